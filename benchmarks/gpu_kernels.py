@@ -39,7 +39,7 @@ from neuprim.core.render.cuda import binning, colour_net, float64, forward, pass
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.render.cuda.projection import PER_BLOCK
-from neuprim.core.train import adam_warp, ssim_warp
+from neuprim.core.train import kernels_warp
 from neuprim.core.volumes import density_grid_warp
 from neuprim.tasks.dynamic.volume import raymarch_warp
 
@@ -71,8 +71,8 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     if name == BESIDE:
         for title, made in (
             ("harmonics", sh_warp._kernels(3)),
-            ("Adam", adam_warp._kernels()),
-            ("SSIM", ssim_warp._kernels()),
+            ("Adam", kernels_warp.adam_kernels()),
+            ("SSIM", kernels_warp.ssim_kernels()),
             ("grid", (density_grid_warp._add_kernel(),)),
             ("rays of volumes", (raymarch_warp._image_kernel(), raymarch_warp._depth_kernel())),
         ):

@@ -28,8 +28,7 @@ from shared.tables import DOCS, between_markers, make_table, spread
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count, cpu_name
-from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.core.train.distributed.torchrun import read_torchrun_rank
+from neuprim.core.train.distributed.process_group import ProcessGroup, read_torchrun_rank
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import compile_kernels, fit, prepare_training, use_one_torch_thread
 

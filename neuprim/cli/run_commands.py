@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.command_settings import LauncherSettings, Target, ViewerSettings
     from neuprim.config.overrides import CommandLine
-    from neuprim.core.train.distributed.process_group import ProcessGroup
-    from neuprim.core.train.distributed.torchrun import TorchrunRank
+    from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
     from neuprim.runs.launch.jobs import JobResult
     from neuprim.search.target_record import TargetRecord
 
@@ -82,7 +81,7 @@ def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, read_stored_config
     from neuprim.config.command_settings import LauncherSettings, take_launcher, take_target, take_viewer
     from neuprim.config.overrides import CommandLine, drop_place
-    from neuprim.core.train.distributed.torchrun import read_torchrun_rank
+    from neuprim.core.train.distributed.process_group import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
     place = read_torchrun_rank()

@@ -59,7 +59,7 @@ from neuprim.config.task_files import (
 )
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
-from neuprim.core.train.distributed.torchrun import read_torchrun_rank
+from neuprim.core.train.distributed.process_group import read_torchrun_rank
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import coerce, format_value, infer_type, refuse_unknown, validate
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source

@@ -19,7 +19,7 @@ from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
+from neuprim.core.train.population import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
 
 _RAYS = 6  # per primitive
 _STEPS = (1e-5, 1e-6)

@@ -63,7 +63,7 @@ def price_cuts(
 ) -> Sensitivity:
     """Return mean squared changes of images without each primitive and unit; changes inside count by their weight."""
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
-    return priced if inside is None else priced.beside(inside, quality.inside_weight(model))
+    return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
 
 def _measure_contrast(model: Primitives, effects: Sensitivity, quality: TrainingQuality) -> float:

@@ -69,7 +69,7 @@ class QuantizationSearch:
         effects = sensitivity(self.model, dataset, quality.others[:_SENSITIVITY_VIEWS], quality.settings)
         if quality.draws:
             inside = inner_sensitivity(self.model, quality.draws, threads=quality.settings.threads)
-            effects = effects.beside(inside, quality.inside_weight(self.model))
+            effects = effects.combine(inside, quality.inside_weight(self.model))
         columns = sum(spec.size for spec in self.model.specs)
         self._effects = effects.columns
         self._error = 10 ** (-quality.image_quality(self.model) / 10) / max(columns, 1)

@@ -16,8 +16,7 @@ from neuprim.config import compose
 from neuprim.core.compute import threads
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError
 from neuprim.core.train.distributed import process_group
-from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.core.train.distributed.torchrun import TorchrunRank
+from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
 from tests.ranks import ThreadGroup, results, run_ranks
 
 WORDS = ["task=static", "scene=solids"]

@@ -49,7 +49,7 @@ def initial_model(
         cloud = draw_points(points, settings.primitives, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
-        cloud = _surrounded(cloud, dataset, settings, generator)
+        cloud = _add_surroundings(cloud, dataset, settings, generator)
     else:
         raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
     check_points(cloud, settings.primitives, dataset)
@@ -60,9 +60,8 @@ def initial_model(
             f"{dataset.name}: none of {len(cloud.means)} starting points is in the image of a training camera; "
             f"{GIVE_POINTS}"
         )
-    extent = scene_extent(
-        dataset.extent, cloud.means, [dataset.train.view(i).camera for i in range(len(dataset.train))]
-    )
+    cameras = [dataset.train.view(i).camera for i in range(len(dataset.train))]
+    extent = scene_extent(dataset.extent, cloud.means, cameras)
     if len(cloud.means) == 1:
         scales = torch.full((1,), 0.1 * extent)
     else:
@@ -85,7 +84,9 @@ def initial_model(
     return Primitives.initialise(density, colour, context)
 
 
-def _surrounded(cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator) -> PointCloud:
+def _add_surroundings(
+    cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator
+) -> PointCloud:
     """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""
     share = settings.init.get("surroundings", 0.0)
     if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:

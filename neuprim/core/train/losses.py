@@ -1,30 +1,43 @@
-"""Losses of an image: the photometric one, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high
-dynamic range.
+"""Losses of images and of points, and regularisers of sizes.
 
-Each factory takes the settings that a :class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. The
+Images: the photometric loss, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high dynamic range.
+Each factory takes the settings that a :class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. Image
 losses ignore masks: masked pixels are equal in both images.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import torch
 from kornia.metrics import ssim as kornia_ssim
+from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.compute import device
+from neuprim.core.data import Dataset, PointSamples, ViewSet
+from neuprim.core.data.dataset_check import check_samples
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.output import Contributions
 from neuprim.core.task import Loss, Supervision
+from neuprim.core.train.settings import TrainSettings
+from neuprim.core.volumes.points import PointShares, volume_values_at
 
 _WINDOW = 11
 _MAX_CPU_CHANNELS = 51
 _MU = 16.0
 _DARK = 0.05
 
+_COMPONENT_WEIGHT = 0.1
+"""Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly
+moves primitives."""
+
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
-    """The loss by kornia and autograd, on any device and in any dtype; the oracle of the fused versions.
+    """The photometric loss by kornia and autograd, on any device and in any dtype; the oracle of the fused versions.
 
     Args:
         rendered, truth: (H, W, C), values nominally in 0..1.
@@ -42,15 +55,15 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
 
 
 class _Photometric(torch.autograd.Function):
-    """The same by kernels, which compute the gradient with the value."""
+    """The photometric loss by kernels, which compute the gradient with the value."""
 
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
         if device.on_numba(rendered):
-            from neuprim.core.train.ssim_cpu import similarity
+            from neuprim.core.train.ssim_cpu import ssim_with_gradient
         else:
-            from neuprim.core.train.ssim_warp import similarity
-        means, grad = similarity(rendered.detach(), truth.detach(), weight)
+            from neuprim.core.train.kernels_warp import ssim_with_gradient
+        means, grad = ssim_with_gradient(rendered.detach(), truth.detach(), weight)
         parts["l1"], parts["ssim"] = means.tolist()
         ctx.save_for_backward(grad)
         return ((1 - weight) * means[0] + weight * (1 - means[1])).float()
@@ -62,7 +75,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric(settings: Mapping[str, Any]) -> Loss:
-    """Make the loss from ``{"ssim_weight": lambda}``."""
+    """Make the photometric loss from ``{"ssim_weight": lambda}``."""
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
@@ -79,7 +92,7 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
 def l1(settings: Mapping[str, Any]) -> Loss:
     """Mean absolute difference."""
-    return _named("l1", lambda rendered, truth: (rendered - truth).abs().mean())
+    return _image_loss("l1", lambda rendered, truth: (rendered - truth).abs().mean())
 
 
 def compressed(settings: Mapping[str, Any]) -> Loss:
@@ -90,7 +103,7 @@ def compressed(settings: Mapping[str, Any]) -> Loss:
         a, b = (torch.log1p(_MU * x.clamp_min(0.0)) / scale for x in (rendered, truth))
         return (a - b).abs().mean()
 
-    return _named("compressed", measure)
+    return _image_loss("compressed", measure)
 
 
 def relative(settings: Mapping[str, Any]) -> Loss:
@@ -99,12 +112,101 @@ def relative(settings: Mapping[str, Any]) -> Loss:
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         return ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean()
 
-    return _named("relative", measure)
+    return _image_loss("relative", measure)
 
 
-def _named(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:
+def _image_loss(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
         value = measure(rendered, truth)
         return value, {name: value.item()}
 
     return loss
+
+
+# ---------------------------------------------------------------- points
+
+
+@dataclass(frozen=True)
+class PointResult:
+    """One frame's points, evaluated and compared.
+
+    Attributes:
+        loss: with gradient. parts: its named parts, for the log.
+        psnr: of the extinction at the points, against the largest true one.
+        name: of the frame.
+        rows, shares: of its active primitives, see :func:`~neuprim.core.volumes.points.volume_values_at`.
+    """
+
+    loss: Tensor
+    parts: dict[str, float]
+    psnr: float
+    name: str
+    rows: Tensor | None
+    shares: PointShares
+
+    def contributions(self) -> Contributions:
+        """Contributions of the primitives to the points; call it after the backward pass."""
+        return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
+
+
+def point_loss(
+    model: Primitives, dataset: Dataset, samples: PointSamples, settings: TrainSettings, threads: int = 0
+) -> PointResult:
+    """Compare a model with known extinction and source radiance at points.
+
+    The loss is the mean square of errors over their scale: the extinction's, plus a small share of each of its
+    components, plus ``train.voxel_colour`` times the source's.
+    """
+    check_samples(samples, dataset)
+    colour = samples.source is not None and settings.voxel_colour > 0
+    found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
+    where = found.sigma.device
+    wrong = (found.sigma - device.copy_from_host(samples.sigma, where)) / samples.sigma_scale
+    loss = wrong.square().mean()
+    parts = {"voxel_sigma": loss.item()}
+    if found.source is not None and samples.source is not None:
+        light = ((found.source - device.copy_from_host(samples.source, where)) / samples.source_scale).square().mean()
+        parts["voxel_source"] = light.item()
+        loss = loss + settings.voxel_colour * light
+    for name, (value, scale) in samples.components.items():
+        if name in found.components:
+            part = ((found.components[name] - device.copy_from_host(value, where)) / scale).square().mean()
+            loss = loss + _COMPONENT_WEIGHT * part
+    peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
+    psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))
+    return PointResult(loss, parts, psnr, samples.name, found.rows, found.request_shares(wrong.detach().abs()))
+
+
+# ---------------------------------------------------------------- sizes
+
+
+def scale_anisotropy(log_scales: Tensor) -> Tensor:
+    """Mean over primitives of the standard deviation over axes of s / min s (the authors' regulariser); 0 for
+    spheres."""
+    ratio = (log_scales - log_scales.min(dim=-1, keepdim=True).values).exp()
+    return ratio.std(dim=-1).mean()
+
+
+class MaxScreenSize:
+    """Limit every primitive's largest semi-axis to a share of its distance to the nearest training camera.
+
+    A primitive close to one camera covers few pixels of the others, so images alone do not stop its growth: it learns
+    the mean of what is behind it and veils views from between two cameras. A distant primitive may be large.
+
+    Args:
+        share: largest semi-axis over distance.
+        every: steps between two applications.
+    """
+
+    def __init__(self, views: ViewSet, share: float, every: int = 10) -> None:
+        eyes = torch.stack([views.view(i).camera.position.detach().double() for i in range(len(views))])
+        self.share, self.every, self._eyes = share, every, cKDTree(eyes.numpy())
+
+    def apply(self, step: int, means: Tensor, log_scales: Tensor) -> None:
+        """Shrink (N, 3) ``log_scales`` in place where they exceed the limit, all axes of a primitive alike."""
+        if step % self.every:
+            return
+        distance = torch.from_numpy(self._eyes.query(means.detach().cpu().numpy())[0]).to(log_scales)
+        limit = (self.share * distance.clamp_min(1e-12)).log()
+        with torch.no_grad():
+            log_scales -= (log_scales.max(dim=1).values - limit).clamp_min(0.0)[:, None]

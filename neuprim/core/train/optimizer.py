@@ -85,7 +85,7 @@ def _corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
     return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
 
 
-class _Update(NamedTuple):
+class _ParameterUpdate(NamedTuple):
     name: str
     value: Tensor
     grad: Tensor
@@ -120,11 +120,12 @@ class RowAdam:
         for name in (spec.name for spec in self.specs):
             grad = params[name].grad
             if grad is not None and grad.numel():
-                updates.append(_Update(name, params[name].detach(), grad, self.m[name], self.v[name], rates[name]))
+                updates.append(
+                    _ParameterUpdate(name, params[name].detach(), grad, self.m[name], self.v[name], rates[name])
+                )
         float32 = all(update.value.dtype == torch.float32 for update in updates)
-        if updates and float32 and device.on_warp(self.age):
-            if self._step_on_gpu(updates):
-                return
+        if updates and float32 and device.on_warp(self.age) and self._step_on_gpu(updates):
+            return
         if updates and not _all_finite([update.grad for update in updates]):
             raise NonFiniteError(_describe_gradient(updates))
         self.age += 1
@@ -134,18 +135,18 @@ class RowAdam:
         for update in updates:
             adam_step_reference(update.value, update.grad, update.m, update.v, update.rate, self.age, self.beta2)
 
-    def _step_on_gpu(self, updates: list[_Update]) -> bool:
+    def _step_on_gpu(self, updates: list[_ParameterUpdate]) -> bool:
         """Step in two launches; False, with nothing changed, if a gradient is not finite."""
-        from neuprim.core.train.adam_warp import adam_rows
+        from neuprim.core.train.kernels_warp import adam_rows
 
         age, betas = self.age + 1, (BETA1, self.beta2)
-        _, values, grads, first, second, rates = zip(*updates, strict=True)
-        fine = adam_rows(values, grads, first, second, rates, age, betas)
-        if fine:
+        _, *columns = zip(*updates, strict=True)
+        finite = adam_rows(*columns, age, betas)
+        if finite:
             self.age = age
-        return fine
+        return finite
 
-    def _step_on_cpu(self, updates: list[_Update]) -> None:
+    def _step_on_cpu(self, updates: list[_ParameterUpdate]) -> None:
         age = self.age.numpy()
         breaks = np.flatnonzero(age[1:] != age[:-1]) + 1
         shared = (self.beta2, age, breaks, *_corrections(self.beta2, 1 << int(age.max(initial=0)).bit_length()))
@@ -156,11 +157,11 @@ class RowAdam:
             flat = [x.reshape(-1).numpy() for x in (update.value, update.grad.contiguous(), update.m, update.v)]
             work += [(at, min(at + rows, count), width, *flat, update.rate, *shared) for at in range(0, count, rows)]
 
-        def step_some(start: int, stop: int) -> None:
+        def step_rows(start: int, stop: int) -> None:
             for arguments in work[start:stop]:
                 _adam_rows(*arguments)
 
-        parallel_for(step_some, len(work), 1, 0)
+        parallel_for(step_rows, len(work), 1, 0)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow a change of population: keep ``rows`` in their new order, and start anew where ``fresh`` is set."""
@@ -181,7 +182,7 @@ class RowAdam:
         self.age = state["age"]
 
 
-def _describe_gradient(updates: list[_Update]) -> str:
+def _describe_gradient(updates: list[_ParameterUpdate]) -> str:
     """Name the first primitive whose gradient is not finite."""
     for update in updates:
         bad = (~torch.isfinite(update.grad.reshape(len(update.grad), -1)).all(dim=1)).nonzero()

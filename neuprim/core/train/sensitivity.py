@@ -1,11 +1,9 @@
-"""What images would lose without a primitive, or without a piece of it, found by one backward pass per view.
+"""Estimate what images, or points, would lose without a primitive or a unit of it, by one backward pass per view.
 
-An image is J delta different when numbers change by delta, to first order. For random signs z per pixel and channel,
-the mean of (z . J delta)^2 is the sum of squares |J delta|^2 (Hutchinson 1990, for the trace), and z . J is what a
-backward pass gives. So views are enough to know every piece's squared effect at once. A whole primitive's part in a
-pixel is its weight w = alpha T times how much its colour differs from what is behind it; its sum of w^2 comes the same
-way out of the frame's tally. Squares matter: primitives of equal summed weight differ much in it, and on a trained
-chair those with the least w^2 cost a third of what those with the least w cost (docs/tradeoffs.md).
+To first order an image changes by J delta when numbers change by delta. For random signs z per pixel and channel, the
+mean of (z . J delta)^2 is the sum of squares |J delta|^2 (Hutchinson 1990), and z . J is what a backward pass gives. A
+whole primitive's part in a pixel is its weight w = alpha T times how much its colour differs from what is behind it.
+Its sum of w^2 predicts the loss better than its sum of w (docs/tradeoffs.md).
 """
 
 from __future__ import annotations
@@ -34,8 +32,7 @@ class Sensitivity:
         seen: (N,) in how many of the views, or frames, a primitive was; of those in none nothing is known.
         pieces: name -> (N,) of each primitive's piece being zero.
         columns: parameter -> (C,) float64, of each of its numbers when those of all primitives change by independent
-        amounts of variance 1; of
-            "quats" by amounts across a quaternion of unit norm.
+            amounts of variance 1; of "quats" by amounts across a quaternion of unit norm.
     """
 
     whole: Tensor
@@ -43,23 +40,23 @@ class Sensitivity:
     pieces: dict[str, Tensor]
     columns: dict[str, Tensor]
 
-    def beside(self, other: Sensitivity, weight: float) -> Sensitivity:
+    def combine(self, other: Sensitivity, weight: float) -> Sensitivity:
         """Effects on these views and, ``weight`` times, on what another one looked at."""
         pieces = {name: value + weight * other.pieces[name] for name, value in self.pieces.items()}
         columns = {name: value + weight * other.columns[name] for name, value in self.columns.items()}
         return Sensitivity(self.whole + weight * other.whole, self.seen + other.seen, pieces, columns)
 
 
-class _Sums:
-    """What backward passes of random signs say of a model's numbers, summed."""
+class _SensitivitySums:
+    """Sums over backward passes of random signs."""
 
     def __init__(self, model: Primitives) -> None:
         self._model, self._pieces = model, prunable_units_by_name(model.density, model.colour)
         self.pieces = {name: torch.zeros(model.count) for name in self._pieces}
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
-    def add(self, params: dict[str, Tensor]) -> None:
-        """One pass: ``params`` with their gradients."""
+    def add_pass(self, params: dict[str, Tensor]) -> None:
+        """Add one pass: ``params`` with their gradients."""
         gradients = {
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
@@ -71,11 +68,9 @@ class _Sums:
                 slopes = slopes * params[name].detach().norm(dim=1, keepdim=True)
             own += slopes.double().square().sum(0).cpu()
 
-    def over(self, count: float, whole: Tensor, seen: Tensor) -> Sensitivity:
-        """Means."""
-        pieces, columns = (
-            {name: value / count for name, value in sums.items()} for sums in (self.pieces, self.columns)
-        )
+    def means(self, count: float, whole: Tensor, seen: Tensor) -> Sensitivity:
+        pieces = {name: value / count for name, value in self.pieces.items()}
+        columns = {name: value / count for name, value in self.columns.items()}
         return Sensitivity(whole / count, seen, pieces, columns)
 
 
@@ -89,22 +84,22 @@ def sensitivity(
         seed: of the random signs.
     """
     generator = torch.Generator().manual_seed(seed)
-    whole, there, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _Sums(model)
+    whole, seen, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _SensitivitySums(model)
     background, numbers = dataset.background.float(), 0
     for index in views:
         view = dataset.train.view(index)
         params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
-        seen = Primitives(model.density, model.colour, params)
-        output = render(seen, view.camera, view.conditions, settings, background.to(model.device))
+        traced = Primitives(model.density, model.colour, params)
+        output = render(traced, view.camera, view.conditions, settings, background.to(model.device))
         signs = (2 * torch.randint(0, 2, output.rgb.shape, generator=generator) - 1).to(output.rgb)
-        tally = output.request_contributions(signs[..., 0])
+        contributions = output.request_contributions(signs[..., 0])
         (output.rgb * signs).sum().backward()
-        sums.add(params)
-        weight, signed = tally.of_all(model.count)
-        there += (weight > 0).cpu()
+        sums.add_pass(params)
+        weight, signed = contributions.of_all(model.count)
+        seen += (weight > 0).cpu()
         whole += signed.cpu().square() * output.rgb.shape[-1]
         numbers += output.rgb.numel()
-    return sums.over(numbers, whole, there)
+    return sums.means(numbers, whole, seen)
 
 
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
@@ -116,18 +111,17 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
         seed, threads: of the random signs; of the backward pass, 0 for all cores.
     """
     generator = torch.Generator().manual_seed(seed)
-    whole, there, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _Sums(model)
+    whole, seen, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _SensitivitySums(model)
     for samples in draws:
         params = {name: value.detach().requires_grad_() for name, value in model.params.items()}
-        values = volume_values_at(
-            Primitives(model.density, model.colour, params), samples.conditions, samples.points, False, threads
-        )
+        traced = Primitives(model.density, model.colour, params)
+        values = volume_values_at(traced, samples.conditions, samples.points, False, threads)
         signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()
         signs = device.copy_from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
         shares = values.request_shares(signs)
         (values.sigma * signs).sum().backward()
         rows = torch.arange(model.count) if values.rows is None else values.rows.cpu()
         whole[rows] += shares.error_weight.cpu().square()
-        there[rows] += (shares.weight > 0).cpu()
-        sums.add(params)
-    return sums.over(max(len(draws), 1), whole, there)
+        seen[rows] += (shares.weight > 0).cpu()
+        sums.add_pass(params)
+    return sums.means(max(len(draws), 1), whole, seen)

@@ -51,7 +51,7 @@ def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def
 
 
 @inline
-def _vertical(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
+def _blur_columns(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
         for k in range(SSIM_TAPS):
@@ -60,7 +60,7 @@ def _vertical(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _horizontal(out, V, step, count):  # type: ignore[no-untyped-def]
+def _blur_rows(out, V, step, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
         for k in range(SSIM_TAPS):
@@ -69,7 +69,7 @@ def _horizontal(out, V, step, count):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _derivatives(s, n, scale):  # type: ignore[no-untyped-def]
+def _ssim_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
     """In place on blocks E[x], E[y], E[xx], E[yy], E[xy]: derivatives of scale x SSIM for E[x], E[xx], E[xy]; returns
     the sum of SSIM."""
     total = f(0)
@@ -89,7 +89,7 @@ def _derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _similarity(start, stop, x, y, height, channels, maps):  # type: ignore[no-untyped-def]
+def _ssim_maps(start, stop, x, y, height, channels, maps):  # type: ignore[no-untyped-def]
     """Window rows start:stop: derivative maps of the mean SSIM; returns the sum of SSIM over them.
 
     x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
@@ -106,8 +106,8 @@ def _similarity(start, stop, x, y, height, channels, maps):  # type: ignore[no-u
             size = min(_BLOCK, m - j0)
             _vertical_moments(V, x, y, r * n + j0, n, size + reach)
             for q in range(5):
-                _horizontal(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
-            total += _derivatives(s, size, scale)
+                _blur_rows(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
+            total += _ssim_derivatives(s, size, scale)
             for q, block in enumerate((_EX, _EXX, _EXY)):
                 row = maps[q, r + SSIM_TAPS - 1]
                 row[reach + j0 : reach + j0 + size] = s[block : block + size]
@@ -115,7 +115,7 @@ def _similarity(start, stop, x, y, height, channels, maps):  # type: ignore[no-u
 
 
 @inline
-def _finish(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
+def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
     """gr = L1 and SSIM gradient from the three spread maps; returns the sum of |x - y|."""
     line = f(0)
     for j in range(n):
@@ -128,7 +128,7 @@ def _finish(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _spread(start, stop, x, y, height, channels, maps, weight, grad):  # type: ignore[no-untyped-def]
+def _spread_gradient(start, stop, x, y, height, channels, maps, weight, grad):  # type: ignore[no-untyped-def]
     """Image rows start:stop of d loss / d x, the adjoint of the blur; returns the sum of |x - y|."""
     n = x.shape[0] // height
     pitch = maps.shape[2]
@@ -141,26 +141,25 @@ def _spread(start, stop, x, y, height, channels, maps, weight, grad):  # type: i
         for j0 in range(0, n, _BLOCK):
             size = min(_BLOCK, n - j0)
             for q in range(3):
-                _vertical(V, maps[q].reshape(-1), i * pitch + j0, pitch, size + reach)  # the window is symmetric
-                _horizontal(s[q * _BLOCK :], V, channels, size)
+                _blur_columns(V, maps[q].reshape(-1), i * pitch + j0, pitch, size + reach)  # the window is symmetric
+                _blur_rows(s[q * _BLOCK :], V, channels, size)
             at = i * n + j0
-            total += _finish(grad[at:], x[at:], y[at:], s, size, l1_share, weight)
+            total += _loss_gradient(grad[at:], x[at:], y[at:], s, size, l1_share, weight)
     return total
 
 
 _buffers = threading.local()
 
 
-def _bordered(rows: int, columns: int) -> Any:
-    """Three maps with a zero border. Reused by the next image of the same size in this thread: only the inside is ever
-    written."""
+def _bordered_maps(rows: int, columns: int) -> Any:
+    """Three maps with a zero border, reused by the next image of the same size in this thread."""
     maps = getattr(_buffers, "maps", None)
     if maps is None or maps.shape != (3, rows, columns):
         maps = _buffers.maps = np.zeros((3, rows, columns), np.float32)
     return maps
 
 
-def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def ssim_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
     weight (1 - SSIM).
 
@@ -170,8 +169,8 @@ def similarity(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, 
     H, W, C = rendered.shape
     x, y = (np.ascontiguousarray(image.numpy()).reshape(-1) for image in (rendered, truth))
     windows, m = H - SSIM_TAPS + 1, (W - SSIM_TAPS + 1) * C
-    maps = _bordered(windows + 20, m + 20 * C)
-    ssim = sum(parallel_for(_similarity, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
+    maps = _bordered_maps(windows + 20, m + 20 * C)
+    ssim = sum(parallel_for(_ssim_maps, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
     grad = np.empty(x.size, np.float32)
-    l1 = sum(parallel_for(_spread, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
+    l1 = sum(parallel_for(_spread_gradient, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
     return torch.tensor([l1, ssim], dtype=torch.float64), torch.from_numpy(grad).reshape(H, W, C)

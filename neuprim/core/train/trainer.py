@@ -1,9 +1,8 @@
 """The training loop of every task.
 
 A step draws a view, renders it, compares it with the image, runs the backward pass, updates the parameters and lets the
-population react. ``train.supervision`` adds points of known extinction, or replaces the view by them. Everything that
-affects the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for
-bit.
+population react. ``train.supervision`` adds points of known extinction, or replaces the view by them. All that affects
+the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for bit.
 """
 
 from __future__ import annotations
@@ -29,10 +28,9 @@ from neuprim.core.render.backends import device_of
 from neuprim.core.render.near_plane import resolve_near, scene_extent
 from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
+from neuprim.core.train.losses import MaxScreenSize, PointResult, point_loss, scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
-from neuprim.core.train.point_loss import PointResult, point_loss
-from neuprim.core.train.population import Change, make_population
-from neuprim.core.train.regularization import MaxScreenSize, scale_anisotropy
+from neuprim.core.train.population import PopulationChange, make_population
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer_state import check_state, hash_names, select_prefix
 from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_view, resolution_factor
@@ -104,7 +102,6 @@ class Trainer:
     that they are the same on every device.
 
     Attributes:
-        device: where the training's tensors are.
         extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near_plane.scene_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
         fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they
@@ -126,19 +123,7 @@ class Trainer:
         seed: int,
     ) -> None:
         train = dataset.train
-        if len(train) == 0:
-            raise DataError(f"{dataset.name}: the training split is empty")
-        names = [spec.name for spec in model.specs]
-        for group, given in (("rates", settings.rates), ("rate_units", settings.rate_units)):
-            for key in given:
-                if key not in names:
-                    raise ConfigError(f"train.{group}.{key}: no such parameter{nearest(key, names)}")
-        if settings.supervision == "auto":
-            settings = replace(settings, supervision="images" if dataset.points is None else "both")
-        if settings.supervision != "images" and dataset.points is None:
-            raise ConfigError(
-                f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images"
-            )
+        settings = _check_settings(settings, model, dataset)
         cameras = [train.view(i).camera for i in range(len(train))]
         self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
@@ -149,17 +134,9 @@ class Trainer:
         if self.device.type == device.CUDA:
             self.prefetcher = Prefetcher(self._load_pixels, device.free_cuda_memory(self.device) // 4)
         self.population = make_population(settings.population)
-        self.max_screen_size: MaxScreenSize | None = None
-        if settings.angular_size is not None:
-            self.max_screen_size = MaxScreenSize(train, settings.angular_size)
-        self.exposures: Exposures | None = None
-        if settings.exposure_rate > 0:
-            if train.pixels(0).alpha is not None:
-                raise ConfigError(
-                    f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected "
-                    "opaque photographs, as a gain would change the background that is put behind them"
-                )
-            self.exposures = Exposures(len(train), dataset.channels, settings.exposure_rate, self.device)
+        size, rate = settings.angular_size, settings.exposure_rate
+        self.max_screen_size = None if size is None else MaxScreenSize(train, size)
+        self.exposures = Exposures(len(train), dataset.channels, rate, self.device) if rate > 0 else None
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order = torch.empty(0, dtype=torch.int64)
         self.step, self.elapsed = 0, 0.0
@@ -168,8 +145,6 @@ class Trainer:
         self.stop_requested: Callable[[], bool] = lambda: False
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self._require_grad()
-
-    # ------------------------------------------------------------ the budget
 
     @property
     def progress(self) -> float:
@@ -224,8 +199,7 @@ class Trainer:
                 value.grad = None
 
             # Draw the views and the points of this step.
-            tasks = self._draw_views()
-            samples = self._draw_points() if self._points_due() else None
+            tasks, samples = self._draw_views(), self._draw_points()
 
             # Add up losses and gradients, view by view. Points and regularisers join the last view.
             points: PointResult | None = None
@@ -270,8 +244,7 @@ class Trainer:
                 change = self.population.intervene(model, self.extent)
                 if change is not None:
                     self._apply_change(change)
-            self.elapsed = self._stop_clock(start)
-            text = None if change is None else change.text
+            self.elapsed, text = self._stop_clock(start), None if change is None else change.text
             return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, text)
 
     @contextmanager
@@ -298,19 +271,17 @@ class Trainer:
         return [ViewTask(index, background, then) for (index, background), then in zip(drawn, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
-        """Called after the backward pass of each view, whose gradients one process adds to those of the views before;
-        returns what :meth:`_combine_views` gets."""
+        """Called after the backward pass of each view, whose gradients one process adds to those of earlier views."""
         return contributions
 
     def _combine_views(
         self, results: list[ViewResult], each: list[Contributions], start: float
     ) -> tuple[list[ViewResult], Contributions]:
-        """Results of all views of the step, in their order, and the sum of their contributions. ``start``: when the
-        step began, seconds of ``time.perf_counter``."""
+        """Results of all views of the step, in their order, and the sum of their contributions. The step began at
+        ``start``."""
         return results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
 
     def _stop_clock(self, start: float) -> float:
-        """Seconds of training up to the end of this step."""
         return self.elapsed + time.perf_counter() - start
 
     # ------------------------------------------------------------ parts of a step
@@ -330,16 +301,14 @@ class Trainer:
             return self.dataset.background.float()
         return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
-    def _points_due(self) -> bool:
-        """Whether this step uses points. With ``both``, the last step before each multiple of ``voxels_every`` does,
-        which is the one that logs show."""
+    def _draw_points(self) -> PointSamples | None:
+        """Draw the points of a step that uses some. With ``both``, that is the last step before each multiple of
+        ``voxels_every``, which is the one that logs show."""
         source = self.settings.supervision
-        return source == "voxels" or (source == "both" and (self.step + 1) % self.settings.voxels_every == 0)
-
-    def _draw_points(self) -> PointSamples:
-        points = self.dataset.points
-        assert points is not None, "the constructor refuses data without points"
-        return points.draw(self.settings.voxels_per_step, self.generator)
+        if source == "images" or (source == "both" and (self.step + 1) % self.settings.voxels_every):
+            return None
+        assert self.dataset.points is not None, "the constructor refuses data without points"
+        return self.dataset.points.draw(self.settings.voxels_per_step, self.generator)
 
     def _load_pixels(self, index: int) -> Pixels:
         """Pixels of a training view, on the training's device."""
@@ -349,10 +318,9 @@ class Trainer:
 
     def _quantized_model(self) -> Primitives:
         """The model that images and points are rendered of."""
-        model = self.model
         if self.fake_quantize is None:
-            return model
-        return Primitives(model.density, model.colour, self.fake_quantize(model.params))
+            return self.model
+        return Primitives(self.model.density, self.model.colour, self.fake_quantize(self.model.params))
 
     def _render_view(self, task: ViewTask, progress: float) -> _RenderedView:
         """Render a view and compare it with its image."""
@@ -407,7 +375,7 @@ class Trainer:
         loss.backward()
         return cost
 
-    def _apply_change(self, change: Change) -> None:
+    def _apply_change(self, change: PopulationChange) -> None:
         self.model.params = {spec.name: change.params[spec.name] for spec in self.model.specs}
         self.optimizer.select(change.origin, change.fresh)
         self.zero_masks = {name: mask[change.origin] for name, mask in self.zero_masks.items()}
@@ -450,6 +418,29 @@ class Trainer:
         self.generator.set_state(tensors["generator"])
         self.step, self.elapsed = header["step"], float(header["elapsed"])
         self._require_grad()
+
+
+def _check_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
+    """Refuse settings that do not fit the model and the data; returns them with ``train.supervision`` decided."""
+    if len(dataset.train) == 0:
+        raise DataError(f"{dataset.name}: the training split is empty")
+    names = [spec.name for spec in model.specs]
+    for group, given in (("rates", settings.rates), ("rate_units", settings.rate_units)):
+        for key in given:
+            if key not in names:
+                raise ConfigError(f"train.{group}.{key}: no such parameter{nearest(key, names)}")
+    if settings.supervision == "auto":
+        settings = replace(settings, supervision="images" if dataset.points is None else "both")
+    if settings.supervision != "images" and dataset.points is None:
+        raise ConfigError(
+            f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images"
+        )
+    if settings.exposure_rate > 0 and dataset.train.pixels(0).alpha is not None:
+        raise ConfigError(
+            f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque "
+            "photographs, as a gain would change the background that is put behind them"
+        )
+    return settings
 
 
 def _summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:

@@ -40,19 +40,19 @@ def check_state(
     Raises:
         CheckpointError: it belongs to other settings or data; names what differs.
     """
-    step, elapsed, views = header.get("step"), header.get("elapsed"), header.get("views")
+    step, elapsed, views = (header.get(name) for name in ("step", "elapsed", "views"))
     if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):
         raise CheckpointError(f"{where}: step {step!r}, elapsed {elapsed!r}; expected numbers")
     if views != own_header["views"]:
         raise CheckpointError(f"{where}: trained on {views} views, the data set now has {own_header['views']}")
     if header.get("names") != own_header["names"]:
         raise CheckpointError(f"{where}: trained on {views} views with other names than those of the data set now")
-    fault = _find_fault(tensors, own_tensors, step, own_header["views"])
+    fault = _find_state_fault(tensors, own_tensors, step, own_header["views"])
     if fault is not None:
         raise CheckpointError(f"{where}: does not fit this run's settings ({fault})")
 
 
-def _find_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], step: int, views: int) -> str | None:
+def _find_state_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], step: int, views: int) -> str | None:
     means = tensors.get("params.means", torch.zeros(()))
     count = len(means) if means.dim() else 0
     # order, population and zeros may be of other shapes, or missing, at another step
@@ -75,12 +75,8 @@ def _find_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], step: 
         if kind in ("params", "adam", "exposure") and name not in names:
             return f"it has {name}, which these settings do not use"
     order, age = tensors.get("order"), tensors["adam.age"]
-    if (
-        order is None
-        or order.dim() != 1
-        or order.dtype != torch.int64
-        or not bool(((order >= 0) & (order < views)).all())
-    ):
+    fits = order is not None and order.dim() == 1 and order.dtype == torch.int64
+    if order is None or not fits or not bool(((order >= 0) & (order < views)).all()):
         return "the order of views is out of range"
     if not bool(((age >= 0) & (age <= step)).all()):
         return f"ages are {int(age.min())} to {int(age.max())} steps; expected 0 to {step}"

@@ -81,13 +81,8 @@ def reduce_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
 class Exposures:
     """A factor per training view and channel, by which a rendered image is multiplied before it is compared.
 
-    Adam learns the logarithms of the factors, each in the steps that use its view. The geometric mean over the views
-    stays 1, so that the model keeps the photographs' mean exposure, with which held-out views are rendered.
-
-    Args:
-        views: number of training views.
-        channels: number of colour channels.
-        rate: learning rate of the logarithms.
+    Adam learns the logarithms of the factors at ``rate``, each in the steps that use its view. The geometric mean over
+    the views stays 1, so that the model keeps the photographs' mean exposure, with which held-out views are rendered.
     """
 
     def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:

@@ -36,7 +36,7 @@ from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_scr
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.train.splitting import SPLIT_LONG, SPLIT_SHIFT
+from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
 from neuprim.tasks.dynamic.time_kernels import apply_window, move_means, rows_in_window
 
 TIME_PARTS = ("phase", "offset", "window", "motion")

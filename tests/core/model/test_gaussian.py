@@ -20,7 +20,7 @@ from neuprim.core.model.fields import CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.train.splitting import split_primitives
+from neuprim.core.train.population import split_primitives
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 from tests.core import tiny

@@ -12,8 +12,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.data import View
 from neuprim.core.metrics import ssim
 from neuprim.core.task import Supervision
-from neuprim.core.train.losses import photometric, photometric_reference
-from neuprim.core.train.regularization import scale_anisotropy
+from neuprim.core.train.losses import photometric, photometric_reference, scale_anisotropy
 
 pytestmark = pytest.mark.usefixtures("either_way")
 

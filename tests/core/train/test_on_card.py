@@ -12,8 +12,7 @@ from neuprim.core.train.optimizer import adam_step_reference
 
 pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
 
-from neuprim.core.train.adam_warp import TOGETHER, adam_rows
-from neuprim.core.train.ssim_warp import similarity
+from neuprim.core.train.kernels_warp import LAUNCH_PARAMETERS, adam_rows, ssim_with_gradient
 
 BETAS = (0.9, 0.999)
 ROWS = 23
@@ -21,7 +20,7 @@ ROWS = 23
 
 def parameters(generator: torch.Generator) -> list[torch.Tensor]:
     """More than fit into one launch, of several widths."""
-    shapes = [(ROWS, 3), (ROWS, 1), (ROWS, 8, 3), (ROWS,), *[(ROWS, 2)] * TOGETHER]
+    shapes = [(ROWS, 3), (ROWS, 1), (ROWS, 8, 3), (ROWS,), *[(ROWS, 2)] * LAUNCH_PARAMETERS]
     return [torch.randn(shape, generator=generator) for shape in shapes]
 
 
@@ -47,7 +46,7 @@ def test_adam_is_the_reference() -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-@pytest.mark.parametrize("which", [0, 2, TOGETHER + 3])
+@pytest.mark.parametrize("which", [0, 2, LAUNCH_PARAMETERS + 3])
 def test_adam_changes_nothing_where_a_gradient_is_not_finite(bad: float, which: int) -> None:
     generator = torch.Generator().manual_seed(1)
     values = parameters(generator)
@@ -57,7 +56,8 @@ def test_adam_changes_nothing_where_a_gradient_is_not_finite(bad: float, which: 
     kept = torch.full((ROWS,), 5)
     fine = adam_rows(values, grads, *moments, [0.1] * len(values), kept, BETAS)
     # numbers of a launch without the bad one may have moved; those beside it have not
-    group = slice(which // TOGETHER * TOGETHER, which // TOGETHER * TOGETHER + TOGETHER)
+    first = which // LAUNCH_PARAMETERS * LAUNCH_PARAMETERS
+    group = slice(first, first + LAUNCH_PARAMETERS)
     assert not fine
     assert all(torch.equal(a, b) for a, b in zip(before[: len(values)][group], values[group], strict=True))
     assert all(torch.equal(a, b) for a, b in zip(before, (*values, *moments[0], *moments[1]), strict=True))
@@ -68,7 +68,7 @@ def test_similarity_and_its_gradient_are_those_of_float64(shape: tuple[int, int,
     generator = torch.Generator().manual_seed(2)
     truth = torch.rand(*shape, generator=generator)
     rendered = (0.7 * truth + 0.3 * torch.rand(*shape, generator=generator)).requires_grad_()
-    means, grad = similarity(rendered, truth, 0.2)
+    means, grad = ssim_with_gradient(rendered, truth, 0.2)
     exact = rendered.detach().double().requires_grad_()
     loss, parts = photometric_reference(exact, truth.double(), 0.2)
     loss.backward()
@@ -79,6 +79,6 @@ def test_similarity_and_its_gradient_are_those_of_float64(shape: tuple[int, int,
 
 def test_similarity_of_equal_images_pulls_nowhere() -> None:
     truth = torch.rand(20, 20, 3, generator=torch.Generator().manual_seed(3))
-    means, grad = similarity(truth, truth, 0.2)
+    means, grad = ssim_with_gradient(truth, truth, 0.2)
     assert means.tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
     assert float(grad.abs().max()) < 1e-7

@@ -13,7 +13,7 @@ from neuprim.core import checkpoint
 from neuprim.core.data import Dataset, Pixels, View, ViewSet
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.train import training_views
-from neuprim.core.train.regularization import MaxScreenSize
+from neuprim.core.train.losses import MaxScreenSize
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.training_views import Exposures, reduce_view, resolution_factor
 from tests.core import tiny

@@ -14,13 +14,17 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import (
-    Fixed,
-    Gradient,
-    Relocate,
+    SPLIT_GAUSSIAN,
+    SPLIT_LONG,
+    SPLIT_OTHERS,
+    SPLIT_SHIFT,
+    FixedPopulation,
+    GradientPopulation,
+    RelocatePopulation,
     make_population,
+    split_primitives,
 )
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.core.train.splitting import SPLIT_GAUSSIAN, SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT, split_primitives
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 
@@ -68,7 +72,7 @@ def relocate(  # type: ignore[no-untyped-def]
     idle: float | None = None,
     grow_to: int | None = None,
 ):
-    population = Relocate(PopulationSettings(fraction=fraction, idle=idle, grow_to=grow_to))
+    population = RelocatePopulation(PopulationSettings(fraction=fraction, idle=idle, grow_to=grow_to))
     population.observe(m, stats(weight, error))
     return population.intervene(m, 1.0)
 
@@ -179,7 +183,7 @@ def test_relocation_grows_to_what_was_asked_for_where_the_error_is() -> None:
 def test_relocation_reaches_its_count_in_time(steps: int, every: int, target: int, most: int) -> None:
     """However few interventions there are, and in budgets that are over before the first one."""
     m, counts, when = model(), [], []
-    population = Relocate(PopulationSettings(start=0.02, stop=0.35, every=every, grow_to=target))
+    population = RelocatePopulation(PopulationSettings(start=0.02, stop=0.35, every=every, grow_to=target))
     for step in range(1, steps + 1):
         population.observe(m, stats(torch.ones(m.count), torch.rand(m.count) + 0.1))
         if population.due(step, step / steps):
@@ -195,7 +199,8 @@ def test_relocation_reaches_its_count_in_time(steps: int, every: int, target: in
 
 def test_relocation_keeps_its_interval_where_that_is_soon_enough_or_nobody_is_missing() -> None:
     for steps, grow_to in ((5000, 2 * COUNT), (500, COUNT)):
-        m, population = model(), Relocate(PopulationSettings(start=0.02, stop=0.35, every=100, grow_to=grow_to))
+        interval = PopulationSettings(start=0.02, stop=0.35, every=100, grow_to=grow_to)
+        m, population = model(), RelocatePopulation(interval)
         population.observe(m, stats(torch.ones(m.count), torch.rand(m.count) + 0.1))
         found = [step for step in range(1, steps + 1) if population.due(step, step / steps)]
         assert found == list(range(100, int(0.35 * steps - 1e-9) + 1, 100))
@@ -203,7 +208,7 @@ def test_relocation_keeps_its_interval_where_that_is_soon_enough_or_nobody_is_mi
 
 def test_relocation_sums_over_views_and_starts_anew() -> None:
     m = model()
-    population = Relocate(PopulationSettings(fraction=0.05))
+    population = RelocatePopulation(PopulationSettings(fraction=0.05))
     first, second = torch.full((COUNT,), 1.0), torch.full((COUNT,), 1.0)
     first[3], second[5] = 9.0, 30.0
     first[8] = second[8] = 0.1
@@ -229,7 +234,7 @@ def settings(**changes: object) -> PopulationSettings:
 
 
 def grown(m: Primitives, size: Tensor, weight: Tensor | None = None, extent: float = 1.0, **changes: object):  # type: ignore[no-untyped-def]
-    population = Gradient(settings(**changes))
+    population = GradientPopulation(settings(**changes))
     give_grads(m, size)
     population.observe(m, stats(torch.ones(m.count) if weight is None else weight))
     return population.intervene(m, extent)
@@ -304,7 +309,7 @@ def test_the_model_is_never_emptied() -> None:
 
 def test_the_mean_is_over_views_that_saw_the_primitive() -> None:
     m = model()
-    population = Gradient(settings(clone_scale=10.0))
+    population = GradientPopulation(settings(clone_scale=10.0))
     one = torch.zeros(COUNT)
     one[0] = 1.0
     give_grads(m, torch.full((COUNT,), 1.5))
@@ -322,7 +327,7 @@ def test_the_mean_is_over_views_that_saw_the_primitive() -> None:
 
 def test_gradients_of_other_fields_do_not_count() -> None:
     m = model()
-    population = Gradient(settings())
+    population = GradientPopulation(settings())
     give_grads(m, torch.full((COUNT,), 0.5))
     for name in ("means", "sh_dc", "log_scales"):
         m.params[name].grad = torch.full_like(m.params[name], 1e6)
@@ -331,12 +336,12 @@ def test_gradients_of_other_fields_do_not_count() -> None:
 
 
 def test_due() -> None:
-    population = Fixed(PopulationSettings(every=10, start=0.2, stop=0.6))
+    population = FixedPopulation(PopulationSettings(every=10, start=0.2, stop=0.6))
     assert [s for s in range(1, 101) if population.due(s, s / 100)] == [20, 30, 40, 50]
     m = model()
     population.observe(m, stats(torch.ones(COUNT)))
     assert population.intervene(m, 1.0) is None and population.state() == {}
-    assert isinstance(make_population(PopulationSettings(strategy="fixed")), Fixed)
+    assert isinstance(make_population(PopulationSettings(strategy="fixed")), FixedPopulation)
 
 
 # ---------------------------------------------------------------- fields whose methods return something else

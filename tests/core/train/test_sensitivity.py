@@ -97,7 +97,7 @@ def test_columns_are_the_mean_squared_change_by_independent_amounts() -> None:
 def test_effects_beside_others_are_weighted_sums() -> None:
     one, dataset = model(), tiny.two_primitives()
     a, b = (sensitivity(one, dataset, [view], SETTINGS) for view in (0, 1))
-    both = a.beside(b, 3.0)
+    both = a.combine(b, 3.0)
     assert torch.allclose(both.whole, a.whole + 3 * b.whole) and torch.equal(both.seen, a.seen + b.seen)
     assert all(torch.allclose(both.pieces[n], a.pieces[n] + 3 * b.pieces[n]) for n in a.pieces)
     assert all(torch.allclose(both.columns[n], a.columns[n] + 3 * b.columns[n]) for n in a.columns)

@@ -15,7 +15,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
 from neuprim.core.train import population
-from neuprim.core.train.population import Change, Population, make_population
+from neuprim.core.train.population import Population, PopulationChange, make_population
 from neuprim.core.train.settings import PopulationSettings
 from tests.core import tiny
 
@@ -28,11 +28,11 @@ class Decimate(Population):
     def observe(self, model: Primitives, tally: Contributions) -> None:
         pass
 
-    def intervene(self, model: Primitives, extent: float) -> Change | None:
+    def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
         type(self).asked += 1
         keep = torch.arange(model.count - 1)
         params = {name: value.detach()[keep].clone() for name, value in model.params.items()}
-        return Change(params, keep, torch.zeros(len(keep), dtype=torch.bool), "dropped 1")
+        return PopulationChange(params, keep, torch.zeros(len(keep), dtype=torch.bool), "dropped 1")
 
 
 @pytest.fixture

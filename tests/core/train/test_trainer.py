@@ -21,7 +21,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import Contributions
 from neuprim.core.task import Supervision
 from neuprim.core.train.initial_model import initial_model
-from neuprim.core.train.population import Fixed
+from neuprim.core.train.population import FixedPopulation
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import MIN_COOLDOWN, StepReport, Trainer
 from neuprim.runs.measure import render_image
@@ -210,7 +210,7 @@ def test_the_psnr_of_a_step_is_that_of_the_pixels_that_count() -> None:
     assert report.psnr == pytest.approx(expected, abs=1e-4)
 
 
-class _Seen(Fixed):
+class _Seen(FixedPopulation):
     """Leaves the model as it is and keeps what it was told."""
 
     def __init__(self) -> None:

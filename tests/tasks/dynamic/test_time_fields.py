@@ -17,9 +17,8 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import Contributions
-from neuprim.core.train.population import Relocate
+from neuprim.core.train.population import RelocatePopulation, split_primitives
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.core.train.splitting import split_primitives
 from neuprim.tasks.dynamic import TASK, invisible_fraction
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TIME_PARTS, TimeDensity
@@ -226,7 +225,7 @@ def test_a_clone_halves_the_density_at_all_times(time: str) -> None:
 
 def test_relocation_counts_frames_in_which_a_primitive_lives() -> None:
     m = model("window", dtype=torch.float32)
-    population = Relocate(PopulationSettings(fraction=0.1))
+    population = RelocatePopulation(PopulationSettings(fraction=0.1))
     rows = torch.tensor([2, 5, 7])
     population.observe(m, Contributions(torch.ones(3), torch.tensor([1.0, 9.0, 1.0]), rows))
     change = population.intervene(m, 1.0)

@@ -16,7 +16,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.train.splitting import split_primitives
+from neuprim.core.train.population import split_primitives
 from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_harmonics
 from neuprim.tasks.relight.lighting import parse_intensities, parse_lights

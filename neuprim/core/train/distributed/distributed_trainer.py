@@ -30,11 +30,11 @@ _ALIGNMENT = 16
 """Numbers; tensors start at multiples of 64 bytes, which vector units read at once."""
 
 
-class _Message(NamedTuple):
+class _RankMessage(NamedTuple):
     """What a rank tells the others in a step.
 
     Attributes:
-        checksum: of the bits of all positions before the step, to notice a rank that computes differently.
+        checksum: of the positions before the step, to notice a rank that computes differently.
         elapsed: seconds of training; those of rank 0 count.
         stop: whether this rank was asked to stop.
         present: which parameters have a gradient.
@@ -71,13 +71,12 @@ class DistributedTrainer(Trainer):
         super().__init__(model, dataset, loss, settings, renderer, seed)
         if self.settings.supervision == "voxels":
             raise ConfigError(
-                f"train.supervision=voxels: there are no views that {group.size} ranks could share; expected one "
-                f"process"
+                f"train.supervision=voxels: {group.size} ranks have no views to share; expected one process"
             )
         self.group, self.rank, self.ranks = group, group.rank, group.size
         self._sums: GradientSum | None = None
         self._present: list[bool] = []
-        self._checksum = 0
+        self._checksum = 0  # sum of the bits of all positions before the step
         self._stopping = False
         self._agreed = self._agreed_at = self._after = 0.0
 
@@ -89,8 +88,7 @@ class DistributedTrainer(Trainer):
         """
         views, digest = self.dataset.train, hashlib.sha256()
         for name, value in sorted(self.state()[0].items()):
-            digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
-            digest.update(value.contiguous().numpy().tobytes())
+            digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode() + value.contiguous().numpy().tobytes())
         settings = hashlib.sha256(repr((self.settings, self.renderer)).encode())
         facts = {
             "steps done": self.step,
@@ -126,7 +124,7 @@ class DistributedTrainer(Trainer):
         own = drawn[self.rank :: self.ranks]
         after = int(self.order[self.rank]) if len(self.order) > self.rank else None
         upcoming = [*(index for index, _ in own[1:]), after]
-        self._checksum = _checksum(self.model.params["means"])
+        self._checksum = int(self.model.params["means"].detach().view(torch.int32).sum())
         if self._sums is None or not self._sums.fits(self.model.params):
             self._sums = GradientSum(self.model.params, self.group)
         self._present = [False] * len(self.model.params)
@@ -144,8 +142,8 @@ class DistributedTrainer(Trainer):
         assert self._sums is not None
         self._agreed_at = time.perf_counter()
         elapsed = self.elapsed + self._after + self._agreed_at - start
-        own = _Message(self._checksum, elapsed, self.stop_requested(), self._present, results)
-        messages: list[_Message] = self.group.gather(own)
+        own = _RankMessage(self._checksum, elapsed, self.stop_requested(), self._present, results)
+        messages: list[_RankMessage] = self.group.gather(own)
         for rank, message in enumerate(messages):
             if message.checksum != messages[0].checksum:
                 raise RankError(
@@ -164,26 +162,17 @@ class DistributedTrainer(Trainer):
         return self._agreed
 
 
-def _checksum(means: Tensor) -> int:
-    """Sum of the bits of all numbers."""
-    return int(means.detach().view(torch.int32).sum())
-
-
-def _pad(numbers: int) -> int:
+def _pad_to_alignment(numbers: int) -> int:
     return -(-numbers // _ALIGNMENT) * _ALIGNMENT
 
 
 class GradientSum:
-    """Sums gradients and contributions over the views of all ranks, in the order of the views.
+    """Sum gradients and contributions over the views of all ranks, in the order of the views.
 
-    Floating-point sums depend on their order, and an all-reduce adds in an order of its own. Here every rank owns a
-    slice of a flat buffer, receives that slice of every view, adds the views one after the other as one process does,
-    and sends the sum to the others. This moves as many bytes as a ring all-reduce. The buffers are reused: new memory
-    pages cost as much as sending them.
-
-    Args:
-        params: name -> (N, ...) float32.
-        group: the ranks.
+    An all-reduce adds in an order of its own, which changes the bits. Here every rank owns a slice of a flat buffer,
+    receives that slice of every view, adds the views one after the other as one process does, and sends the sum to the
+    others, which moves as many bytes as a ring all-reduce. The buffers are reused: new memory pages cost as much as
+    sending them.
     """
 
     def __init__(self, params: Mapping[str, Tensor], group: ProcessGroup) -> None:
@@ -192,21 +181,21 @@ class GradientSum:
         first = next(iter(params.values()))
         self._count = first.shape[0]
         sizes = [*(value.numel() for value in params.values()), self._count, self._count]
-        width = _pad(-(-sum(map(_pad, sizes)) // group.size))
+        width = _pad_to_alignment(-(-sum(map(_pad_to_alignment, sizes)) // group.size))
         self._buffer, self._received = (torch.zeros(group.size, width, device=first.device) for _ in range(2))
         self._sum = torch.zeros(width, device=first.device)
         self._empty = True
         flat, start, parts = self._buffer.reshape(-1), 0, []
         for size in sizes:
             parts.append(flat[start : start + size])
-            start += _pad(size)
+            start += _pad_to_alignment(size)
         *self._gradients, self._weight, self._error = parts
 
     def fits(self, params: Mapping[str, Tensor]) -> bool:
         """Whether it was made for parameters of these shapes."""
         return self.shapes == {name: value.shape for name, value in params.items()}
 
-    def add(self, params: Mapping[str, Tensor], tally: Contributions) -> list[bool]:
+    def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:
         """Add one view of every rank, in the order of the ranks. The parameters lose their gradients; returns which of
         them had one."""
         present = []
@@ -217,7 +206,7 @@ class GradientSum:
             else:
                 part.view(value.shape).copy_(value.grad)
             value.grad = None
-        weight, error = tally.of_all(self._count)
+        weight, error = contributions.of_all(self._count)
         self._weight.copy_(weight)
         self._error.copy_(error)
         self.group.exchange(self._buffer, self._received)

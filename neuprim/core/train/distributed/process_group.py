@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import dataclass
 from datetime import timedelta
 from typing import Any
 
@@ -14,7 +16,62 @@ from torch import Tensor
 from torch.distributed.rendezvous import rendezvous
 
 from neuprim.core.errors import ConfigError, RankError
-from neuprim.core.train.distributed.torchrun import TorchrunRank
+
+_NUMBERS = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
+_VARIABLES = (*_NUMBERS, "MASTER_ADDR", "MASTER_PORT")
+
+
+@dataclass(frozen=True)
+class TorchrunRank:
+    """This process among those of torchrun.
+
+    Attributes:
+        rank, size: its number, and how many there are on all machines.
+        local_rank, local_size: the same among those of this machine.
+        address: host and port where they meet.
+    """
+
+    rank: int
+    size: int
+    local_rank: int
+    local_size: int
+    address: str
+
+
+def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunRank | None:
+    """Return this process's rank; None for a process that works alone.
+
+    Raises:
+        ConfigError: the environment has some of torchrun's variables, or values that cannot be.
+    """
+    # an address alone does not count: it is often set for a whole machine
+    if not any(name in environment for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK")):
+        return None
+    present = [name for name in _VARIABLES if environment.get(name, "") != ""]
+    missing = [name for name in _VARIABLES if name not in present]
+    if missing:
+        raise ConfigError(
+            f"environment: {', '.join(present)} without {', '.join(missing)}; expected all that torchrun sets, or none"
+        )
+    values = {}
+    for name in _NUMBERS:
+        text = environment[name]
+        if not text.isascii() or not text.isdigit():
+            raise ConfigError(f"environment: {name}={text}: expected a whole number, as torchrun sets it")
+        values[name] = int(text)
+    rank, size, local_rank, local_size = values.values()
+    for name, value, most in (("RANK", rank, size), ("LOCAL_RANK", local_rank, local_size)):
+        if value >= most:
+            whole = "WORLD_SIZE" if name == "RANK" else "LOCAL_WORLD_SIZE"
+            raise ConfigError(f"environment: {name}={value} with {whole}={most}: expected less")
+    if local_size > size or local_rank > rank:
+        raise ConfigError(
+            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected no more "
+            f"there than in all"
+        )
+    address = f"{environment['MASTER_ADDR']}:{environment['MASTER_PORT']}"
+    return TorchrunRank(rank, size, local_rank, local_size, address) if size > 1 else None
+
 
 MEETING = timedelta(minutes=5)
 """How long ranks wait for the last one to start."""
@@ -23,8 +80,7 @@ TIMEOUT = timedelta(hours=12)
 """How long a rank waits for another one, which may generate data or evaluate. A rank that ends breaks its connections
 at once, and torchrun ends the others."""
 
-_FAILED = "failed"
-"""Key of the store: the first failure of any rank."""
+_FAILED = "failed"  # key of the store: the first failure of any rank
 
 
 class ProcessGroup:

@@ -165,7 +165,7 @@ def test_a_training_without_views_is_refused(tmp_path: Path) -> None:
     ]
     config = compose(overrides)
     first, _ = run_ranks(2, lambda group: prepare_training(config, group=group))
-    assert isinstance(first, ConfigError) and "no views that 2 ranks could share" in str(first)
+    assert isinstance(first, ConfigError) and "2 ranks have no views to share" in str(first)
 
 
 # ------------------------------------------------------------ failures

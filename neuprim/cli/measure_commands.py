@@ -24,8 +24,7 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from neuprim.runs.paper import Planned as PlannedRun
-    from neuprim.runs.paper import Table as PaperTable
+    from neuprim.runs.paper import PaperTable, PlannedRun
     from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 
 
@@ -109,10 +108,10 @@ def _bench(args: argparse.Namespace) -> int:
     from neuprim.cli.run_commands import run_one
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.open import read_metrics
-    from neuprim.runs.paper import plan, tables
+    from neuprim.runs.paper import load_paper_tables, plan_paper_runs
 
     wanted = parse_table_numbers(args.tables)
-    chosen = [table for table in tables() if wanted & set(table.numbers)]
+    chosen = [table for table in load_paper_tables() if wanted & set(table.numbers)]
     if args.data is None:
         print(*_list_paper_tables(chosen), sep="\n")
         return 0
@@ -121,7 +120,7 @@ def _bench(args: argparse.Namespace) -> int:
         name, _, folder = text.partition("=")
         scenes[name.strip().lower()] = (folder or name).strip()
     rows = args.rows.split(",") if args.rows else []
-    planned = plan(args.data, chosen, scenes, rows, args.budget, args.seeds, args.out, args.overrides)
+    planned = plan_paper_runs(args.data, chosen, scenes, rows, args.budget, args.seeds, args.out, args.overrides)
     print(*_describe_bench_plan(planned), sep="\n", flush=True)
     if args.estimate:
         return 0
@@ -163,7 +162,7 @@ def _list_paper_tables(chosen: Sequence[PaperTable]) -> Iterator[str]:
 
 def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
     """What would run, and for how long: seconds of a budget, else steps at the pace of a row's first scene."""
-    from neuprim.runs.paper import pace
+    from neuprim.runs.paper import measure_starting_pace
 
     total, paces, longer = 0.0, dict[tuple[str, str], float](), ""
     for one in planned:
@@ -173,7 +172,7 @@ def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
             continue
         assert train.iterations is not None, "a run without seconds has steps"
         if key not in paces:
-            paces[key] = pace(one)
+            paces[key] = measure_starting_pace(one)
             start = f"{1e3 * paces[key]:.0f} ms a step at the start"
             yield f"{one.row.name}, {one.scene}: {start}, {train.iterations:,} steps"
         total += paces[key] * train.iterations
@@ -183,7 +182,7 @@ def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
 
 
 def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Iterator[str]:
-    from neuprim.runs.paper import compared
+    from neuprim.runs.paper import compare_with_paper
 
     steps, seconds = metrics["iterations"], _format_seconds(metrics["train_seconds"])
     yield (
@@ -194,7 +193,7 @@ def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
     own = " ".join(text for text in one.config.overrides if not text.startswith(protocol))
     width, height = metrics["image_size"]
     yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{f', {own}' if own else ''}"
-    for kind, ours, theirs, other in compared(one, metrics):
+    for kind, ours, theirs, other in compare_with_paper(one, metrics):
         beside = (
             f"   {one.row.beside[0]} {_format_measure(other, kind)}"
             if one.row.beside[0] and kind in _PAPER_MEASURES
@@ -205,7 +204,7 @@ def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
 
 def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, Any]]]) -> Iterator[str]:
     """Per row, over scenes and seeds that have both numbers."""
-    from neuprim.runs.paper import compared
+    from neuprim.runs.paper import compare_with_paper
 
     rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
     for one, metrics in results:
@@ -214,7 +213,7 @@ def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, An
         scenes, seeds = len({one.scene for one, _ in own}), len({one.config.seed for one, _ in own})
         count = f"{scenes} scenes, {seeds} seed{'s' * (seeds > 1)}"
         yield f"{title}, {name}: means over {count}; ours of the last checkpoint, the paper's of the best"
-        pairs = [pair for one, metrics in own for pair in compared(one, metrics)]
+        pairs = [pair for one, metrics in own for pair in compare_with_paper(one, metrics)]
         for kind in _PAPER_MEASURES:
             both = [(a, b) for what, a, b, _ in pairs if what == kind and a is not None and b is not None]
             if both:

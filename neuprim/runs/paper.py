@@ -1,8 +1,7 @@
 """The paper's tables, and the runs that stand for their rows: ``neuprim bench paper``.
 
-What a run is compared by are its ``psnr``, and its ``ssim_3dgs`` and ``lpips_3dgs``, the rules by which tables like
-these are made. It is the last checkpoint of one seed; the paper's are the best of a run on the test views, whose number
-of seeds it does not say.
+Runs are compared by ``psnr``, ``ssim_3dgs`` and ``lpips_3dgs``, the rules by which such tables are made. Numbers of a
+run are those of its last checkpoint; the paper's are the best of a run on the test views.
 """
 
 from __future__ import annotations
@@ -22,13 +21,12 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.metrics import from_json
 from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
 
-_KINDS = ("psnr", "ssim", "lpips")
-_OURS = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
+_OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 _UNITS = {"s": 1, "m": 60, "h": 3600}
 
 
 @dataclass(frozen=True)
-class Figures:
+class PaperFigures:
     """Numbers of one scene; None for one that is not there."""
 
     psnr: float | None
@@ -38,7 +36,7 @@ class Figures:
 
 
 @dataclass(frozen=True)
-class Row:
+class PaperRow:
     """One of the paper's models.
 
     Attributes:
@@ -50,12 +48,12 @@ class Row:
 
     name: str
     preset: str
-    figures: Mapping[str, Figures]
-    beside: tuple[str, Mapping[str, Figures]]
+    figures: Mapping[str, PaperFigures]
+    beside: tuple[str, Mapping[str, PaperFigures]]
 
 
 @dataclass(frozen=True)
-class Table:
+class PaperTable:
     """Tables of one data set.
 
     Attributes:
@@ -70,44 +68,43 @@ class Table:
     loader: str
     scenes: tuple[str, ...]
     images: Mapping[str, str]
-    rows: tuple[Row, ...]
+    rows: tuple[PaperRow, ...]
 
 
 @dataclass(frozen=True)
-class Planned:
+class PlannedRun:
     """A run that stands for a row in one scene."""
 
-    table: Table
-    row: Row
+    table: PaperTable
+    row: PaperRow
     scene: str
     config: RunConfig
 
 
-def tables() -> list[Table]:
+def load_paper_tables() -> list[PaperTable]:
     """All of the paper's tables, as shipped."""
     text = (resources.files(__package__) / "paper_tables.yaml").read_text(encoding="utf-8")
-    return [_table(entry) for entry in yaml.safe_load(text)]
+    return [_parse_table(entry) for entry in yaml.safe_load(text)]
 
 
-def _table(entry: Mapping[str, Any]) -> Table:
+def _parse_table(entry: Mapping[str, Any]) -> PaperTable:
     scenes = tuple(entry["scenes"])
 
-    def figures(found: Mapping[str, Any]) -> dict[str, Figures]:
-        columns = [found[kind] for kind in _KINDS] + [found.get("primitives", [None] * len(scenes))]
-        return {scene: Figures(*values) for scene, *values in zip(scenes, *columns, strict=True)}
+    def figures(found: Mapping[str, Any]) -> dict[str, PaperFigures]:
+        columns = [found[kind] for kind in _OWN_NAMES] + [found.get("primitives", [None] * len(scenes))]
+        return {scene: PaperFigures(*values) for scene, *values in zip(scenes, *columns, strict=True)}
 
     rows = []
     for row in entry["rows"]:
-        beside = row.get("beside")
-        rows.append(
-            Row(row["name"], row["preset"], figures(row), (beside["name"], figures(beside)) if beside else ("", {}))
-        )
+        other = row.get("beside")
+        beside = (other["name"], figures(other)) if other else ("", {})
+        rows.append(PaperRow(row["name"], row["preset"], figures(row), beside))
     images = dict(zip(scenes, entry.get("images", ()), strict="images" in entry))
-    return Table(entry["title"], tuple(entry["tables"]), entry["loader"], scenes, images, tuple(rows))
+    return PaperTable(entry["title"], tuple(entry["tables"]), entry["loader"], scenes, images, tuple(rows))
 
 
-def budget_words(budget: str) -> list[str]:
-    """Settings of a budget: "full", the preset's own steps, or a run's seconds of training as 90s, 10m or 2h.
+def budget_overrides(budget: str) -> list[str]:
+    """Overrides of a budget: "full", the preset's own steps, or a run's seconds of training as 90s, 10m or 2h.
 
     Raises:
         ConfigError: it is something else.
@@ -120,16 +117,16 @@ def budget_words(budget: str) -> list[str]:
     return [f"train.max_seconds={float(match[1]) * _UNITS[match[2]]:g}"]
 
 
-def plan(
+def plan_paper_runs(
     data: Path,
-    chosen: Sequence[Table],
+    tables: Sequence[PaperTable],
     scenes: Mapping[str, str],
     rows: Sequence[str],
     budget: str,
     seeds: int,
     out: Path,
     words: Sequence[str],
-) -> list[Planned]:
+) -> list[PlannedRun]:
     """Every run of the rows whose data are there, checked before one starts.
 
     Args:
@@ -143,70 +140,59 @@ def plan(
     Raises:
         ConfigError: no such scene, row or folder, nothing found, or a setting that is refused.
     """
-    _known("--scenes", scenes, [s for t in chosen for s in t.scenes])
-    _known("--rows", rows, [r.name for t in chosen for r in t.rows])
+    every_scene = [scene for table in tables for scene in table.scenes]
+    every_row = [row.name for table in tables for row in table.rows]
+    for flag, given, known in (("--scenes", scenes, every_scene), ("--rows", rows, every_row)):
+        for name in given:
+            if name not in known:
+                raise ConfigError(f"{flag} {name}: not in these tables{nearest(name, known)}")
     if not data.is_dir():
         raise ConfigError(f"--data {data}: no such folder")
     folders = {entry.name.casefold(): entry for entry in sorted(data.iterdir()) if entry.is_dir()}
-    found = []
-    for table in chosen:
+    common = [*budget_overrides(budget), *words]
+    planned = []
+    for table in tables:
         for scene in (s for s in table.scenes if not scenes or s in scenes):
             folder = folders.get(scenes.get(scene, scene).casefold()) or folders.get(f"{scene}s")
+            if folder is None and scenes:
+                raise ConfigError(f"--scenes {scene}: {data} has no folder {scenes[scene]}")
             if folder is None:
-                if scenes:
-                    raise ConfigError(f"--scenes {scene}: {data} has no folder {scenes[scene]}")
                 continue
+            own = ["task=static", f"scene={table.loader}", f"scene.path='{folder}'"]
+            if scene in table.images and (folder / table.images[scene]).is_dir():
+                own.append(f"scene.images={table.images[scene]}")
             for row in (r for r in table.rows if not rows or r.name in rows):
                 for seed in range(seeds):
-                    name = f"{scene}-{row.name}-{budget}-seed{seed}"
-                    own = [
-                        f"scene={table.loader}",
-                        f"scene.path='{folder}'",
-                        f"preset={row.preset}",
-                        f"seed={seed}",
-                        f"output_dir='{out / name}'",
-                    ]
-                    if scene in table.images and (folder / table.images[scene]).is_dir():
-                        own.append(f"scene.images={table.images[scene]}")
-                    found.append(
-                        Planned(table, row, scene, compose(["task=static", *own, *budget_words(budget), *words]))
-                    )
-    if not found:
-        raise ConfigError(
-            f"--data {data}: no folder named like a scene; expected one of "
-            f"{', '.join(s for t in chosen for s in t.scenes)}"
-        )
-    return found
+                    place = f"output_dir='{out / f'{scene}-{row.name}-{budget}-seed{seed}'}'"
+                    config = compose([*own, f"preset={row.preset}", f"seed={seed}", place, *common])
+                    planned.append(PlannedRun(table, row, scene, config))
+    if not planned:
+        raise ConfigError(f"--data {data}: no folder named like a scene; expected one of {', '.join(every_scene)}")
+    return planned
 
 
-def _known(flag: str, given: Sequence[str] | Mapping[str, str], names: Sequence[str]) -> None:
-    for name in given:
-        if name not in names:
-            raise ConfigError(f"{flag} {name}: not in these tables{nearest(name, names)}")
-
-
-def pace(planned: Planned, steps: int = 8) -> float:
+def measure_starting_pace(planned: PlannedRun, steps: int = 8) -> float:
     """Seconds that a step takes at the start of a run, on this machine; a population that grows makes later ones
     slower."""
-    fitted = prepare_training(planned.config)
-    compile_kernels(fitted.trainer)
+    trainer = prepare_training(planned.config).trainer
+    compile_kernels(trainer)
     with use_one_torch_thread():
-        fitted.trainer.train_step()
+        trainer.train_step()
         begin = time.perf_counter()
         for _ in range(steps):
-            fitted.trainer.train_step()
+            trainer.train_step()
         return (time.perf_counter() - begin) / steps
 
 
-def compared(
-    planned: Planned, metrics: Mapping[str, Any]
+def compare_with_paper(
+    planned: PlannedRun, metrics: Mapping[str, Any]
 ) -> Iterator[tuple[str, float | None, float | None, float | None]]:
     """(what, ours, the paper's, that of what the paper puts beside it) of a finished run; None for what is not there.
 
     LPIPS of another network than the paper's tools', VGG, is left out.
     """
-    theirs, other = planned.row.figures[planned.scene], planned.row.beside[1].get(planned.scene)
-    for kind in _KINDS:
-        ours = from_json(metrics, _OURS[kind]) if kind != "lpips" or metrics.get("lpips_network") == "vgg" else None
-        yield kind.upper(), ours, getattr(theirs, kind), None if other is None else getattr(other, kind)
-    yield "primitives", float(metrics["primitives"]), theirs.primitives, None
+    paper, beside = planned.row.figures[planned.scene], planned.row.beside[1].get(planned.scene)
+    for kind, name in _OWN_NAMES.items():
+        ours = from_json(metrics, name) if kind != "lpips" or metrics.get("lpips_network") == "vgg" else None
+        yield kind.upper(), ours, getattr(paper, kind), None if beside is None else getattr(beside, kind)
+    yield "primitives", float(metrics["primitives"]), paper.primitives, None

@@ -41,41 +41,11 @@ _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0,
 
 # ---------------------------------------------------------------- storage formats
 
-
-@dataclass(frozen=True)
-class StorageFormat:
-    """A way to store a tensor.
-
-    Attributes:
-        round_trip: (N, ...) float32 -> the same after storing and reading.
-        bytes: bytes of a tensor so stored.
-    """
-
-    round_trip: Callable[[Tensor], Tensor]
-    bytes: Callable[[Tensor], int]
-
-
-_CODE_BITS = 8
-
-
-def _round_trip_codes(value: Tensor) -> Tensor:
-    flat = value.detach().cpu().reshape(len(value), math.prod(value.shape[1:]))
-    columns = fit_columns(flat, [_CODE_BITS] * flat.shape[1])
-    return columns.values(columns.codes(flat)).reshape(value.shape).to(value)
-
-
-def _code_bytes(value: Tensor) -> int:
-    return value.numel() + 8 * math.prod(value.shape[1:])  # every column has two float32 ends
-
-
 FLOAT32 = "float32"
 """Format of model files."""
 
-FORMATS: Mapping[str, StorageFormat] = {
-    FLOAT32: StorageFormat(lambda value: value, lambda value: 4 * value.numel()),
-    "float16": StorageFormat(lambda value: value.half().float(), lambda value: 2 * value.numel()),
-    "uint8": StorageFormat(_round_trip_codes, _code_bytes),  # even steps between the ends of each column
-}
+FORMATS = (FLOAT32, "float16", "uint8")
+"""``uint8`` has even steps between the ends of each column."""
 
 GROUPS = ("means", "shape", "density", "colour")
 """Groups of parameters: centres, other numbers of the ellipsoids, and both fields."""
@@ -83,7 +53,24 @@ GROUPS = ("means", "shape", "density", "colour")
 ALL_GROUPS = "all"
 
 
-def _parameters_of(model: Primitives, group: str) -> tuple[str, ...]:
+def _round_trip(value: Tensor, format: str) -> Tensor:
+    """(N, ...) float32 after storing and reading."""
+    if format == "float16":
+        return value.half().float()
+    if format == FLOAT32:
+        return value
+    flat = value.detach().cpu().reshape(len(value), math.prod(value.shape[1:]))
+    columns = fit_columns(flat, [8] * flat.shape[1])
+    return columns.values(columns.codes(flat)).reshape(value.shape).to(value)
+
+
+def _stored_bytes(value: Tensor, format: str) -> int:
+    if format == "uint8":
+        return value.numel() + 8 * math.prod(value.shape[1:])  # every column has two float32 ends
+    return (2 if format == "float16" else 4) * value.numel()
+
+
+def _group_parameters(model: Primitives, group: str) -> tuple[str, ...]:
     if group == "means":
         return ("means",)
     if group == "shape":
@@ -101,8 +88,8 @@ def emulate_storage(model: Primitives, storage: Mapping[str, str]) -> Primitives
         return model
     params = dict(model.params)
     for group, name in storage.items():
-        for parameter in _parameters_of(model, group):
-            params[parameter] = FORMATS[name].round_trip(params[parameter].detach())
+        for parameter in _group_parameters(model, group):
+            params[parameter] = _round_trip(params[parameter].detach(), name)
             if not bool(torch.isfinite(params[parameter]).all()):
                 raise ConfigError(f"store.{group}={name}: {parameter} has values outside the range of {name}")
     return Primitives(model.density, model.colour, params)
@@ -111,9 +98,9 @@ def emulate_storage(model: Primitives, storage: Mapping[str, str]) -> Primitives
 def storage_bytes(model: Primitives, storage: Mapping[str, str]) -> int:
     """Return the bytes of the model's tensors, each group in its format."""
     return sum(
-        FORMATS[storage.get(group, FLOAT32)].bytes(model.params[name])
+        _stored_bytes(model.params[name], storage.get(group, FLOAT32))
         for group in GROUPS
-        for name in _parameters_of(model, group)
+        for name in _group_parameters(model, group)
     )
 
 
@@ -150,8 +137,8 @@ class RenderConfig:
         """Return overrides that :func:`parse_render_config` reads back, over default settings."""
         before = dataclasses.asdict(defaults)
         values = dataclasses.asdict(self.settings)
-        words = [_override(f"renderer.{name}", value) for name, value in values.items() if value != before[name]]
-        words += [_override("resolution", self.resolution)] if self.resolution != 1.0 else []
+        words = [_format_override(f"renderer.{name}", value) for name, value in values.items() if value != before[name]]
+        words += [_format_override("resolution", self.resolution)] if self.resolution != 1.0 else []
         words += [f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()]
         formats = set(self.storage.values())
         if len(self.storage) == len(GROUPS) and len(formats) == 1 and formats != {FLOAT32}:
@@ -215,7 +202,8 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
         elif head in KINDS and dot:
             reduced[head, name] = validate_reduction(model.density, model.colour, head, name, assignment.value)
         elif head == "store" and dot:
-            storage |= dict.fromkeys(GROUPS if name == ALL_GROUPS else [name], _check_format(name, assignment.value))
+            format = _check_storage_format(name, assignment.value)
+            storage |= dict.fromkeys(GROUPS if name == ALL_GROUPS else [name], format)
         else:
             known = [
                 *(f"renderer.{name}" for name in values),
@@ -232,7 +220,7 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
     return RenderConfig(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
 
 
-def _check_format(group: str, name: Any) -> str:
+def _check_storage_format(group: str, name: Any) -> str:
     if group not in (*GROUPS, ALL_GROUPS):
         raise ConfigError(f"store.{group}: no such group of parameters{nearest(group, (*GROUPS, ALL_GROUPS))}")
     if name not in FORMATS:
@@ -240,7 +228,7 @@ def _check_format(group: str, name: Any) -> str:
     return str(name)
 
 
-def _override(key: str, value: Any) -> str:
+def _format_override(key: str, value: Any) -> str:
     if isinstance(value, str):
         return quote_override(key, value)
     return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value).removesuffix('.0')}"

@@ -161,7 +161,7 @@ class _RenderSession:
         self._visible = [False] * len(self.views)
 
     def _load_lights(self, environment: EnvironmentFile | None) -> Sequence[Conditions]:
-        """Conditions of the lights that stand for an environment; none without one."""
+        """Conditions of the lights that replace an environment; none without one."""
         if environment is None:
             return ()
         with self.run.plugins.attribute_errors():
@@ -265,11 +265,11 @@ class _RenderSession:
 
     def _count_pass(self, alpha: torch.Tensor) -> None:
         """Called after every image of a view under a light, with its alpha."""
-        each, count = max(len(self.lights), 1), len(self.views)
-        self._visible[self._passes // each] |= bool((alpha > 0).any())
+        lights, count = max(len(self.lights), 1), len(self.views)
+        number = self._passes // lights
+        self._visible[number] |= bool((alpha > 0).any())
         self._passes += 1
-        done = self._passes
-        self.progress(f"view {done // each + (done % each > 0)} of {count}", done / (each * count))
+        self.progress(f"view {number + 1} of {count}", self._passes / (lights * count))
 
     def _check_visible(self) -> None:
         """Warn of images that show nothing of the model; refuse a request of which all do.
@@ -284,9 +284,8 @@ class _RenderSession:
         if len(empty) < len(self.views):
             self.notify(f"warning: {len(empty)} of {len(self.views)} images are empty, first {empty[0].name}: {where}")
             return
-        hint = "; a file's cameras are in the units of the run's data, or of the model with --space scene"
-        if self.request.camera in SETS or self.request.space == SCENE:
-            hint = ""
+        own = self.request.camera in SETS or self.request.space == SCENE
+        hint = "; a file's cameras are in the units of the run's data, or of the model with --space scene" * (not own)
         raise DataError(f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}{hint}")
 
 
@@ -298,26 +297,18 @@ def _describe_position(model: Primitives, view: View, world: World) -> str:
         return "no primitive is there under these conditions"
     means, reach = geometry.means.double().cpu(), geometry.scales.double().cpu().amax(1, keepdim=True)
     low, high = world.world_box(torch.stack([(means - reach).min(0).values, (means + reach).max(0).values]).numpy())
-    seen = world.world_camera(view.camera)
-    at, towards = seen.position.tolist(), seen.viewmat[2, :3].tolist()
-    return (
-        f"the model is within {_format_point(low)} to {_format_point(high)}, and {view.name} at {_format_point(at)} "
-        f"looks towards {_format_point(towards)}"
-    )
-
-
-def _format_point(numbers: Sequence[float]) -> str:
-    return "(" + ", ".join(f"{x:.7g}" for x in numbers) + ")"
+    camera = world.world_camera(view.camera)
+    points = low, high, camera.position.tolist(), camera.viewmat[2, :3].tolist()
+    start, end, at, towards = ("(" + ", ".join(f"{x:.7g}" for x in point) + ")" for point in points)
+    return f"the model is within {start} to {end}, and {view.name} at {at} looks towards {towards}"
 
 
 def _write_image(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
     """Write one image: all channels as the data set has them in npy, or what its channels look like."""
     if format == "npy":
         write_npy(path, pixels.contiguous().numpy())
-    elif format == "png":
-        images.write_png(path, channels.display(pixels))
-    elif format == "webp":
-        images.write_webp(path, channels.display(pixels))
+    elif format in ("png", "webp"):
+        (images.write_png if format == "png" else images.write_webp)(path, channels.display(pixels))
     else:
         write_animation(path, [channels.display(pixels)], fps or 12.0)
 

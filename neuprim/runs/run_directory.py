@@ -45,14 +45,13 @@ def lock_directory(directory: Path, what: str = "run") -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         raise ConfigError(
-            f"{directory}: {_holder(file)} is at work on this {what}; expected that to end first, or another output_dir"
+            f"{directory}: {_describe_lock_holder(file)} is at work on this {what}; expected that to end first, or "
+            f"another output_dir"
         ) from None
+    owner = {"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}
     try:
         with suppress(OSError):  # a note for others; on Windows a locked file cannot be written
-            file.write_text(
-                json.dumps({"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}),
-                encoding="utf-8",
-            )
+            file.write_text(json.dumps(owner), encoding="utf-8")
         remove_leftovers(directory)
         yield
     finally:
@@ -65,7 +64,7 @@ def lock_directory(directory: Path, what: str = "run") -> Iterator[None]:
                 directory.rmdir()
 
 
-def _holder(file: Path) -> str:
+def _describe_lock_holder(file: Path) -> str:
     try:
         data = load_json(file.read_text(encoding="utf-8"))
         return f"process {int(data['pid'])} on {data['host']} (since {data['since']})"
@@ -75,21 +74,20 @@ def _holder(file: Path) -> str:
 
 # ------------------------------------------------------------ results
 
-_PAGES = ("metrics.json", "report.html", "viewer.html")
-_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst(_\d{3,}\.png|\.json)")
+_RESULT_FILES = ("metrics.json", "report.html", "viewer.html")
+_RESULT_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst(_\d{3,}\.png|\.json)")
 
 
 def result_files(run_dir: Path) -> list[Path]:
     """List the files that the end of a run wrote: metrics, pictures and report; not what other commands drew into
     ``renders/``."""
-    folder = run_dir / "renders"
-    pictures = [path for path in sorted(folder.iterdir()) if _PICTURES.fullmatch(path.name)] if folder.is_dir() else []
-    return [*(path for name in _PAGES if (path := run_dir / name).is_file()), *pictures]
+    pictures = (path for path in sorted((run_dir / "renders").glob("*")) if _RESULT_PICTURES.fullmatch(path.name))
+    return [*(path for name in _RESULT_FILES if (path := run_dir / name).is_file()), *pictures]
 
 
 def discard_results(run_dir: Path) -> None:
-    """Remove them. A run that resumes does so before its model changes, so that a kill never leaves numbers of another
-    model."""
+    """Remove the results. A run that resumes does so before its model changes, so that a kill never leaves numbers of
+    another model."""
     for path in result_files(run_dir):
         path.unlink(missing_ok=True)
 

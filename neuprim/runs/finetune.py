@@ -34,12 +34,7 @@ _PACE_WARMUP, _PACE_STEPS = 5, 20
 
 
 def fine_tuner(
-    job: Job,
-    dataset: Dataset,
-    model: Primitives,
-    steps: int,
-    begin: float = BEGIN,
-    voxels_every: int = VOXELS_EVERY,
+    job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
     """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 

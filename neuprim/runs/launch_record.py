@@ -72,11 +72,7 @@ class LaunchRecord:
     def end_run(self, number: int, result: JobResult) -> LaunchRecord:
         """The record after a run has ended."""
         run = replace(
-            self.runs[number],
-            state=result.state,
-            line=result.line,
-            seconds=result.seconds,
-            attempts=result.attempts,
+            self.runs[number], state=result.state, line=result.line, seconds=result.seconds, attempts=result.attempts
         )
         return replace(self, runs=(*self.runs[:number], run, *self.runs[number + 1 :]))
 

@@ -27,16 +27,7 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.finetune import fine_tuner, steps_in
-from neuprim.runs.fit import (
-    Events,
-    Finishing,
-    Fitted,
-    Note,
-    Preparing,
-    ignore_event,
-    is_chunked,
-    refuse_chunks,
-)
+from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_event, is_chunked, refuse_chunks
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.jobs import ENDED, JobStatus
 from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record

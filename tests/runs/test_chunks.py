@@ -165,8 +165,7 @@ def _fail_first(data: Any, attempt: int, events: Any) -> str:
 def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "copy")
     with pytest.raises(
-        ConfigError,
-        match=r"chunks.json: begun with frames_1-4, .* ask for frames_1-3, .*; expected the same words",
+        ConfigError, match=r"chunks.json: begun with frames_1-4, .* ask for frames_1-3, .*; expected the same words"
     ):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")

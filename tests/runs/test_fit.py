@@ -58,15 +58,8 @@ def test_shares_that_cannot_be(scene: Path, tmp_path: Path, more: list[str], mes
 
 def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None:
     """Its films are of test cameras, whose views nobody has then."""
-    asked = [
-        "task=dynamic",
-        "scene=smoke_fire",
-        "scene.size=16",
-        "scene.timesteps=6",
-        "scene.cameras=6",
-        "scene.resolution=16",
-        "model.primitives=20",
-    ]
+    scene = "task=dynamic scene=smoke_fire scene.size=16 scene.timesteps=6 scene.cameras=6 scene.resolution=16"
+    asked = [*scene.split(), "model.primitives=20"]
     config = compose([*asked, "train.iterations=2", "train.max_seconds=null", f"output_dir={tmp_path / 'out'}"])
     fitted = train_to_end(prepare_training(config, hold_out=3))
     metrics = fitted.metrics()

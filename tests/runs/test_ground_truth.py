@@ -42,15 +42,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def words(files: Path, place: Path, *more: str) -> list[str]:
-    scene = [f"scene.vdb='{files}'", "scene.look=smoke_fire", "scene.size=16", "scene.cameras=4", "scene.samples=1"]
-    return [
-        "task=dynamic",
-        "scene=vdb",
-        *scene,
-        f"scene.cache='{place / 'cache'}'",
-        f"output_dir='{place / 'outputs' / 'run'}'",
-        *more,
-    ]
+    scene = "task=dynamic scene=vdb scene.look=smoke_fire scene.size=16 scene.cameras=4 scene.samples=1".split()
+    places = [f"scene.vdb='{files}'", f"scene.cache='{place / 'cache'}'", f"output_dir='{place / 'outputs' / 'run'}'"]
+    return [*scene, *places, *more]
 
 
 def config(files: Path, place: Path, *more: str) -> RunConfig:

@@ -78,8 +78,4 @@ def test_a_files_times_are_the_frames_where_the_task_has_a_time() -> None:
 
 def test_no_two_views_share_a_file() -> None:
     assert _view_file_names(("a/b", "c d")) == ["a_b", "c_d"]
-    assert _view_file_names(("a/b", "a_b", "A_B")) == [
-        "000_a_b",
-        "001_a_b",
-        "002_A_B",
-    ]
+    assert _view_file_names(("a/b", "a_b", "A_B")) == ["000_a_b", "001_a_b", "002_A_B"]

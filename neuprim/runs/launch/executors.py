@@ -277,22 +277,6 @@ def _divide_ray_cluster(ray: Any, settings: LauncherSettings, jobs: int) -> tupl
 # ------------------------------------------------------------ Slurm
 
 
-@dataclass(frozen=True)
-class RequeuedTask:
-    """A task that submitit may stop and queue again, when Slurm takes the machine away or its time is up."""
-
-    task: WorkerTask
-
-    def __call__(self) -> JobResult:
-        return self.task()
-
-    def checkpoint(self) -> Any:
-        """The task that takes its place, which continues from the run's checkpoint."""
-        from submitit.helpers import DelayedSubmission
-
-        return DelayedSubmission(RequeuedTask(self.task.retry()))
-
-
 class SlurmExecutor:
     """``launcher=slurm``: jobs of a Slurm cluster; submitit's local executor uses processes of this machine.
 
@@ -332,7 +316,7 @@ class SlurmExecutor:
             ) from None
 
     def submit(self, task: WorkerTask) -> Any:
-        self._jobs.append(self._executor.submit(RequeuedTask(task)))
+        self._jobs.append(self._executor.submit(task))
         return self._jobs[-1]
 
     def done(self, handle: Any) -> bool:

@@ -17,6 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
+from typing import Any
 
 from neuprim.runs.launch.jobs import JobResult, LaunchJob, StatusListener, perform_job, write_status
 
@@ -68,6 +69,12 @@ class WorkerTask:
     def retry(self) -> WorkerTask:
         """The same task after its worker died."""
         return replace(self, attempt=self.attempt + 1)
+
+    def checkpoint(self) -> Any:
+        """What submitit queues when Slurm takes the machine away or its time is up: the task, which continues."""
+        from submitit.helpers import DelayedSubmission
+
+        return DelayedSubmission(self.retry())
 
     def __call__(self) -> JobResult:
         os.environ.update(self.variables)

@@ -27,14 +27,7 @@ from tests.pretend_card import CARD, pretended
 from tests.short_runs import words
 from tests.tasks.dynamic.sequences import blob
 
-LIT = [
-    "task=relight",
-    "scene=lit_solids",
-    "scene.size=24",
-    "scene.train_views=6",
-    "scene.test_views=2",
-    "scene.supersampling=1",
-]
+LIT = "task=relight scene=lit_solids scene.size=24 scene.train_views=6 scene.test_views=2 scene.supersampling=1".split()
 SMALL = ["model.primitives=80", "model.neurons=2", "train.max_seconds=null"]
 TASKS = {
     "lights": [*LIT, *SMALL, "model.colour.hidden=3"],
@@ -43,41 +36,19 @@ TASKS = {
 
 
 def configured(task: str, tmp_path: Path, *more: str) -> list[str]:
+    population = ["train.population.every=3", "train.population.start=0.0"]
     if task == "static":
-        base = words(
-            tiny.write_blender(tmp_path / "two"),
-            tmp_path / "run",
-            8,
-            "train.population.every=3",
-            "train.population.start=0.0",
-            "train.rates.quats=0",
-        )
-    else:
-        if task == "time":
-            folder = tmp_path / "ball"
-            folder.mkdir(exist_ok=True)
-            for number in range(1, 4):
-                write_vdb(folder / f"ball_{number}.vdb", blob(6.0 + 3 * number))
-            own = [
-                "task=dynamic",
-                "scene=vdb",
-                f"scene.vdb='{folder}'",
-                "scene.look=smoke_fire",
-                "scene.size=24",
-                "scene.cameras=4",
-                "scene.samples=1",
-            ]
-        else:
-            own = TASKS[task]
-        base = [
-            *own,
-            *SMALL,
-            f"output_dir={tmp_path / 'run'}",
-            "train.iterations=8",
-            "train.population.every=3",
-            "train.population.start=0.0",
-        ]
-    return [*base, *more]
+        scene = tiny.write_blender(tmp_path / "two")
+        return words(scene, tmp_path / "run", 8, *population, "train.rates.quats=0", *more)
+    own = TASKS.get(task, [])
+    if task == "time":
+        folder = tmp_path / "ball"
+        folder.mkdir(exist_ok=True)
+        for number in range(1, 4):
+            write_vdb(folder / f"ball_{number}.vdb", blob(6.0 + 3 * number))
+        files = "task=dynamic scene=vdb scene.look=smoke_fire scene.size=24 scene.cameras=4 scene.samples=1"
+        own = [*files.split(), f"scene.vdb='{folder}'"]
+    return [*own, *SMALL, f"output_dir={tmp_path / 'run'}", "train.iterations=8", *population, *more]
 
 
 def trained(words: list[str], dataset: Dataset | None, steps: int) -> tuple[Fitted, list[Any]]:

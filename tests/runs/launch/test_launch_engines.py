@@ -145,13 +145,10 @@ def test_submitit_does_all_sorts_of_jobs(tmp_path: Path) -> None:
 def test_submitit_queues_again_with_what_goes_on(tmp_path: Path) -> None:
     """What submitit asks for before a machine is taken away: a task that knows that it was begun."""
     pytest.importorskip("submitit")
-    from neuprim.runs.launch.executors import RequeuedTask
     from neuprim.runs.launch.worker import WorkerTask
 
-    again = RequeuedTask(
-        WorkerTask(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
-    ).checkpoint()
-    assert again.function.task.attempt == 1
+    task = WorkerTask(job("once", launching.die, 1), 1, tmp_path / "0.json", tmp_path / "stop", tmp_path)
+    assert task.checkpoint().function.attempt == 1
 
 
 def test_without_slurm_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -53,7 +53,7 @@ def _color_table() -> NDArray[np.uint8]:
 
 
 @dataclass(frozen=True)
-class Inlined:
+class InlinedPicture:
     """A picture as a ``data:`` address, its size in pixels, and whether it was compressed on the way."""
 
     url: str
@@ -62,7 +62,7 @@ class Inlined:
     compressed: bool
 
 
-def inline(path: Path) -> Inlined | None:
+def inline_picture(path: Path) -> InlinedPicture | None:
     """Return a picture file for an ``img`` element; None if it is damaged, as an interrupted run may leave it."""
     content = path.read_bytes()
     try:
@@ -75,6 +75,6 @@ def inline(path: Path) -> Inlined | None:
                 image.convert("RGBA" if clear else "RGB").save(buffer, "WEBP", quality=90, method=4)
                 content, kind = buffer.getvalue(), "image/webp"
             url = f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-            return Inlined(url, *image.size, compressed)
+            return InlinedPicture(url, *image.size, compressed)
     except (UnidentifiedImageError, OSError, SyntaxError):
         return None

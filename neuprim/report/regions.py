@@ -18,9 +18,9 @@ from neuprim.core.io.files import read_json, write_json
 from neuprim.core.io.plain import finite
 from neuprim.report.pictures import error_map
 
-FILE = "worst.json"  # beside the pictures in ``renders/``
-SHARE, LEAST = 0.25, 16  # side of a region over the shorter side of its image, and in pixels
-MOST = 60  # views whose regions are kept: the worst of them
+REGIONS_FILE = "worst.json"  # beside the pictures in ``renders/``
+_SIDE_SHARE, MIN_SIDE = 0.25, 16  # side of a region over the shorter side of its image, and in pixels
+MAX_REGIONS = 60  # views whose regions are kept: the worst of them
 _STEPS = 8  # places along a region's side at which regions are compared
 
 
@@ -45,7 +45,7 @@ def worst_region(rendered: Tensor, truth: Tensor) -> Region:
         rendered, truth: (H, W, C) images in the same colour space.
     """
     height, width = truth.shape[:2]
-    side = min(max(round(SHARE * min(height, width)), LEAST), height, width)
+    side = min(max(round(_SIDE_SHARE * min(height, width)), MIN_SIDE), height, width)
     error = (rendered.double() - truth.double()).square().mean(-1)[None, None]
     stride = max(side // _STEPS, 1)
     means = F.avg_pool2d(error, side, stride)[0, 0]
@@ -54,7 +54,7 @@ def worst_region(rendered: Tensor, truth: Tensor) -> Region:
     return Region(column * stride, row * stride, side, -10 * math.log10(mse) if mse > 0 else math.inf)
 
 
-class Regions:
+class WorstRegions:
     """Collects the worst regions of views as they are measured, and writes those of the worst views.
 
     Args:
@@ -65,7 +65,7 @@ class Regions:
         self._display = display
         self._found: list[tuple[Region, str, Tensor]] = []
 
-    def look(self, name: str, rendered: Tensor, truth: Tensor) -> None:
+    def add_view(self, name: str, rendered: Tensor, truth: Tensor) -> None:
         """Remember a view's worst region."""
         region = worst_region(rendered, truth)
         if not math.isfinite(region.psnr):
@@ -74,7 +74,7 @@ class Regions:
         shown = [images.to_uint8(self._display(x)) for x in (first, second)]
         self._found.append((region, name, torch.cat([*shown, torch.from_numpy(error_map(second, first))], dim=1)))
         self._found.sort(key=lambda found: found[0].psnr)
-        del self._found[MOST:]
+        del self._found[MAX_REGIONS:]
 
     def write(self, folder: Path) -> None:
         """Write ``worst_000.png`` (truth, render and error side by side), the worst first, and ``worst.json``."""
@@ -82,7 +82,7 @@ class Regions:
         for place, (region, name, picture) in enumerate(self._found):
             images.write_png(folder / f"worst_{place:03d}.png", picture)
             entries.append({"file": f"worst_{place:03d}.png", "name": name, **asdict(region)})
-        write_json(folder / FILE, entries)
+        write_json(folder / REGIONS_FILE, entries)
 
 
 @dataclass(frozen=True)
@@ -101,17 +101,17 @@ def read_regions(folder: Path) -> list[RegionFile]:
     Raises:
         DataError: the file is damaged.
     """
-    file = folder / FILE
+    file = folder / REGIONS_FILE
     entries = read_json(file, "a list of regions", "evaluate the run again")
     if entries is None:
         return []
     if not isinstance(entries, list):
         raise DataError(f"{file}: expected a list, found {type(entries).__name__}")
     pictures = {path.name: path for path in folder.glob("worst_*.png")}
-    return [region for entry in entries if (region := _parse_entry(pictures, entry)) is not None]
+    return [region for entry in entries if (region := _parse_region(pictures, entry)) is not None]
 
 
-def _parse_entry(pictures: Mapping[str, Path], entry: Any) -> RegionFile | None:
+def _parse_region(pictures: Mapping[str, Path], entry: Any) -> RegionFile | None:
     """Return a region; None for what is no region of a picture in the folder."""
     if not isinstance(entry, Mapping) or not isinstance(entry.get("file"), str) or entry["file"] not in pictures:
         return None

@@ -89,7 +89,7 @@ class RunRecord:
         """Return the entry of ``per_view`` of a view's pictures; empty where the names do not agree."""
         entries = per_view(self)
         entry = entries[view.index] if view.index < len(entries) else {}
-        return entry if _plain(str(entry.get("name"))) == _plain(view.stem) else {}
+        return entry if _plain_view_name(str(entry.get("name"))) == _plain_view_name(view.stem) else {}
 
 
 def per_view(run: RunRecord) -> list[Mapping[str, Any]]:
@@ -119,7 +119,7 @@ def read_run(run_dir: Path) -> RunRecord:
     config_text = _read_text(files[0])
     config = _read_mapping(files[0], "YAML", lambda text: load_yaml(text) or {})
     metrics = _read_mapping(files[1], "JSON", lambda text: load_json(text, infinite=True))
-    log, unreadable = _parse_log(_read_text(files[2]) or "")
+    log, unreadable = _parse_metrics_log(_read_text(files[2]) or "")
     renders = run_dir / "renders"
     orbit, clips = renders / "orbit.webp", sorted(renders.glob("clip_*.webp"))
     return RunRecord(
@@ -129,7 +129,7 @@ def read_run(run_dir: Path) -> RunRecord:
         metrics,
         log,
         unreadable,
-        _find_views(renders),
+        _find_view_files(renders),
         orbit if orbit.is_file() else None,
         clips,
         read_regions(renders),
@@ -158,7 +158,7 @@ def _read_mapping(path: Path, kind: str, parse: Callable[[str], Any]) -> Mapping
     return data
 
 
-def _parse_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
+def _parse_metrics_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
     """Return readable lines in order of steps, and the number of the others."""
     lines: list[Mapping[str, Any]] = []
     unreadable = 0
@@ -178,7 +178,7 @@ def _parse_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
     return lines, unreadable
 
 
-def _find_views(folder: Path) -> list[ViewFiles]:
+def _find_view_files(folder: Path) -> list[ViewFiles]:
     groups: dict[str, set[str]] = defaultdict(set)
     for path in folder.glob("test_*.png"):
         match = re.match(r"test_(\d+)(_|$)", path.stem)
@@ -195,5 +195,5 @@ def _find_views(folder: Path) -> list[ViewFiles]:
     return views
 
 
-def _plain(name: str) -> str:
+def _plain_view_name(name: str) -> str:
     return re.sub(r"\W+|_+", "_", name).strip("_").lower()

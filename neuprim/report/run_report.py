@@ -11,9 +11,10 @@ from neuprim.core.conditions import flag
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import from_json
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.report import page
+from neuprim.report import report_page as page
 from neuprim.report.charts import HELD_OUT, Chart, Points, curve_chart, view_chart
-from neuprim.report.page import (
+from neuprim.report.pictures import ERROR_SCALE, color_bar, inline_picture
+from neuprim.report.report_page import (
     MISSING,
     Tile,
     escape,
@@ -25,10 +26,9 @@ from neuprim.report.page import (
     note,
     section,
 )
-from neuprim.report.pictures import ERROR_SCALE, color_bar, inline
 from neuprim.report.run_record import RunRecord, ViewFiles, as_number, per_view, read_run
 
-LIMIT = 4_000_000  # bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it
+VIEWER_LIMIT = 4_000_000  # bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it
 _WORST_SHOWN = 12  # worst regions that are shown unfolded
 
 _SOURCES = {
@@ -55,40 +55,42 @@ def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer
 
     Args:
         conditions: those of the run's task; the commands that the page offers animate them.
-        viewer: becomes a part of the page, or ``viewer.html`` beside it where both have more than :data:`LIMIT` bytes.
+        viewer: becomes a part of the page, or ``viewer.html`` beside it where both exceed :data:`VIEWER_LIMIT`.
 
     Raises:
         DataError: the directory is no run, or its ``config.yaml`` or ``metrics.json`` is damaged.
     """
     run_dir = Path(run_dir)
     run, beside, target = read_run(run_dir), run_dir / _VIEWER_FILE, run_dir / "report.html"
-    text = _render(run, conditions, viewer)
-    if viewer is not None and len(text.encode()) > LIMIT:
+    text = _render_report(run, conditions, viewer)
+    if viewer is not None and len(text.encode()) > VIEWER_LIMIT:
         write_text(beside, viewer.text)
-        text = _render(run, conditions, linked=_VIEWER_FILE)
+        text = _render_report(run, conditions, linked=_VIEWER_FILE)
     else:
         beside.unlink(missing_ok=True)  # of an earlier report
     write_text(target, text)
     return target
 
 
-def _render(run: RunRecord, conditions: Sequence[ConditionSpec], viewer: Viewer | None = None, linked: str = "") -> str:
+def _render_report(
+    run: RunRecord, conditions: Sequence[ConditionSpec], viewer: Viewer | None = None, linked: str = ""
+) -> str:
     """Return the report as HTML text, with a viewer in it or a link to one."""
     names = [name for name in (run.name_of("task"), run.name_of("scene")) if name]
     sections = (
-        _head(run),
-        page.banner(_warnings(run)),
-        _headline(run),
-        _model("" if viewer is None else viewer.text, linked),
-        _films(run),
-        _held_out(run),
-        _worst_regions(run),
-        _curves(run),
-        _view_table(run),
-        _settings(run),
-        _facts(run),
-        _commands(run, conditions),
-        _config(run),
+        _report_head(run),
+        page.banner(_report_warnings(run)),
+        _report_headline(run),
+        _report_model("" if viewer is None else viewer.text, linked),
+        _report_films(run),
+        _report_held_out(run),
+        _report_worst_regions(run),
+        _report_curves(run),
+        _report_view_table(run),
+        _report_settings(run),
+        _report_facts(run),
+        _report_commands(run, conditions),
+        _report_config(run),
     )
     policy = "" if viewer is None else f"; script-src 'nonce-{viewer.nonce}'; worker-src blob:"
     return page.render_page(" / ".join(names) or run.run_dir.name, sections, policy=policy)
@@ -97,7 +99,7 @@ def _render(run: RunRecord, conditions: Sequence[ConditionSpec], viewer: Viewer 
 # ---------------------------------------------------------------- head
 
 
-def _head(run: RunRecord) -> str:
+def _report_head(run: RunRecord) -> str:
     """Return task and scene, and a badge unless the data is real."""
     source, drawn = run.field("data_source"), run.field("rendered_from")
     mark = ""
@@ -109,7 +111,7 @@ def _head(run: RunRecord) -> str:
     return page.masthead(run.name_of("task") or "", run.name_of("scene") or "", mark)
 
 
-def _warnings(run: RunRecord) -> list[str]:
+def _report_warnings(run: RunRecord) -> list[str]:
     """Return notes, HTML: no final metrics, unreadable log lines, views worse than nothing."""
     notes = []
     if not run.metrics:
@@ -129,9 +131,9 @@ def _warnings(run: RunRecord) -> list[str]:
     return notes
 
 
-def _headline(run: RunRecord) -> str:
+def _report_headline(run: RunRecord) -> str:
     """Return final numbers in large type, or the last logged ones of an unfinished run; and the orbit."""
-    html = page.tiles(_interim_tiles(run) if run.metrics is None else _final_tiles(run, run.metrics))
+    html = page.tiles(_report_interim_tiles(run) if run.metrics is None else _report_final_tiles(run, run.metrics))
     if run.metrics is not None:
         kept = run.field("checkpoint")
         which = "the last checkpoint, not the best" if kept in (None, "last") else f"checkpoint “{escape(kept)}”"
@@ -143,11 +145,11 @@ def _headline(run: RunRecord) -> str:
     return html
 
 
-def _final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
+def _report_final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
     mean, worst, ssim = (from_json(metrics, key) for key in ("psnr", "psnr_worst", "ssim"))
     views, split = len(per_view(run)), escape(metrics.get("split") or "held-out")
     shown = f"{format_count(views)} {split} view{'s' if views != 1 else ''}" if views else ""
-    empty, worst_name = metrics.get("views_empty"), _worst_name(run)
+    empty, worst_name = metrics.get("views_empty"), _worst_view_name(run)
     displayed = from_json(metrics, "ssim_3dgs")
     rule = "" if displayed is None else f"; as displayed, by 3DGS’s rule: {format_decimal(displayed, 4)}"
     each, steps = metrics.get("parameters_per_primitive"), metrics.get("iterations")
@@ -156,13 +158,13 @@ def _final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
     fps, backend = as_number(metrics.get("render_fps")), metrics.get("backend")
     speed, unit = format_decimal(fps, 1 if fps is None or fps < 100 else 0), "" if fps is None else "fps"
     return [
-        _decibels("PSNR, mean", mean, shown),
-        _decibels("PSNR, worst view", worst, escape(worst_name) if worst_name else ""),
+        _decibel_tile("PSNR, mean", mean, shown),
+        _decibel_tile("PSNR, worst view", worst, escape(worst_name) if worst_name else ""),
         *([("Empty views", format_count(empty), "", "the model is not in them")] if empty else []),
         ("SSIM", format_decimal(ssim, 4), "", "" if ssim is None else f"mean over views{rule}"),
-        *_lpips_tile(metrics),
-        *_mask_tile(metrics),
-        *_volume_tiles(metrics),
+        *_report_lpips_tile(metrics),
+        *_report_mask_tile(metrics),
+        *_report_volume_tiles(metrics),
         ("Primitives", format_count(metrics.get("primitives")), "", ""),
         ("Parameters", format_count(metrics.get("parameters")), "", per_primitive),
         ("Model size", *page.format_bytes(metrics.get("model_bytes")), ""),
@@ -171,11 +173,11 @@ def _final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
     ]
 
 
-def _decibels(label: str, value: float | None, text: str) -> Tile:
+def _decibel_tile(label: str, value: float | None, text: str) -> Tile:
     return label, format_decimal(value, 2), "" if value is None else "dB", text
 
 
-def _lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
+def _report_lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
     value, reasons = from_json(metrics, "lpips"), metrics.get("not_measured")
     if value is None:
         reason = reasons.get("lpips") if isinstance(reasons, Mapping) else None
@@ -185,15 +187,15 @@ def _lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
     return [("LPIPS", format_decimal(value, 4), "", f"{escape(metrics.get('lpips_network'))}, mean over views{more}")]
 
 
-def _mask_tile(metrics: Mapping[str, object]) -> list[Tile]:
+def _report_mask_tile(metrics: Mapping[str, object]) -> list[Tile]:
     inside, black = from_json(metrics, "psnr_mask"), from_json(metrics, "psnr_black_image_mask")
     if inside is None:
         return []
     compared = "" if black is None else f"; a black image: {format_decimal(black, 1)} dB"
-    return [_decibels("PSNR inside the mask", inside, f"where anything ever is{compared}")]
+    return [_decibel_tile("PSNR inside the mask", inside, f"where anything ever is{compared}")]
 
 
-def _volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
+def _report_volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
     """Return the largest error of each known volume over the compared frames."""
     tiles: list[Tile] = []
     for key, frames in metrics.items():
@@ -208,7 +210,7 @@ def _volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
     return tiles
 
 
-def _interim_tiles(run: RunRecord) -> list[Tile]:
+def _report_interim_tiles(run: RunRecord) -> list[Tile]:
     tiles: list[Tile] = []
     for label, key, digits, unit in (
         ("PSNR, held-out", "eval_psnr", 2, "dB"),
@@ -225,13 +227,13 @@ def _interim_tiles(run: RunRecord) -> list[Tile]:
     return tiles
 
 
-def _worst_name(run: RunRecord) -> str | None:
+def _worst_view_name(run: RunRecord) -> str | None:
     known = [(value, entry.get("name")) for entry in per_view(run) if (value := from_json(entry, "psnr")) is not None]
     name = min(known, key=lambda pair: pair[0])[1] if known else None
     return None if name is None else str(name)
 
 
-def _model(viewer: str, linked: str) -> str:
+def _report_model(viewer: str, linked: str) -> str:
     """Return the model to turn by hand: a page in this page, or a link to one."""
     if viewer:
         frame = f'<iframe title="the model, drawn by this browser" loading="lazy" srcdoc="{escape(viewer)}"></iframe>'
@@ -246,27 +248,29 @@ def _model(viewer: str, linked: str) -> str:
 # ---------------------------------------------------------------- pictures
 
 
-def _films(run: RunRecord) -> str:
+def _report_films(run: RunRecord) -> str:
     """Return held-out cameras over time, ground truth on the left and render on the right."""
     figures = ""
     for path in run.clips:
         name = escape(path.stem.removeprefix("clip_"))
         figures += figure(path, f"{name}: ground truth, render", f"film of {name}, ground truth beside render")
-    return section("Held-out films", f'{_shown(run)}<div class="films">{figures}</div>') if figures else ""
+    return (
+        section("Held-out films", f'{_note_shown_channels(run)}<div class="films">{figures}</div>') if figures else ""
+    )
 
 
-def _shown(run: RunRecord) -> str:
+def _note_shown_channels(run: RunRecord) -> str:
     """Return a line on what pictures show of the channels, where that is not plain colour."""
     return note(f"Shown: {escape(run.shown)}.") if run.shown else ""
 
 
-def _held_out(run: RunRecord) -> str:
+def _report_held_out(run: RunRecord) -> str:
     """Return each view: render, truth and error map with its numbers; the colour bar once."""
     if not run.views:
         return ""
     rows, compressed = "", False
     for view in run.views:
-        row, large = _view_row(run, view)
+        row, large = _report_view_row(run, view)
         rows, compressed = rows + row, compressed or large
     exact = "Large pictures are compressed on this page (WebP, quality 90); the PNG files in renders/ are exact."
     ticks = "".join(f"<span>{'≥ ' if i == 4 else ''}{ERROR_SCALE * i / 4:g}</span>" for i in range(5))
@@ -274,16 +278,16 @@ def _held_out(run: RunRecord) -> str:
         f'<div class="scale"><p>Error: mean absolute difference over {"all " if run.shown else ""}channels</p>'
         f'<div class="bar" style="background: {color_bar()}"></div><div class="ticks">{ticks}</div></div>'
     )
-    return section("Held-out views", f"{_shown(run)}{bar}{rows}{note(exact) if compressed else ''}")
+    return section("Held-out views", f"{_note_shown_channels(run)}{bar}{rows}{note(exact) if compressed else ''}")
 
 
-def _view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
+def _report_view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
     """Return a view's pictures and numbers, and whether a picture was compressed."""
     entry = run.view_numbers(view)
     name = escape(entry.get("name") or view.stem or view.index)
     figures, compressed = "", False
     for path, caption in ((view.render, "render"), (view.truth, "ground truth"), (view.error, "error")):
-        shown = None if path is None else inline(path)
+        shown = None if path is None else inline_picture(path)
         figures += page.picture(shown, caption, f"{caption} of view {name}", path is not None)
         compressed = compressed or (shown is not None and shown.compressed)
     numbers = [
@@ -296,7 +300,7 @@ def _view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
     return f'<article class="view"><header><h3>{name}</h3><p>{line}</p></header>{figures}</article>', compressed
 
 
-def _worst_regions(run: RunRecord) -> str:
+def _report_worst_regions(run: RunRecord) -> str:
     """Return the square of every held-out view with the largest error, worst first, folded after the first dozen."""
     figures = []
     for region in run.regions:
@@ -318,7 +322,7 @@ def _worst_regions(run: RunRecord) -> str:
 # ---------------------------------------------------------------- curves
 
 
-def _curves(run: RunRecord) -> str:
+def _report_curves(run: RunRecord) -> str:
     """Return PSNR and loss over time and steps, primitives over time, PSNR per view and frame."""
     views = [from_json(entry, "psnr") for entry in per_view(run)]
     mean, frames = from_json(run.metrics or {}, "psnr"), run.field("per_frame")
@@ -329,7 +333,7 @@ def _curves(run: RunRecord) -> str:
     ]
     film = Points([i for i, _ in known], [value for _, value in known], HELD_OUT)
     lines = [
-        _curve(run, x, key, title)
+        _report_curve(run, x, key, title)
         for x, key, title in (
             ("seconds", "psnr", "PSNR over time"),
             ("seconds", "loss", "Loss over time"),
@@ -339,7 +343,7 @@ def _curves(run: RunRecord) -> str:
         )
     ]
     charts = [(f"{chart.title}, dB" if "PSNR" in chart.title else chart.title, chart) for chart in lines]
-    hung = view_chart("PSNR per view", views, mean, _worst_name(run))
+    hung = view_chart("PSNR per view", views, mean, _worst_view_name(run))
     charts.append(("PSNR per view, dB <small>dashed: mean</small>", hung))
     charts.append(("PSNR over the frames of a film, dB", curve_chart("PSNR over frames", "frame", [film])))
     body = page.chart_panels(charts)
@@ -347,7 +351,7 @@ def _curves(run: RunRecord) -> str:
     return section("Curves", key + body) if body else ""
 
 
-def _curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
+def _report_curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
     """Return a chart of a logged number; that of PSNR with the held-out views."""
     lines = [Points(*run.series(x, key), band=True)]
     if key == "psnr":
@@ -358,7 +362,7 @@ def _curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
 # ---------------------------------------------------------------- tables
 
 
-def _view_table(run: RunRecord) -> str:
+def _report_view_table(run: RunRecord) -> str:
     """Return every held-out view's numbers, folded."""
     entries = per_view(run)
     if not entries:
@@ -372,7 +376,7 @@ def _view_table(run: RunRecord) -> str:
     return folded(f"All {format_count(len(entries))} held-out views", table)
 
 
-def _settings(run: RunRecord) -> str:
+def _report_settings(run: RunRecord) -> str:
     """Return every setting that is not at its default."""
     changed = run.field("non_default")
     if not isinstance(changed, Mapping):
@@ -389,7 +393,7 @@ def _settings(run: RunRecord) -> str:
     return section("Settings changed from their defaults", body)
 
 
-def _facts(run: RunRecord) -> str:
+def _report_facts(run: RunRecord) -> str:
     """Return where the numbers come from: split, data, machine, versions."""
     keys = ("split", "data_source", "color_space", "channels", "downsampling", "background", "seed", "iterations")
     pairs = [(key.replace("_", " "), run.field(key)) for key in (*keys, "checkpoint", "backend", "device")]
@@ -404,7 +408,7 @@ def _facts(run: RunRecord) -> str:
     return section("Run", page.fact_list(pairs))
 
 
-def _commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
+def _report_commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
     """Return the commands that go on from here, among them an animation of each condition of the task that has one."""
     folder = shlex.quote(str(run.run_dir))
     orbit = f"neuprim render {folder} --camera orbit"
@@ -417,7 +421,7 @@ def _commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
     return section("Go on", f'<ul class="commands">{items}</ul>')
 
 
-def _config(run: RunRecord) -> str:
+def _report_config(run: RunRecord) -> str:
     """Return the resolved configuration, folded."""
     if run.config_text is None:
         return note("There is no config.yaml in this run directory.")

@@ -13,9 +13,17 @@ from urllib.parse import quote
 
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import from_json
-from neuprim.report import page
+from neuprim.report import report_page as page
 from neuprim.report.charts import LARGE, Points, curve_chart
-from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration, note, section
+from neuprim.report.report_page import (
+    escape,
+    format_bytes,
+    format_count,
+    format_decimal,
+    format_duration,
+    note,
+    section,
+)
 from neuprim.report.run_record import RunRecord
 
 _LESS, _MORE = "less", "more"
@@ -73,7 +81,7 @@ class SweepRun:
         return {name: value for name, value in found.items() if value is not None}
 
 
-def better(name: str) -> str | None:
+def better_direction(name: str) -> str | None:
     """Return whether "more" or "less" of a metric is better; None where that is not known."""
     known = [start for start in _BETTER if name == start or name.startswith(f"{start}_")]
     return _BETTER[max(known, key=len)] if known and name != "parameters_per_primitive" else None
@@ -111,7 +119,7 @@ class _SweepPage:
         self.folder, self.words = folder, words
         self.numbers = {run.name: run.numbers for run in runs}
         self.runs = sorted(runs, key=lambda run: -self.numbers[run.name].get("psnr", -math.inf))
-        self.colours = dict(zip((run.name for run in runs), _colours(len(runs)), strict=True))
+        self.colours = dict(zip((run.name for run in runs), _run_colours(len(runs)), strict=True))
         names = dict.fromkeys(name for run in self.runs for name in self.numbers[run.name])
         kept = [name for name in names if not name.startswith(_NOT_COMPARED)]
         differ = {name for name in kept if len({self.numbers[run.name].get(name) for run in self.runs}) > 1}
@@ -120,7 +128,7 @@ class _SweepPage:
         self.best = {name: self._best(name) for name in {*self.metrics, *_BEST}}
 
     def _best(self, name: str) -> SweepRun | None:
-        sign = {_MORE: 1.0, _LESS: -1.0, None: 0.0}[better(name)]
+        sign = {_MORE: 1.0, _LESS: -1.0, None: 0.0}[better_direction(name)]
         having = [run for run in self.runs if name in self.numbers[run.name] and sign]
         return max(having, key=lambda run: sign * self.numbers[run.name][name], default=None)
 
@@ -152,7 +160,7 @@ class _SweepPage:
         heads = [escape(title) for title in ("run", *keys, "state")]
         options = ""
         for name in self.metrics:
-            title, known = escape(_TITLES.get(name, name.replace("_", " "))), better(name)
+            title, known = escape(_TITLES.get(name, name.replace("_", " "))), better_direction(name)
             heads.append(f'<th data-metric="{escape(name)}" data-better="{known or ""}">{title}</th>')
             options += "" if known is None else f'<option value="{escape(name)}">{title}</option>'
         rows = [self._row(run, keys) for run in self.runs]
@@ -204,7 +212,7 @@ class _SweepPage:
         body = ""
         for (task, scene), members in groups.items():
             body += f"<h3>{escape(task)} / {escape(scene)}</h3>" if len(groups) > 1 else ""
-            body += _side_by_side(members)
+            body += _views_side_by_side(members)
         return section("Held-out views side by side", body) if body else ""
 
     def facts(self) -> str:
@@ -215,7 +223,7 @@ class _SweepPage:
         return section("Where the numbers come from", page.fact_list(pairs))
 
 
-def _side_by_side(members: Sequence[tuple[SweepRun, RunRecord]]) -> str:
+def _views_side_by_side(members: Sequence[tuple[SweepRun, RunRecord]]) -> str:
     """Return a few views, evenly spread, of the first runs, which are the best."""
     shown, views = members[:_MOST_PICTURES], members[0][1].views
     few = min(len(views), _MOST_VIEWS)
@@ -250,7 +258,7 @@ def _format_metric(name: str, value: float | None) -> tuple[str, str]:
     return format_decimal(value, 1 if name.endswith("fps") else 4), ""
 
 
-def _colours(number: int) -> Iterable[str]:
+def _run_colours(number: int) -> Iterable[str]:
     if number <= len(COLOURS):
         return COLOURS[:number]
     from matplotlib import colormaps  # slow to import, and only reports need it

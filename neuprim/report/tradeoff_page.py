@@ -14,10 +14,10 @@ from torch import Tensor
 from neuprim.core.io.files import write_text
 from neuprim.core.io.images import write_png
 from neuprim.core.metrics import from_json
-from neuprim.report import page as elements
+from neuprim.report import report_page as elements
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
-from neuprim.report.page import escape, format_bytes, format_count, format_decimal, note, section
-from neuprim.report.pictures import Inlined, color_bar, error_map, inline
+from neuprim.report.pictures import InlinedPicture, color_bar, error_map, inline_picture
+from neuprim.report.report_page import escape, format_bytes, format_count, format_decimal, note, section
 
 _SLOWEST = 12.0  # multiples of the reference's time beyond which points are off the charts
 
@@ -241,8 +241,8 @@ class _TradeoffPage:
         return section("Where the numbers come from", elements.fact_list(pairs))
 
 
-def _inline_image(image: Tensor) -> Inlined | None:
+def _inline_image(image: Tensor) -> InlinedPicture | None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "picture.png"
         write_png(path, image)
-        return inline(path)
+        return inline_picture(path)

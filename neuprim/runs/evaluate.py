@@ -18,7 +18,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.returns import call_task_clips, call_task_orbit
 from neuprim.report import Viewer, error_map, write_report
-from neuprim.report.regions import Regions
+from neuprim.report.regions import WorstRegions
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.webpage.scene import held_out, scene_page, start_of
@@ -40,7 +40,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     clips = call_task_clips(task, dataset)
     clip_of_view = {i: clip for clip in clips if clip.source is None for i in clip.views}
     spool: FrameSpool | None = None
-    regions = Regions(display)
+    regions = WorstRegions(display)
 
     def add_frame(clip: Clip, index: int, rendered: Tensor, truth: Tensor) -> None:
         nonlocal spool
@@ -51,7 +51,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
             spool = None
 
     def write_view(index: int, view: View, rendered: Tensor, truth: Tensor) -> None:
-        regions.look(view.name, rendered, truth)
+        regions.add_view(view.name, rendered, truth)
         if index in clip_of_view:
             add_frame(clip_of_view[index], index, rendered, truth)
         if index in shown:

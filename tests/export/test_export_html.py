@@ -14,7 +14,7 @@ import pytest
 
 from neuprim.core.errors import ConfigError
 from neuprim.report import Viewer, write_report
-from neuprim.report.run_report import LIMIT
+from neuprim.report.run_report import VIEWER_LIMIT
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
@@ -162,11 +162,11 @@ def test_the_report_of_a_run_holds_its_page(trained: Path) -> None:
     page = html.unescape(frame[1])
     assert header_of(page)["count"] == 40
     inner, outer = (re.search(r"script-src 'nonce-(\w+)'", part) for part in (page, text))
-    assert inner and outer and inner[1] == outer[1] and len(text.encode()) < LIMIT
+    assert inner and outer and inner[1] == outer[1] and len(text.encode()) < VIEWER_LIMIT
 
 
 def test_a_large_page_lies_beside_the_report(trained: Path) -> None:
-    viewer = Viewer("<!doctype html><p>" + "x" * LIMIT, "nonce")
+    viewer = Viewer("<!doctype html><p>" + "x" * VIEWER_LIMIT, "nonce")
     text = write_report(trained, viewer=viewer).read_text(encoding="utf-8")
     assert (trained / "viewer.html").read_text(encoding="utf-8") == viewer.text
     assert '<a href="viewer.html">' in text and "iframe title" not in text and "script-src" not in text

@@ -13,7 +13,7 @@ from PIL import Image
 
 from neuprim.core.errors import DataError
 from neuprim.report import write_report
-from neuprim.report.regions import FILE, LEAST, MOST, Regions, read_regions, worst_region
+from neuprim.report.regions import MAX_REGIONS, MIN_SIDE, REGIONS_FILE, WorstRegions, read_regions, worst_region
 
 
 def pair(height: int, width: int, x: int, y: int, size: int, off: float = 0.5) -> tuple[torch.Tensor, torch.Tensor]:
@@ -37,23 +37,23 @@ def test_it_is_where_the_error_is(x: int, y: int) -> None:
 def test_small_and_perfect_images(tmp_path: Path) -> None:
     rendered, truth = pair(9, 30, 20, 3, 4)
     region = worst_region(rendered, truth)
-    assert region.side == 9 < LEAST and (region.y, 12 <= region.x <= 20) == (0, True)
+    assert region.side == 9 < MIN_SIDE and (region.y, 12 <= region.x <= 20) == (0, True)
     assert worst_region(truth, truth).psnr == math.inf
-    regions = Regions(lambda x: x)
-    regions.look("same", truth, truth)
+    regions = WorstRegions(lambda x: x)
+    regions.add_view("same", truth, truth)
     regions.write(tmp_path)
-    assert json.loads((tmp_path / FILE).read_text()) == [] and read_regions(tmp_path) == []
+    assert json.loads((tmp_path / REGIONS_FILE).read_text()) == [] and read_regions(tmp_path) == []
 
 
 def test_the_worst_come_first_and_not_all_are_kept(tmp_path: Path) -> None:
-    regions = Regions(lambda x: x)
-    for i in range(3 * MOST):
-        rendered, truth = pair(40, 40, 8, 8, 10, off=0.1 + 0.9 * ((i * 37) % (3 * MOST)) / (3 * MOST))
-        regions.look(f"v{i}", rendered, truth)
+    regions = WorstRegions(lambda x: x)
+    for i in range(3 * MAX_REGIONS):
+        rendered, truth = pair(40, 40, 8, 8, 10, off=0.1 + 0.9 * ((i * 37) % (3 * MAX_REGIONS)) / (3 * MAX_REGIONS))
+        regions.add_view(f"v{i}", rendered, truth)
     regions.write(tmp_path)
     found = read_regions(tmp_path)
     values = [one.psnr for one in found]
-    assert len(found) == MOST and values == sorted(values) and found[0].place.startswith("16×16 at (")
+    assert len(found) == MAX_REGIONS and values == sorted(values) and found[0].place.startswith("16×16 at (")
     with Image.open(found[0].path) as image:
         assert image.size == (48, 16)
         assert image.getpixel((4, 4)) == (102, 102, 102), "the truth stands first"
@@ -64,9 +64,9 @@ def test_the_page_shows_them(tmp_path: Path) -> None:
     (run / "renders").mkdir(parents=True)
     (run / "config.yaml").write_text("task: static\n")
     assert "Worst regions" not in write_report(run).read_text(encoding="utf-8"), "older runs have none"
-    regions = Regions(lambda x: x)
+    regions = WorstRegions(lambda x: x)
     for i in range(20):
-        regions.look(f"<i>{i}", *pair(40, 40, 8, 8, 10, off=0.1 + 0.02 * i))
+        regions.add_view(f"<i>{i}", *pair(40, 40, 8, 8, 10, off=0.1 + 0.02 * i))
     regions.write(run / "renders")
     page = write_report(run).read_text(encoding="utf-8")
     assert "Worst regions" in page and "8 more" in page and "&lt;i&gt;19" in page and "<i>" not in page
@@ -88,9 +88,9 @@ def test_a_list_from_elsewhere_reads_no_other_file(tmp_path: Path) -> None:
         good | {"file": "worst_9.png"},
         3,
     ]
-    (folder / FILE).write_text(json.dumps([*wrong, good]))
+    (folder / REGIONS_FILE).write_text(json.dumps([*wrong, good]))
     assert [one.path.name for one in read_regions(folder)] == ["worst_000.png"]
     for text in ("{", "{}", "[" * 100_000):
-        (folder / FILE).write_text(text)
+        (folder / REGIONS_FILE).write_text(text)
         with pytest.raises(DataError, match=r"worst\.json"):
             read_regions(folder)

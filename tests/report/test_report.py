@@ -110,7 +110,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def quick(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """A tiny finished run to change, for tests that do not look at its charts (which take most of the time)."""
-    monkeypatch.setattr("neuprim.report.run_report._curves", lambda run: "")
+    monkeypatch.setattr("neuprim.report.run_report._report_curves", lambda run: "")
     return make_run(tmp_path / "run", size=(8, 10), lines=4, names=("a", "b"))
 
 
@@ -317,7 +317,7 @@ def test_a_failed_write_keeps_the_old_report(quick: Path, monkeypatch: pytest.Mo
     if step == "replace":
         monkeypatch.setattr(os, "replace", fail)
     else:
-        monkeypatch.setattr("neuprim.report.run_report._render", fail)
+        monkeypatch.setattr("neuprim.report.run_report._render_report", fail)
     with pytest.raises(OSError, match="disk full"):
         write_report(quick)
     assert (quick / "report.html").read_text() == "old"

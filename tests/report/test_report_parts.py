@@ -16,8 +16,8 @@ from PIL import Image
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
 from neuprim.report import ERROR_SCALE, error_map
 from neuprim.report.charts import HELD_OUT, TRAINING, Dot, Points, curve_chart, draw_svg, front_chart, view_chart
-from neuprim.report.page import escape, format_bytes, format_count, format_decimal, format_duration
-from neuprim.report.pictures import inline
+from neuprim.report.pictures import inline_picture
+from neuprim.report.report_page import escape, format_bytes, format_count, format_decimal, format_duration
 from neuprim.report.run_record import read_run
 
 
@@ -49,7 +49,7 @@ def test_damaged_files_are_named(tmp_path: Path, name: str, text: str | bytes, m
 def test_large_pictures_are_compressed(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "a.png")
-    picture = inline(tmp_path / "a.png")
+    picture = inline_picture(tmp_path / "a.png")
     assert picture and picture.compressed and picture.url.startswith("data:image/webp")
     assert (picture.width, picture.height) == (400, 400)
     assert len(picture.url) < (tmp_path / "a.png").stat().st_size
@@ -58,10 +58,10 @@ def test_large_pictures_are_compressed(tmp_path: Path) -> None:
 def test_small_pictures_are_the_files_byte_for_byte(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     Image.new("RGB", (5, 3), (200, 10, 40)).save(path)
-    picture = inline(path)
+    picture = inline_picture(path)
     assert picture and not picture.compressed and base64.b64decode(picture.url.partition(",")[2]) == path.read_bytes()
     path.write_bytes(path.read_bytes()[:50])
-    assert inline(path) is None
+    assert inline_picture(path) is None
 
 
 def test_error_map_has_a_fixed_scale() -> None:

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from neuprim.report.run_record import read_run
-from neuprim.report.sweep_page import COLOURS, SweepRun, better, write_sweep_page
+from neuprim.report.sweep_page import COLOURS, SweepRun, better_direction, write_sweep_page
 from tests.browsers import browser
 
 
@@ -63,7 +63,7 @@ def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_better_is_said_where_it_is_known(name: str, expected: str | None) -> None:
-    assert better(name) == expected
+    assert better_direction(name) == expected
 
 
 def test_of_many_runs_each_has_its_colour_and_infinite_numbers_sort(tmp_path: Path) -> None:

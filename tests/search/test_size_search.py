@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import importlib
 import json
-import math
-from collections.abc import Mapping, Sequence
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -30,23 +31,21 @@ from neuprim.search.size_search import next_setting_change, setting_change_pays
 from neuprim.search.target_record import Attempt, SettingChange, TargetRecord
 from tests.search.simulated_search import attempt, from_grid, simulate_search
 
-RESULTS = json.loads((Path(__file__).parents[2] / "benchmarks/results/target.json").read_text(encoding="utf-8"))
+BENCHMARKS = Path(__file__).parents[2] / "benchmarks"
+RESULTS = json.loads((BENCHMARKS / "results/target.json").read_text(encoding="utf-8"))
 STARTS = {"solids": 400, "chair": 2800, "fire": 13500, "lit_solids": 2655}
 
 
-def smallest(grid: Sequence[Mapping[str, Any]], psnr: float) -> float:
-    """Return the bytes of the smallest model of a grid that has a PSNR."""
-    found = []
-    for less in {g["less"] for g in grid}:
-        own = sorted((g for g in grid if g["less"] == less), key=lambda g: int(g["primitives"]))
-        for a, b in pairwise(own):
-            if a["psnr"] <= psnr <= b["psnr"]:
-                share = (psnr - a["psnr"]) / (b["psnr"] - a["psnr"])
-                found.append(math.exp((1 - share) * math.log(a["bytes"]) + share * math.log(b["bytes"])))
-    return min(found)
+@pytest.fixture(scope="module")
+def smallest() -> Iterator[Callable[[Sequence[Mapping[str, Any]], float], float]]:
+    """The benchmark's function: bytes of the smallest model of a grid that has a PSNR."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(str(BENCHMARKS))
+        patch.setattr(sys, "dont_write_bytecode", True)
+        yield importlib.import_module("target").smallest
 
 
-def test_replays_of_the_recorded_grids_find_the_smallest_model() -> None:
+def test_replays_of_the_recorded_grids_find_the_smallest_model(smallest: Any) -> None:
     """As the benchmark counts: bytes of the chosen full run over those of the grid's smallest with the target."""
     ratios = []
     for name, start in STARTS.items():
@@ -59,7 +58,7 @@ def test_replays_of_the_recorded_grids_find_the_smallest_model() -> None:
 
 
 @pytest.mark.parametrize("start", [20, 160, 3000])
-def test_the_start_does_not_decide(start: int) -> None:
+def test_the_start_does_not_decide(smallest: Any, start: int) -> None:
     grid = RESULTS["solids"]["grid"]
     chosen, runner = simulate_search(from_grid(grid), Target(psnr=26.0), start)
     assert chosen.packed / smallest(grid, 26.0) <= 1.25 and runner.seconds_spent <= 60.0

@@ -15,7 +15,7 @@ from pathlib import Path
 from string import Template
 
 from neuprim.report.charts import Chart, draw_svg
-from neuprim.report.pictures import Inlined, inline
+from neuprim.report.pictures import InlinedPicture, inline_picture
 from neuprim.report.run_record import as_number
 
 MISSING = "–"
@@ -90,10 +90,12 @@ def figure(path: Path | None, caption: str, alternative: str, attributes: str = 
     Args:
         caption, alternative, attributes: HTML.
     """
-    return picture(None if path is None else inline(path), caption, alternative, path is not None, attributes)
+    return picture(None if path is None else inline_picture(path), caption, alternative, path is not None, attributes)
 
 
-def picture(shown: Inlined | None, caption: str, alternative: str, exists: bool = True, attributes: str = "") -> str:
+def picture(
+    shown: InlinedPicture | None, caption: str, alternative: str, exists: bool = True, attributes: str = ""
+) -> str:
     """Return a picture as :func:`figure` does; ``exists`` says whether one of None is damaged or missing."""
     under = f"<figcaption>{caption}</figcaption>" if caption else ""
     if shown is None:

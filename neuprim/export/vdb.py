@@ -39,7 +39,7 @@ from neuprim.core.volumes.density_truth import (
     GridExtent,
     Placement,
     VolumeSource,
-    measure_frame_errors,
+    measure_density_errors,
     split_grid_planes,
 )
 from neuprim.export.shared import ellipsoid_box
@@ -344,7 +344,7 @@ def _errors(
     settings = job.run.settings
     component = None if source.placement.exact else source.placement.component
     part: dict[str, str] = {} if component is None else {"component": component}
-    found = measure_frame_errors(
+    found = measure_density_errors(
         job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part
     )
     place = source.points(frame.source)

@@ -20,7 +20,7 @@ from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.density_grid import POINTS_LIMIT, box_lattice, density_grid
-from neuprim.core.volumes.density_truth import DensityTruth, measure_frame_errors
+from neuprim.core.volumes.density_truth import DensityTruth, measure_density_errors
 from neuprim.inspect.field import FieldFrame, ViewOptions, describe_conditions, find_matter_box, read_condition_frames
 from neuprim.inspect.html_page import write_page
 from neuprim.inspect.layers import Layer, validate_layers
@@ -203,7 +203,7 @@ class _FrameSequence:
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
-        numbers = measure_frame_errors(self.model, conditions, self.truth, number, where=self.device)
+        numbers = measure_density_errors(self.model, conditions, self.truth, number, where=self.device)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
         events(Note(f"{self.truth.frames[number].name}  {describe_conditions(conditions)}  {words}"))
         return numbers

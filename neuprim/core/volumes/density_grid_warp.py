@@ -2,8 +2,8 @@
 """Extinction on a regular grid on a GPU: the twin of the kernel in :mod:`neuprim.core.volumes.density_grid`.
 
 A block adds up a tile of the grid, a thread a point, primitive by primitive in their order, float64 inside and float32
-sums, as the CPU does it. Primitives of each tile are listed by sorting integers, so that no bit depends on the order of
-blocks, nor on how much of the grid or how many primitives are taken at a time. Warp is imported with this module.
+sums, as the CPU does it. No bit depends on the order of blocks, nor on how much of the grid or how many primitives are
+taken at a time. Warp is imported with this module.
 """
 
 from __future__ import annotations
@@ -75,8 +75,7 @@ def _add_kernel() -> Any:
 def _tile_boxes(
     means: Tensor, scales: Tensor, rotations: Tensor, Q: Tensor, shape: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
-    """Tiles that the ellipsoids' boxes of indices touch: (N, 3) int64 first ones, and ones behind the last, 0 where
-    there is no point."""
+    """Tiles that the ellipsoids' boxes touch: (N, 3) int64 first ones, and ones behind the last, 0 without a point."""
     center = means @ Q[:, :3].T + Q[:, 3]
     reach = ((Q[:, :3] @ rotations) * scales[:, None, :]).norm(dim=2)
     limit, tile = (torch.tensor(x, device=means.device) for x in (shape, _TILE))
@@ -101,7 +100,7 @@ def _list_primitives(
     return starts.int(), prim[order].int()
 
 
-def _parts(counts: Tensor) -> Iterator[tuple[int, int]]:
+def _primitive_ranges(counts: Tensor) -> Iterator[tuple[int, int]]:
     """Ranges of primitives that reach at most ``_PAIRS`` tiles together, in order; those that reach none left out."""
     ends = np.cumsum(counts.cpu().numpy())
     begin = 0
@@ -147,7 +146,7 @@ def fill_density_grid(
         counts = wide.prod(1)
         first, last = plane * _TILE[0], min(end * _TILE[0], shape[0])
         part = torch.zeros((last - first, *shape[1:]), dtype=torch.float32, device=where)
-        for some in _parts(counts):
+        for some in _primitive_ranges(counts):
             own = (end - plane, *tiles[1:])
             starts, ids = _list_primitives(low, wide, counts, own, *some)
             lists = array(starts, wp.int32), array(ids, wp.int32)

@@ -220,7 +220,7 @@ class DensityComparison:
         return dict(zip(DENSITY_ERRORS, values, strict=True))
 
 
-def measure_frame_errors(
+def measure_density_errors(
     model: Primitives,
     conditions: Conditions,
     truth: DensityTruth,

@@ -356,7 +356,7 @@ class _Stencil(NamedTuple):
         return embedding_bag(self.rows, table, per_sample_weights=self.weights, mode="sum")
 
 
-def _stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _Stencil:
+def _trilinear_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _Stencil:
     """Of points given as three tensors (N,) in cells, the first centre at 0; clamped to the outermost centres."""
     lower, parts = [], []
     for along, count in zip(points, shape, strict=True):
@@ -373,7 +373,7 @@ def _stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _Stencil:
     for pair, edge in enumerate(edges):
         upper = torch.mul(edge, z, out=weights[:, 2 * pair + 1])
         torch.sub(edge, upper, out=weights[:, 2 * pair])
-    return _Stencil(base[:, None] + torch.tensor(_corner_offsets(shape), dtype=torch.int32), weights)
+    return _Stencil(base[:, None] + torch.tensor(_stencil_offsets(shape), dtype=torch.int32), weights)
 
 
 def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
@@ -398,32 +398,34 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
     def carry(rows: slice) -> None:
         here = [axis[rows] for axis in cells]
         wind = winds[rows]
-        behind[rows] = _stencil([p - (0.5 * scale) * wind[:, k] for k, p in enumerate(here)], shape).read(winds)
-        back = _stencil([p - scale * behind[rows, k] for k, p in enumerate(here)], shape)
+        behind[rows] = _trilinear_stencil([p - (0.5 * scale) * wind[:, k] for k, p in enumerate(here)], shape).read(
+            winds
+        )
+        back = _trilinear_stencil([p - scale * behind[rows, k] for k, p in enumerate(here)], shape)
         carried[rows] = back.read(table)
         place[rows] = back.rows[:, 0]
 
-    _run_in_threads(carry, [slice(first, min(first + _SLAB, len(table))) for first in range(0, len(table), _SLAB)])
+    _advect_in_threads(carry, [slice(first, min(first + _SLAB, len(table))) for first in range(0, len(table), _SLAB)])
     blurry = carried[:, blurred:].contiguous()
 
     def correct(at: Tensor) -> None:
         # The wind half a step ahead is not sampled but extrapolated: as much more than here as the one behind is less.
         step = scale * (2 * winds.index_select(0, at) - behind.index_select(0, at))
         ahead = [axis.index_select(0, at) + step[:, k] for k, axis in enumerate(cells)]
-        gone = sharp.index_select(0, at) - _stencil(ahead, shape).read(blurry)
+        gone = sharp.index_select(0, at) - _trilinear_stencil(ahead, shape).read(blurry)
         better = blurry.index_select(0, at) + 0.5 * gone
         lowest_corner = place.index_select(0, at)
         low = high = sharp.index_select(0, lowest_corner)
-        for offset in _corner_offsets(shape)[1:]:
+        for offset in _stencil_offsets(shape)[1:]:
             values = sharp.index_select(0, lowest_corner + offset)
             low, high = torch.minimum(low, values), torch.maximum(high, values)
         carried[at, blurred:] = torch.minimum(torch.maximum(better, low), high)
 
-    _run_in_threads(correct, (blurry.abs() > _INVISIBLE).any(1).nonzero().squeeze(1).split(_SLAB))
+    _advect_in_threads(correct, (blurry.abs() > _INVISIBLE).any(1).nonzero().squeeze(1).split(_SLAB))
     return carried.T.reshape(fields.shape)
 
 
-def _run_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
+def _advect_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
     """Calls that write to different places, in threads of our own: torch's threads wait for each other in a busy loop
     after every operation, which on a busy machine takes many times longer than the work."""
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
@@ -437,6 +439,6 @@ def _cell_indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...]:
     return tuple(axis.reshape(-1) for axis in axes)
 
 
-def _corner_offsets(shape: tuple[int, int, int]) -> list[int]:
+def _stencil_offsets(shape: tuple[int, int, int]) -> list[int]:
     """How many rows of a table the eight cells of a stencil lie after the first."""
     return [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]

@@ -26,7 +26,7 @@ from neuprim.tasks.dynamic.time_colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 
 if TYPE_CHECKING:
-    from neuprim.tasks.dynamic.volume.capture_dataset import Recording
+    from neuprim.tasks.dynamic.volume.capture_dataset import VolumeRecording
 
 _MIN_OPACITY = 1.0 / 255.0  # of a visible primitive
 
@@ -76,7 +76,7 @@ def parse_time(text: str) -> list[Tensor]:
 # ---------------------------------------------------------------- evaluation
 
 
-def recording_of(dataset: Dataset) -> Recording | None:
+def recording_of(dataset: Dataset) -> VolumeRecording | None:
     """The volume sequence that the images were rendered from; None if there is none.
 
     Raises:
@@ -84,9 +84,9 @@ def recording_of(dataset: Dataset) -> Recording | None:
     """
     if dataset.extra is None:
         return None
-    from neuprim.tasks.dynamic.volume.capture_dataset import Recording
+    from neuprim.tasks.dynamic.volume.capture_dataset import VolumeRecording
 
-    return get_extra(dataset, Recording)
+    return get_extra(dataset, VolumeRecording)
 
 
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
@@ -186,7 +186,7 @@ _VOLUME_SCENES = {
 }
 _VOLUME_FUNCTIONS = tuple(
     _import_when_called("volume.volume_scene", function)
-    for function in ("load_dataset", "open_volumes", "open_ground_truth", "split_chunks")
+    for function in ("load_volume_scene", "open_volume_source", "open_rendered_frames", "split_into_chunks")
 )
 _MULTIVIEW = "images with a time per frame (D-NeRF layout): scene.path=DIR"
 

@@ -15,11 +15,11 @@ from neuprim.core.model.fields import ColourField, Conditions, Constant, read_sc
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.tasks.dynamic.time_density import get_time
+from neuprim.tasks.dynamic.time_density import get_frame_time
 
 FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
-"""Angle of the first Fourier term at xi = 1. The paper prints i xi, whose basis is nearly rank-deficient on [0, 1]
-(condition 5e13); whole periods are well conditioned (2e5)."""
+"""Angle of the first Fourier term at xi = 1. The paper prints i xi, a nearly rank-deficient basis on [0, 1] (condition
+5e13); whole periods are well conditioned (2e5)."""
 
 _TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
 
@@ -37,14 +37,9 @@ class TimeHarmonics(ColourField):
     """
 
     def __init__(
-        self,
-        degree: int = 3,
-        channels: int = 3,
-        sh_every: float = 0.0,
-        powers: int = 4,
-        waves: int = 4,
+        self, degree: int = 3, channels: int = 3, sh_every: float = 0.0, powers: int = 4, waves: int = 4,
         frequencies: str = "periods",
-    ) -> None:
+    ) -> None:  # fmt: skip
         if not isinstance(degree, int) or not 0 <= degree <= 3:
             raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..3")
         if not isinstance(channels, int) or channels < 1:
@@ -67,12 +62,11 @@ class TimeHarmonics(ColourField):
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.coefficient_count(self.degree) - 1
         specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors))]
-        for name, terms in zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True):
-            if terms:
-                specs.append(ParameterSpec(name, (terms, C), 5e-3, _zeros(terms, C)))
-        if rest:
-            specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C)))
-        return specs
+        specs += [ParameterSpec(name, (n, C), 5e-3, _zeros(n, C)) for name, n in self._term_counts() if n]
+        return specs + ([ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C))] if rest else [])
+
+    def _term_counts(self) -> list[tuple[str, int]]:
+        return list(zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True))
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
         most = {"degree": self.degree, "powers": self.powers, "waves": self.waves}
@@ -107,17 +101,16 @@ class TimeHarmonics(ColourField):
         return dict(zip(_TIME_TENSORS, (powers, waves.cos(), waves.sin()), strict=True))
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
-        dc, xi = params["sh_dc"], get_time(conditions)
-        if self.powers or self.waves:
-            for name, basis in self._terms(xi).items():
-                if name in params:
-                    dc = dc + (params[name] * device.to_like(basis, dc)[:, None]).sum(1)
+        dc, xi = params["sh_dc"], get_frame_time(conditions)
+        for name, basis in self._terms(xi).items():
+            if name in params:
+                dc = dc + (params[name] * device.to_like(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients of the direction, per channel, and single terms in time."""
-        terms = zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True)
-        units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, count in terms for i in range(count))
+        terms = ((name, i) for name, count in self._term_counts() for i in range(count))
+        units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
         return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *units)
 
     def script(self) -> str:

@@ -50,14 +50,14 @@ ChunkOverlaps = tuple[tuple[float, float], ...]
 """(from, to) time of each overlap of chunks, ascending; chunk k ends with overlap k."""
 
 
-def get_time(conditions: Conditions) -> Tensor:
+def get_frame_time(conditions: Conditions) -> Tensor:
     """The frame's time xi, a 0-dim float64 tensor. Raises KeyError if the frame has no condition "time"."""
     if "time" not in conditions:
         raise KeyError("a dynamic model needs the condition 'time'")
     return conditions["time"].detach().double().reshape(())
 
 
-def validate_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
+def validate_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
     """Overlaps as tuples. Raises ValueError unless they are pairs of ascending times, one after the other."""
     try:
         overlaps = tuple((float(begin), float(end)) for begin, end in seams)
@@ -117,7 +117,7 @@ class TimeDensity(DensityField):
         self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
         self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in TIME_PARTS if p in parts) or "none", frozenset(parts)
-        self.seams = validate_overlaps(seams)
+        self.seams = validate_chunk_overlaps(seams)
         if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
             raise ValueError(f"components {components!r}; expected a list of names")
         self.named = tuple(components)
@@ -165,7 +165,7 @@ class TimeDensity(DensityField):
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
         if "window" not in self.parts and not self.seams:
             return None
-        xi, rows = get_time(conditions), None
+        xi, rows = get_frame_time(conditions), None
         if "window" in self.parts:
             rows = rows_in_window(params["window_center"], params["log_window"], xi)
         if self.seams:
@@ -177,11 +177,13 @@ class TimeDensity(DensityField):
         if "motion" not in self.parts:
             return geometry
         center = params["window_center"] if "window" in self.parts else torch.full_like(geometry.means[:, :1], 0.5)
-        means = move_means(geometry.means, params["velocity"], params["acceleration"], center, get_time(conditions))
+        means = move_means(
+            geometry.means, params["velocity"], params["acceleration"], center, get_frame_time(conditions)
+        )
         return Geometry(means, geometry.log_scales, geometry.quats)
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
-        xi = get_time(conditions)
+        xi = get_frame_time(conditions)
         b1 = params["b1"]
         if "phase" in self.parts:
             b1 = _advance_phase(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)

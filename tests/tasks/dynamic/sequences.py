@@ -12,8 +12,8 @@ from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic import recording_of
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.capture_dataset import Recording
-from neuprim.tasks.dynamic.volume.volume_scene import load_dataset
+from neuprim.tasks.dynamic.volume.capture_dataset import VolumeRecording
+from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
 
 VOXEL = 0.5
 MIDDLE = (8, 15)  # along y and z, in voxels
@@ -51,10 +51,10 @@ def to_world(capture: Capture, points: np.ndarray) -> np.ndarray:
 
 def dataset(folder: Path, tmp_path: Path, **changes: Any) -> Dataset:
     settings = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1, "look": "smoke_fire", **changes}
-    return load_dataset(settings, SceneContext(0, tmp_path / "cache"))
+    return load_volume_scene(settings, SceneContext(0, tmp_path / "cache"))
 
 
-def recorded(data: Dataset) -> Recording:
+def recorded(data: Dataset) -> VolumeRecording:
     """What its images were rendered from."""
     found = recording_of(data)
     assert found is not None

@@ -15,7 +15,13 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.task import Chunks, SceneContext
 from neuprim.tasks.dynamic import TASK
-from neuprim.tasks.dynamic.volume.volume_scene import MAX_FRAMES, MIN_FRAMES, count_chunks, open_volumes, split_chunks
+from neuprim.tasks.dynamic.volume.volume_scene import (
+    MAX_FRAMES,
+    MIN_FRAMES,
+    count_chunks,
+    open_volume_source,
+    split_into_chunks,
+)
 from tests.tasks.dynamic.sequences import dataset, empty_frame, recorded, write_blobs
 
 NUMBERS = (2, 3, 5, 6, 7, 8, 10, 11, 12)
@@ -40,7 +46,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def chunks(folder: Path, cache: Path, *words: str) -> Chunks | None:
     config = config_of(folder, *words)
-    return split_chunks(config, SceneContext(0, cache / "cache"))
+    return split_into_chunks(config, SceneContext(0, cache / "cache"))
 
 
 def config_of(folder: Path, *words: str) -> dict[str, Any]:
@@ -143,6 +149,6 @@ def test_a_span_has_the_whole_sequences_times_box_light_and_images(folder: Path,
 def test_files_of_a_span_are_its_frames_in_the_sequences_time(folder: Path, tmp_path: Path) -> None:
     small = {"vdb": str(folder), "size": 24, "cameras": 6, "samples": 1}
     settings: Mapping[str, Any] = {**small, "look": "smoke_fire", "span": "5:10"}
-    source = open_volumes(settings, SceneContext(0, tmp_path / "cache"))
+    source = open_volume_source(settings, SceneContext(0, tmp_path / "cache"))
     assert list(source.placement.numbers) == [5, 6, 7, 8, 10]
     assert source.placement.times["time"] == pytest.approx([0.3, 0.4, 0.5, 0.6, 0.8])

@@ -21,8 +21,8 @@ from neuprim.tasks.dynamic.volume.capture_dataset import FrameViews, FrameVoxels
 from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
 from neuprim.tasks.dynamic.volume.medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
-from neuprim.tasks.dynamic.volume.survey import Normalisation
-from neuprim.tasks.dynamic.volume.volume_scene import choose_frames
+from neuprim.tasks.dynamic.volume.survey import SceneNormalisation
+from neuprim.tasks.dynamic.volume.volume_scene import choose_volume_frames
 from tests.tasks.dynamic.sequences import (
     MIDDLE,
     ORIGIN,
@@ -178,7 +178,7 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(hot: Path, tmp_path: Path) -> Non
 def test_frames_that_do_not_exist(folder: Path, tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"scene\.frames=50:60: .* has frames 2 to 11, and none of these"):
         dataset(folder, tmp_path, frames="50:60")
-    assert choose_frames("2:10:4", list(NUMBERS)) == [2, 10]
+    assert choose_volume_frames("2:10:4", list(NUMBERS)) == [2, 10]
 
 
 # ---------------------------------------------------------------- optics and grids
@@ -256,7 +256,7 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
         box = fine.world_bounds()
         assert box is not None
         grids = {"density": fine, "flames": coarse}
-        media.append(build_medium(grids, optics_preset("smoke_fire"), Normalisation.from_bounds(box).matrix()))
+        media.append(build_medium(grids, optics_preset("smoke_fire"), SceneNormalisation.from_bounds(box).matrix()))
     near, far = (m.values for m in media)
     assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))
 

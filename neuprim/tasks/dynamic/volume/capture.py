@@ -33,7 +33,7 @@ from neuprim.core.volumes.density_truth import GridExtent, Placement
 from neuprim.tasks.dynamic.volume.medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
-from neuprim.tasks.dynamic.volume.survey import GridReader, Normalisation
+from neuprim.tasks.dynamic.volume.survey import GridReader, SceneNormalisation
 
 RENDERER_VERSION = 2
 """Part of the cache's key: raise it with every change to the march, the optics, the cameras or the files' layout."""
@@ -66,7 +66,7 @@ class Capture:
     optics: Optics
     cameras: Sequence[Camera]
     samples: int
-    normalisation: Normalisation
+    normalisation: SceneNormalisation
     bounds: np.ndarray
     device: torch.device = hardware.HOST
     ends: tuple[int, int] | None = None
@@ -98,7 +98,7 @@ class Capture:
         optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
         parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation]
         parts += [self.device.type] * hardware.has_warp(self.device)
-        return hashlib.sha256(json.dumps(parts, default=_to_plain).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(parts, default=_encode_plain).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
         """The medium of a frame's file; empty if the file lacks the grids that absorb in others."""
@@ -146,7 +146,7 @@ class Capture:
             "renderer_version": RENDERER_VERSION,
             "frames": [{"number": f.number, "file": str(f.path)} for f in self.frames],
             "grids": dict(self.reader.names),
-            "look": json.loads(json.dumps(asdict(self.optics), default=_to_plain)),
+            "look": json.loads(json.dumps(asdict(self.optics), default=_encode_plain)),
             "cameras": len(self.cameras),
             "size": [self.cameras[0].width, self.cameras[0].height],
             "samples": self.samples,
@@ -173,11 +173,14 @@ class Capture:
                 )
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
-        largest, points = np.float32(medium.values[..., 0].max(initial=0.0)), _sample_points(medium, frame.number)
+        largest, points = (
+            np.float32(medium.values[..., 0].max(initial=0.0)),
+            _sample_medium_points(medium, frame.number),
+        )
         np.savez(folder / LAST_FILE, brightest=np.float32(brightest), largest=largest, **points)
 
 
-def _sample_points(medium: Medium, seed: int) -> dict[str, Any]:
+def _sample_medium_points(medium: Medium, seed: int) -> dict[str, Any]:
     """Draw points in proportion to the extinction, with jitter inside their voxels."""
     generator = np.random.default_rng(seed)
     sigma = medium.values[..., 0]
@@ -195,7 +198,7 @@ def _sample_points(medium: Medium, seed: int) -> dict[str, Any]:
     return {"means": means.astype(np.float32), "colors": colors.astype(np.float32), "weight": np.float64(total * cell)}
 
 
-def _to_plain(value: Any) -> Any:
+def _encode_plain(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 

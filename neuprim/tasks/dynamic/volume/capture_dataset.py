@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -99,17 +99,19 @@ class FrameViews(ViewSet):
         number, t = self._split_index(index)
         camera, frame = self.capture.cameras[number], self.frames[t]
         size = (camera.width, camera.height)
+
+        def read() -> Tensor:
+            return images.read_image(self.capture.fetch_image(self.folder, frame, number), size)
+
         try:
-            return self.folder.retry(
-                lambda: images.read_image(self.capture.fetch_image(self.folder, frame, number), size), warn_once
-            ).half()
+            return self.folder.retry(read, warn_once).half()
         except DataError as error:
             address = self.folder.at(self.capture.frame_folder(frame)).address
             raise DataError(f"{error}; delete the folder {address} to render the frame again") from error
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class VolumeRecording:
     """A rendered volume sequence, for starting points and evaluation; a dataset's ``extra``.
 
     Attributes:
@@ -141,7 +143,8 @@ class Recording:
         frames = torch.multinomial(torch.from_numpy(weights), count, replacement=True, generator=generator)
         per_frame = torch.bincount(frames, minlength=len(weights)).tolist()
         means, colors, times = [], [], []
-        for t, wanted in ((t, wanted) for t, wanted in enumerate(per_frame) if wanted):
+        for t in np.flatnonzero(per_frame).tolist():
+            wanted = per_frame[t]
             stored = read_points_file(self.capture.fetch_points(self.folder, self.capture.frames[t]), "means", "colors")
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
@@ -162,13 +165,9 @@ class Recording:
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
-            lens = self.test.view(index).camera
-            union = torch.zeros(lens.height, lens.width, dtype=torch.bool)
-            for i in range(camera * frames, (camera + 1) * frames):
-                alpha = self.test.pixels(i).alpha
-                assert alpha is not None
-                union |= alpha > _MIN_ALPHA
-            self._masks[camera] = union
+            alphas = (self.test.pixels(i).alpha for i in range(camera * frames, (camera + 1) * frames))
+            masks = (alpha > _MIN_ALPHA for alpha in alphas if alpha is not None)
+            self._masks[camera] = functools.reduce(torch.logical_or, masks)
         return self._masks[camera]
 
 
@@ -208,7 +207,7 @@ def volume_dataset(
     train = FrameViews(capture, folder, training, exposure, used.every, used.memory * TRAINING_MEMORY)
     test = FrameViews(capture, folder, held_out, exposure, memory=used.memory * _TEST_MEMORY)
     weights = [total_extinction(capture, folder, frame) for frame in capture.frames]
-    recording = Recording(name, capture, folder, exposure, weights, used.every, test)
+    recording = VolumeRecording(name, capture, folder, exposure, weights, used.every, test)
     voxels = FrameVoxels(capture, folder, train, weights[:: used.every], used.memory * _VOXEL_MEMORY)
     camera = capture.cameras[0]
     return Dataset(
@@ -300,7 +299,7 @@ class MediumVoxels:
             index.astype(np.int64), np.ascontiguousarray(flat[index]), (x, y, z), medium.scene_from_index
         )
 
-    @cached_property
+    @functools.cached_property
     def rms(self) -> tuple[float, float, float]:
         """Root mean squares of sigma, sigma times radiance, and the extinction grid's part; 0 without voxels."""
         if not len(self.index):
@@ -349,8 +348,7 @@ class FrameVoxels(PointSupervision):
     """Draws points at voxel centres of one frame at a time, to supervise the extinction directly.
 
     A frame is drawn in proportion to its extinction, and one draw in ten takes any frame. 70 % of the points are voxels
-    with matter, 20 % lie up to six voxels away from one, and 10 % anywhere in a box a little larger than the
-    sequence's.
+    with matter, 20 % lie up to six voxels away from one, and 10 % anywhere in a box larger than the sequence's.
 
     Args:
         folder: store of the images. Voxels of a frame are stored there as well, as their light takes long to compute.

@@ -15,7 +15,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import VdbFrame, sequence
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import voxels_in_box
-from neuprim.core.volumes.density_truth import DENSITY_ERRORS, TruthFrame, VolumeSource, measure_frame_errors
+from neuprim.core.volumes.density_truth import DENSITY_ERRORS, TruthFrame, VolumeSource, measure_density_errors
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 
@@ -98,7 +98,7 @@ def compare_extinction(model: Primitives, capture: Capture, times: list[float]) 
     """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
     ``sigma_frames`` has the numbers of every compared frame
-    (:func:`~neuprim.core.volumes.density_truth.measure_frame_errors`); the thirds are means over three of them, evenly
+    (:func:`~neuprim.core.volumes.density_truth.measure_density_errors`); thirds are means over three of them, evenly
     spaced. Frames without extinction are left out. If flames add to the extinction of a grid, the same numbers exist
     for that grid's part: ``density_frames``, ...
     """
@@ -108,7 +108,7 @@ def compare_extinction(model: Primitives, capture: Capture, times: list[float]) 
         entries: list[dict[str, Any]] = []
         for t in sorted({int((i + 0.5) * count / compared) for i in range(compared)}):
             conditions = {"time": torch.tensor(times[t])}
-            errors = measure_frame_errors(model, conditions, truth, t, where=capture.device, component=component)
+            errors = measure_density_errors(model, conditions, truth, t, where=capture.device, component=component)
             if errors is not None:
                 entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **errors})
         name = component or "sigma"

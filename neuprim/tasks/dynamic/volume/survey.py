@@ -61,7 +61,7 @@ class GridReader:
         return dict(zip(wanted, read_grids(path, list(wanted.values())), strict=True))
 
 
-def find_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> GridReader:
+def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> GridReader:
     """Find the grids that some frame has: those the user chose by name, then those with a usual name.
 
     Raises:
@@ -114,7 +114,7 @@ class SequenceSurvey:
     peaks: dict[str, float]
 
 
-def survey_frames(
+def survey_volume_frames(
     frames: list[VdbFrame], reader: GridReader, optics: Optics, progress: Callable[[str, float], None]
 ) -> SequenceSurvey:
     """Read all frames and measure their grids. Matter is what absorbs: the extinction grid, and flames if they do.
@@ -175,14 +175,14 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
 
 
 @dataclass(frozen=True)
-class Normalisation:
+class SceneNormalisation:
     """scene = (world - center) · scale, the same for all frames; axes are not turned."""
 
     center: tuple[float, float, float]
     scale: float
 
     @staticmethod
-    def from_bounds(bounds: np.ndarray) -> Normalisation:
+    def from_bounds(bounds: np.ndarray) -> SceneNormalisation:
         """Map the (2, 3) box ``bounds``, world units, to one around the origin with longest side 1.
 
         Raises:
@@ -195,7 +195,7 @@ class Normalisation:
                 f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume"
             )
         x, y, z = ((low + high) / 2).tolist()
-        return Normalisation((x, y, z), 1.0 / longest)
+        return SceneNormalisation((x, y, z), 1.0 / longest)
 
     def to_scene(self, points: np.ndarray) -> np.ndarray:
         """Convert (…, 3) world points to float64 scene points."""

@@ -46,7 +46,12 @@ from neuprim.tasks.dynamic.volume.optics import (
     optics_preset,
     override_optics,
 )
-from neuprim.tasks.dynamic.volume.survey import Normalisation, data_dependent_optics, find_grids, survey_frames
+from neuprim.tasks.dynamic.volume.survey import (
+    SceneNormalisation,
+    data_dependent_optics,
+    find_volume_grids,
+    survey_volume_frames,
+)
 
 # ---------------------------------------------------------------- settings
 
@@ -131,7 +136,7 @@ class VolumeSettings:
         return override_optics(preset, self.optics)
 
 
-def choose_frames(frames: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:
+def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:
     """Those of the ascending ``numbers`` of a sequence that ``scene.frames`` names.
 
     Raises:
@@ -179,7 +184,7 @@ class _PreparedScene:
         return RenderedFrames(self.capture, store)
 
 
-def load_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load a volume scene: find or simulate files, survey them, render all cameras, store the images in the cache.
 
     Raises:
@@ -195,10 +200,10 @@ def load_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     return volume_dataset(scene.name, scene.source, scene.capture, images, scene.held_out, up, used)
 
 
-def open_ground_truth(
+def open_rendered_frames(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> RenderedFrames:
-    """The scene's images as work to be done; raises as :func:`load_dataset`.
+    """The scene's images as work to be done; raises as :func:`load_volume_scene`.
 
     Args:
         known: of the same scene's ground truth in another process, which has surveyed the files.
@@ -206,8 +211,8 @@ def open_ground_truth(
     return _prepare_scene(settings, context, known).rendered_frames(context)
 
 
-def open_volumes(settings: Mapping[str, Any], context: SceneContext) -> CaptureDensity:
-    """The scene's files without any image; raises as :func:`load_dataset`."""
+def open_volume_source(settings: Mapping[str, Any], context: SceneContext) -> CaptureDensity:
+    """The scene's files without any image; raises as :func:`load_volume_scene`."""
     scene = _prepare_scene(settings, context)
     span = scene.span_ends()
     return CaptureDensity(scene.capture if span is None else scene.capture.select_frames(*span))
@@ -226,27 +231,27 @@ def _prepare_scene(
         folder = simulate_smoke(*run, context.cache_dir, context.progress)
         name = f"{options.simulation} (simulated)"
     files = sequence(folder).frames
-    chosen = set(choose_frames(options.frames, [f.number for f in files], str(folder)))
+    chosen = set(choose_volume_frames(options.frames, [f.number for f in files], str(folder)))
     frames = [f for f in files if f.number in chosen]
-    reader = find_grids(frames, {str(meaning): name for meaning, name in options.grids.items()})
+    reader = find_volume_grids(frames, {str(meaning): name for meaning, name in options.grids.items()})
     optics = options.resolve_optics("density" in reader.names)
     reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, GridExtent] = {}
     if known is None:
-        survey = survey_frames(frames, reader, optics, context.progress)
+        survey = survey_volume_frames(frames, reader, optics, context.progress)
         if not survey.hottest > 0:  # no flames in any frame: leave out everything that only flames need
             reader = replace(reader, names={m: n for m, n in reader.names.items() if m != "flames"})
         if options.vdb is not None:
             derived = data_dependent_optics(optics, reader.extinction, survey)
             optics = replace(optics, **{key: value for key, value in derived.items() if key not in options.optics})
-        normalisation, measured = Normalisation.from_bounds(survey.box), survey.extents
+        normalisation, measured = SceneNormalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
     else:
         derived = {key: known["look"][key] for key in DATA_DEPENDENT}
         optics = replace(optics, **{**derived, "flame_range": tuple(derived["flame_range"])})
         reader = replace(reader, names=known["grids"])
         center, bounds = tuple(known["normalisation"]["center"]), np.array(known["bounds"])
-        normalisation = Normalisation(center, known["normalisation"]["scale"])
+        normalisation = SceneNormalisation(center, known["normalisation"]["scale"])
     train, test = hemisphere_cameras(options.size, options.cameras, up=options.up, field_of_view=options.field_of_view)
     views = ([*train, *test], options.samples)
     capture = Capture(frames, reader, optics, *views, normalisation, bounds, context.device, measured=measured)
@@ -281,11 +286,11 @@ _FRAMES_PER_OVERLAP, _MAX_OVERLAP = 8, 3
 where little moves; frames in two chunks cost both of them."""
 
 
-def split_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+def split_into_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
     """The chunks of ``scene.chunks``; None for one run. Renders all frames, as the chunks share one exposure.
 
     Raises:
-        ConfigError: more chunks than the frames allow; and as :func:`load_dataset`.
+        ConfigError: more chunks than the frames allow; and as :func:`load_volume_scene`.
     """
     scene = _prepare_scene({name: value for name, value in config["scene"].items() if name != "name"}, context)
     options, capture = scene.settings, scene.capture

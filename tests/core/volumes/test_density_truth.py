@@ -14,7 +14,7 @@ from neuprim.core.volumes.density_truth import (
     DensityComparison,
     DensityTruth,
     TruthFrame,
-    measure_frame_errors,
+    measure_density_errors,
     split_grid_planes,
 )
 from tests.cosine_models import model
@@ -59,7 +59,7 @@ def numbers(a: np.ndarray, b: np.ndarray) -> dict[str, float]:
 def test_numbers_are_those_of_the_whole_grids(monkeypatch: pytest.MonkeyPatch, block: int, blocks: int) -> None:
     monkeypatch.setattr(density_truth, "_BLOCK_POINTS", block)
     truth, m = Known(ball()), model()
-    found = measure_frame_errors(m, {}, truth, 0)
+    found = measure_density_errors(m, {}, truth, 0)
     assert found is not None and tuple(found) == DENSITY_ERRORS and truth.blocks == blocks
     a, b = truth.values.astype(float), density_grid(m, {}, truth.matrix, SHAPE).numpy().astype(float)
     active = (b - a)[a > 0]
@@ -86,8 +86,8 @@ def test_false_matter_in_empty_voxels_counts() -> None:
 
 
 def test_nothing_to_compare_with() -> None:
-    assert measure_frame_errors(model(), {}, Known(ball()), 1) is None
-    assert measure_frame_errors(model(), {}, Known(np.zeros(SHAPE, np.float32)), 0) is None
+    assert measure_density_errors(model(), {}, Known(ball()), 1) is None
+    assert measure_density_errors(model(), {}, Known(np.zeros(SHAPE, np.float32)), 0) is None
     assert numbers(ball(), np.zeros(SHAPE))["correlation"] == 0
 
 

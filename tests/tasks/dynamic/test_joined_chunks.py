@@ -16,7 +16,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.volumes.points import volume_values_at
 from neuprim.tasks.dynamic import TASK
-from neuprim.tasks.dynamic.time_density import TimeDensity, chunk_weights, validate_overlaps
+from neuprim.tasks.dynamic.time_density import TimeDensity, chunk_weights, validate_chunk_overlaps
 from neuprim.tasks.dynamic.volume.volume_scene import join_chunks
 from tests import scenes
 from tests.timed_models import model
@@ -67,7 +67,7 @@ def test_a_chunk_is_all_or_nothing_at_the_frames_beside_a_seam() -> None:
 )
 def test_other_seams_are_refused(wrong: object) -> None:
     with pytest.raises(ValueError, match="expected pairs of"):
-        validate_overlaps(wrong)  # type: ignore[arg-type]
+        validate_chunk_overlaps(wrong)  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- joining

@@ -18,7 +18,7 @@ from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
 from neuprim.tasks.dynamic.volume.raymarch import render_medium
-from neuprim.tasks.dynamic.volume.volume_scene import open_volumes
+from neuprim.tasks.dynamic.volume.volume_scene import open_volume_source
 from neuprim.tasks.static import SphericalHarmonics
 from tests.tasks.dynamic.sequences import dataset, recorded, write_blobs
 from tests.tasks.dynamic.volumes import camera, ragged
@@ -67,7 +67,7 @@ def test_pixels_do_not_depend_on_those_beside_them(monkeypatch: pytest.MonkeyPat
 
 def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     settings = {"vdb": str(folder), "size": 24, "cameras": 4, "look": "smoke_fire"}
-    capture = open_volumes(settings, SceneContext(0, tmp_path)).capture
+    capture = open_volume_source(settings, SceneContext(0, tmp_path)).capture
     generator = torch.Generator().manual_seed(0)
     means = 0.4 * torch.rand(30, 3, generator=generator) - 0.2
     times = {"time": torch.rand(30, generator=generator)}

@@ -76,14 +76,8 @@ def test_a_scene_in_any_unit(task: str, tmp_path: Path) -> None:
         folder = tmp_path / f"{unit:g}"
         write(folder, task, unit)
         # few steps: rounding is another in every unit, and what it decides grows with each
-        words = [
-            f"task={task}",
-            *WORDS[task],
-            f"scene.path={folder}",
-            "model.primitives=120",
-            "train.iterations=30",
-            "renderer.threads=1",
-        ]
+        small = "model.primitives=120 train.iterations=30 renderer.threads=1"
+        words = [f"task={task}", *WORDS[task], f"scene.path={folder}", *small.split()]
         fitted = fit(compose([*words, f"output_dir={tmp_path / 'run'}"]))
         near = fitted.config.renderer.near
         assert near == pytest.approx(0.01 * unit, rel=0.3), "decided in the scene's own unit, and recorded"

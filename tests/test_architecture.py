@@ -237,3 +237,27 @@ def test_nothing_unpickles_or_evaluates() -> None:
         return name in ("eval", "exec", "pickle.load", "pickle.loads", "yaml.load", "yaml.unsafe_load")
 
     assert places(FILES, executes) == []
+
+
+# ---------------------------------------------------------------- tests lie where the code does
+
+TESTS = Path(__file__).parent
+OTHERS = {"docs", "fuzz", "numerics"}
+"""Folders of tests without one of the package: the documentation, and what all renderers must agree on."""
+
+
+def test_no_two_files_of_tests_have_one_name() -> None:
+    """Folders of tests are no packages, so that the second of a name could not be collected."""
+    names = [file.name for file in TESTS.rglob("test_*.py")]
+    assert sorted(name for name in set(names) if names.count(name) > 1) == []
+
+
+def test_every_folder_of_tests_is_one_of_the_package() -> None:
+    found = {file.parent.relative_to(TESTS) for file in TESTS.rglob("test_*.py")} - {Path()}
+    assert [folder for folder in found if folder.parts[0] not in OTHERS and not (ROOT / folder).is_dir()] == []
+    assert all((TESTS / name).is_dir() and not (ROOT / name).exists() for name in OTHERS)
+
+
+def test_tests_of_a_room_are_in_its_own_folder() -> None:
+    found = [file.relative_to(TESTS) for room in (TESTS, TESTS / "core") for file in room.glob("test_*.py")]
+    assert [f for f in found if (ROOT / f.parent / f.stem.removeprefix("test_") / "__init__.py").exists()] == []

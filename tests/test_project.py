@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 import os
 import re
-import shlex
 import shutil
 import subprocess
 import tomllib
@@ -14,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import yaml
 from packaging.requirements import Requirement
 
 import neuprim
@@ -27,10 +25,6 @@ EXTRAS: dict[str, list[str]] = PROJECT["project"]["optional-dependencies"]
 
 def text(name: str) -> str:
     return (ROOT / name).read_text(encoding="utf-8")
-
-
-def parsed(name: str) -> Any:
-    return yaml.safe_load(text(name))
 
 
 def constraints() -> dict[str, str]:
@@ -58,35 +52,6 @@ def test_every_dependency_is_imported() -> None:
     importing = re.compile(r"^\s*(?:import|from) (\w+)", re.MULTILINE)
     used = {name for file in (ROOT / "neuprim").rglob("*.py") for name in importing.findall(file.read_text("utf-8"))}
     assert [r.name for r in wanted if modules.get(r.name, r.name) not in used] == []
-
-
-def steps() -> list[tuple[str, list[str]]]:
-    """(job, words) of every command of the workflow."""
-    jobs = parsed(".github/workflows/ci.yml")["jobs"]
-    runs = [(name, step["run"]) for name, job in jobs.items() for step in job["steps"] if "run" in step]
-    return [(name, shlex.split(line)) for name, block in runs for line in block.splitlines() if line.strip()]
-
-
-def test_the_workflow_s_commands_exist() -> None:
-    commands = steps()
-    assert ("everything", [".ci/run"]) in commands
-    for job, words in commands:
-        if job == "everything":
-            continue
-        assert words[:2] == ["python", "-m"], words
-        assert words[2] in ("pip", "pytest", "neuprim"), words
-        for path in (words[i + 1] for i, word in enumerate(words) if word == "-c"):
-            assert (ROOT / path).is_file()
-        for extras in re.findall(r"\.\[([\w,]+)\]", " ".join(words)):
-            assert set(extras.split(",")) <= EXTRAS.keys()
-
-
-def test_the_workflow_tests_as_the_readme_says() -> None:
-    (line,) = re.findall(r"^python3 -m venv.*pytest.*$", text("README.md"), re.MULTILINE)
-    _, install, pytest_words = (shlex.split(part) for part in line.split("&&"))
-    said = {tuple(words[2:]) for job, words in steps() if job == "tests"}
-    assert ("pip", *(word for word in install[1:] if word != "-q")) in said
-    assert ("pytest", *pytest_words[1:]) in said
 
 
 @posix

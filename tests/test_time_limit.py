@@ -27,19 +27,8 @@ def test_a_hanging_test_fails_and_a_slow_one_may_go_on(tmp_path: Path) -> None:
         "@pytest.mark.slow\ndef test_takes_its_time():\n    time.sleep(1.5)\n"
         "def test_is_quick():\n    pass\n"
     )
-    words = [
-        "-c",
-        str(ROOT / "pyproject.toml"),
-        "-m",
-        "",
-        "-o",
-        "timeout=1",
-        "-p",
-        "no:cacheprovider",
-        "-p",
-        "no:xdist",
-        str(tmp_path),
-    ]
+    limits = "-o timeout=1 -p no:cacheprovider -p no:xdist"
+    words = ["-c", str(ROOT / "pyproject.toml"), "-m", "", *limits.split(), str(tmp_path)]
     done = subprocess.run(
         [sys.executable, "-m", "pytest", *words], capture_output=True, text=True, cwd=tmp_path, check=False, timeout=50
     )

@@ -45,15 +45,8 @@ class Outer:
 
 
 def test_what_loses_nothing_is_converted() -> None:
-    values = {
-        "path": 123,
-        "inner": {"size": 32.0},
-        "exposure": "1e-3",
-        "rates": {"a": 1},
-        "range": [0, 1],
-        "free": object,
-    }
-    made = validate(Outer, values, "scene")
+    values = {"path": 123, "inner": {"size": 32.0}, "exposure": "1e-3", "rates": {"a": 1}, "range": [0, 1]}
+    made = validate(Outer, {**values, "free": object}, "scene")
     assert made.path == Path("123") and made.inner == Inner(size=32) and isinstance(made.inner.size, int)
     assert (
         made.exposure == 1e-3

@@ -29,16 +29,6 @@ def test_links_and_pictures_exist(page: Path) -> None:
     assert broken == []
 
 
-def test_the_checker_sees_links(tmp_path: Path) -> None:
-    page = tmp_path / "x.md"
-    page.write_text(
-        '# A (b): `c`\n[a](b.md#c) ![p](d.png "t") <img src="e.png"> [w](https://x.y) '
-        "`[n](o.md)`\n```sh\n[n](o.md)\n```\n"
-    )
-    assert links(page) == ["b.md#c", "d.png", "e.png"]
-    assert anchors(page) == {"a-b-c"}
-
-
 def listed(entry: Any) -> list[str]:
     if isinstance(entry, str):
         return [entry]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import sys
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -45,18 +46,10 @@ PLUGIN = Inspector(api=1, name="crumbs", summary="points", layers=lambda frame: 
 def add(site: Path, kind: str, source: str) -> None:
     """The exporter ``centres`` of the distribution strange-exporter 0.3, or the inspector ``crumbs`` of
     strange-inspector."""
-    groups: dict[str, tuple[PluginGroup, str]] = {
-        "exporter": (EXPORTERS, "centres"),
-        "inspector": (INSPECTORS, "crumbs"),
-    }  # type: ignore[type-arg]
-    group, name = groups[kind]
-    install(
-        site,
-        f"strange-{kind}",
-        {name: f"strange_{kind}:PLUGIN"},
-        {f"strange_{kind}.py": source},
-        group=group.entry_points,
-    )
+    group: PluginGroup[Any]
+    group, name = (EXPORTERS, "centres") if kind == "exporter" else (INSPECTORS, "crumbs")
+    entries, files = {name: f"strange_{kind}:PLUGIN"}, {f"strange_{kind}.py": source}
+    install(site, f"strange-{kind}", entries, files, group=group.entry_points)
     importlib.invalidate_caches()
     sys.modules.pop(f"strange_{kind}", None)
 

@@ -118,51 +118,42 @@ def test_a_crash_is_one_line_of_the_command_and_does_not_end_a_sweep(
     assert "Traceback" in error and error.splitlines()[-1] == f"neuprim: error: {text}"
 
 
+CALLS: dict[str, Any] = {
+    "clips": call_task_clips,
+    "facts": call_task_facts,
+    "diagnose": lambda task, data: call_task_diagnose(task, data, None),
+    "orbit": lambda task, data: call_task_orbit(task, data, 3),
+    "mask": lambda task, data: call_task_mask(task, data, 0),
+    "metrics": lambda task, data: call_task_metrics(task, data, 0, DATA, DATA),
+    "tunable_settings": lambda task, data: call_task_tunable_settings(task, {}),
+}
+
+
 @pytest.mark.parametrize(
-    ("member", "found", "call", "text"),
+    ("member", "found", "text"),
     [
-        ("clips", 3, call_task_clips, "clips: found a int; expected a list of neuprim.core.data.Clip"),
-        ("clips", [3], call_task_clips, "clips: found a int in the list"),
-        ("clips", [Clip("x", (99,), 5.0)], call_task_clips, "clips: 'x': found view 99; expected some below 2"),
-        ("clips", [Clip("x", (), 5.0)], call_task_clips, "clips: 'x': found no views"),
-        ("facts", {"x": float("nan")}, call_task_facts, "facts: x cannot be written as JSON"),
-        ("facts", {3: 1}, call_task_facts, "facts: found a dict; expected a dictionary with texts as keys"),
-        ("diagnose", {"x": object()}, lambda t, d: call_task_diagnose(t, d, None), "diagnose: x cannot be written"),
-        ("orbit", [], lambda t, d: call_task_orbit(t, d, 3), "orbit: found no views"),
-        ("orbit", [3], lambda t, d: call_task_orbit(t, d, 3), "found a int in the list; expected a list of"),
-        ("mask", torch.ones(2, 2), lambda t, d: call_task_mask(t, d, 0), "mask"),
-        ("metrics", [3], lambda t, d: call_task_metrics(t, d, 0, DATA, DATA), "metrics of test view .*: found a list"),
-        ("metrics", {"x": float("nan")}, lambda t, d: call_task_metrics(t, d, 0, DATA, DATA), "x: found nan"),
-        (
-            "metrics",
-            {"psnr": 1.0},
-            lambda t, d: call_task_metrics(t, d, 0, DATA, DATA),
-            "found the name psnr, which every",
-        ),
-        (
-            "tunable_settings",
-            3,
-            lambda t, d: call_task_tunable_settings(t, {}),
-            "tunable_settings: found a int; expected a dictionary",
-        ),
-        (
-            "tunable_settings",
-            {"train.x": (1,)},
-            lambda t, d: call_task_tunable_settings(t, {}),
-            "tunable_settings: found 'train.x'; expected the name",
-        ),
-        (
-            "tunable_settings",
-            {"model.x": "12"},
-            lambda t, d: call_task_tunable_settings(t, {}),
-            "tunable_settings: model.x: found '12'; expected a list",
-        ),
+        ("clips", 3, "clips: found a int; expected a list of neuprim.core.data.Clip"),
+        ("clips", [3], "clips: found a int in the list"),
+        ("clips", [Clip("x", (99,), 5.0)], "clips: 'x': found view 99; expected some below 2"),
+        ("clips", [Clip("x", (), 5.0)], "clips: 'x': found no views"),
+        ("facts", {"x": float("nan")}, "facts: x cannot be written as JSON"),
+        ("facts", {3: 1}, "facts: found a dict; expected a dictionary with texts as keys"),
+        ("diagnose", {"x": object()}, "diagnose: x cannot be written"),
+        ("orbit", [], "orbit: found no views"),
+        ("orbit", [3], "found a int in the list; expected a list of"),
+        ("mask", torch.ones(2, 2), "mask"),
+        ("metrics", [3], "metrics of test view .*: found a list"),
+        ("metrics", {"x": float("nan")}, "x: found nan"),
+        ("metrics", {"psnr": 1.0}, "found the name psnr, which every"),
+        ("tunable_settings", 3, "tunable_settings: found a int; expected a dictionary"),
+        ("tunable_settings", {"train.x": (1,)}, "tunable_settings: found 'train.x'; expected the name"),
+        ("tunable_settings", {"model.x": "12"}, "tunable_settings: model.x: found '12'; expected a list"),
     ],
 )
-def test_what_a_tasks_function_returns_is_checked(member: str, found: Any, call: Any, text: str) -> None:
+def test_what_a_tasks_function_returns_is_checked(member: str, found: Any, text: str) -> None:
     task = replace(load_task("static"), **{member: lambda *args: found})
     with pytest.raises(ReturnError, match=text):
-        call(task, DATA)
+        CALLS[member](task, DATA)
 
 
 def test_what_a_task_returns_is_passed_on() -> None:

@@ -80,9 +80,8 @@ def run(site: Path, extra: str) -> int:
 
 def written() -> tuple[dict[str, Any], dict[str, Any]]:
     """Metrics, and what the model's header says of the data."""
-    return json.loads(Path("r/metrics.json").read_text()), checkpoint.read(Path("r/model.safetensors"), "model")[0][
-        "data"
-    ]
+    header = checkpoint.read(Path("r/model.safetensors"), "model")[0]
+    return json.loads(Path("r/metrics.json").read_text()), header["data"]
 
 
 def test_images_cameras_and_lights_are_enough(site: Path) -> None:
@@ -90,29 +89,13 @@ def test_images_cameras_and_lights_are_enough(site: Path) -> None:
     metrics, data = written()
     assert (metrics["exposure"], metrics["falloff"], list(metrics["baselines"])) == (2.0, "none", ["black"])
     assert all({"psnr_linear_clamped", "psnr_display", "psnr_mask"} <= view.keys() for view in metrics["per_view"])
-    assert (data["lights"]["falloff"], data["lights"]["exposure"], len(data["lights"]["directions"])) == (
-        "none",
-        2.0,
-        6,
-    )
+    lights = data["lights"]
+    assert (lights["falloff"], lights["exposure"], len(lights["directions"])) == ("none", 2.0, 6)
     with Image.open("r/renders/orbit.webp") as film:
         assert getattr(film, "n_frames", 1) == 2
     write_exr(Path("sky.exr"), torch.ones(8, 16, 3))
-    words = [
-        "--camera",
-        "orbit",
-        "--frames",
-        "2",
-        "--environment",
-        "sky.exr",
-        "--environment-samples",
-        "4",
-        "--format",
-        "png",
-        "--out",
-        "sky",
-    ]
-    assert main(["render", "r", *words]) == 0
+    words = "--camera orbit --frames 2 --environment sky.exr --environment-samples 4 --format png --out sky"
+    assert main(["render", "r", *words.split()]) == 0
     assert len(list(Path("sky").glob("*.png"))) == 2
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -13,7 +12,7 @@ from torch import Tensor
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
-from neuprim.core.data import Dataset
+from neuprim.core.data import Dataset, View
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import Supervision
 from neuprim.core.train.settings import ModelSettings, TrainSettings
@@ -21,6 +20,8 @@ from neuprim.core.used_settings import build_settings, loss_settings
 from neuprim.plugins.registry import LOSSES, load_task
 from neuprim.runs.run import run
 from neuprim.tasks.static import TASK
+from tests.core import tiny
+from tests.core.tiny import camera
 from tests.plugins.extras import LOSS, add
 from tests.plugins.fakes import site, toy
 
@@ -121,16 +122,9 @@ def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_pat
         "more')\n    assert",
     )
     add(site, "loss", picky, package="fake_loss")
-    words = [
-        "task=static",
-        "scene=blender",
-        "scene.path=not_there",
-        "train.loss=extra",
-        "task.options.weight=-1",
-        f"output_dir='{tmp_path / 'run'}'",
-    ]
+    words = "task=static scene=blender scene.path=not_there train.loss=extra task.options.weight=-1"
     with pytest.raises(ConfigError, match="weight: expected more"):
-        run(compose(words))
+        run(compose([*words.split(), f"output_dir='{tmp_path / 'run'}'"]))
 
 
 # ---------------------------------------------------------------- shared settings that not everybody uses
@@ -139,29 +133,17 @@ def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_pat
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (
-            ["task=toy", "model.sh_degree=2"],
-            "model.sh_degree: task 'toy' does not use this setting; it uses model.neurons",
-        ),
-        (
-            ["task=toy", "model={sh_every: 0}"],
-            "model.sh_every: task 'toy' does not use this setting; it uses model.neurons",
-        ),
-        (
-            ["task=relight", "train.ssim_weight=0.5"],
-            "train.ssim_weight: task 'relight' does not use this setting; it uses model.neurons",
-        ),
-        (["task=relight", "model.sh_degree=1"], "model.sh_degree: task 'relight' does not use this setting"),
-        (
-            ["task=static", "train.loss=l1", "train.ssim_weight=0.5"],
-            "train.ssim_weight: loss 'l1' does not use this setting",
-        ),
+        ("task=toy model.sh_degree=2", "model.sh_degree: task 'toy'{}; it uses model.neurons"),
+        ("task=toy model={sh_every:0}", "model.sh_every: task 'toy'{}; it uses model.neurons"),
+        ("task=relight train.ssim_weight=0.5", "train.ssim_weight: task 'relight'{}; it uses model.neurons"),
+        ("task=relight model.sh_degree=1", "model.sh_degree: task 'relight'{}"),
+        ("task=static train.loss=l1 train.ssim_weight=0.5", "train.ssim_weight: loss 'l1'{}"),
     ],
 )
-def test_unused_settings_are_refused_when_typed(toy: Path, words: list[str], text: str) -> None:
+def test_unused_settings_are_refused_when_typed(toy: Path, words: str, text: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        compose(words, False)
-    assert str(caught.value) == text or (text in str(caught.value) and text.endswith("setting"))
+        compose(words.split(), False)
+    assert str(caught.value).startswith(text.format(" does not use this setting"))
 
 
 def test_unused_settings_are_refused_in_a_preset(toy: Path) -> None:
@@ -193,14 +175,14 @@ def test_what_is_not_used_is_not_shown(toy: Path, tmp_path: Path, capsys: pytest
 
 @pytest.mark.parametrize("task", ["static", "dynamic", "relight"])
 def test_names_of_initial_values_and_rates_are_checked_before_data(task: str) -> None:
-    with pytest.raises(ConfigError, match=r"model.init.alhpa: no such setting; did you mean 'model.init.alpha'"):
-        compose([f"task={task}", "model.init.alhpa=0.3"], False)
-    with pytest.raises(ConfigError, match=r"train.rates.mean: no such parameter; did you mean 'means'"):
-        compose([f"task={task}", "train.rates.mean=0.3"], False)
-    with pytest.raises(ConfigError, match=r"train.rate_units.mean: no such parameter; did you mean 'means'"):
-        compose([f"task={task}", "train.rate_units.mean=absolute"], False)
-    with pytest.raises(ConfigError, match=r"train.rate_units.means=metre: expected "):
-        compose([f"task={task}", "train.rate_units.means=metre"], False)
+    for word, text in (
+        ("model.init.alhpa=0.3", r"model.init.alhpa: no such setting; did you mean 'model.init.alpha'"),
+        ("train.rates.mean=0.3", r"train.rates.mean: no such parameter; did you mean 'means'"),
+        ("train.rate_units.mean=absolute", r"train.rate_units.mean: no such parameter; did you mean 'means'"),
+        ("train.rate_units.means=metre", r"train.rate_units.means=metre: expected "),
+    ):
+        with pytest.raises(ConfigError, match=text):
+            compose([f"task={task}", word], False)
 
 
 # ---------------------------------------------------------------- what functions get
@@ -213,16 +195,12 @@ def test_functions_get_what_they_declare_and_no_more() -> None:
     assert "sh_degree" not in model and model.get("sh_degree", 7) == 7
     with pytest.raises(ConfigError, match=r"task 'static' reads model.sh_degree, which its 'uses' does not declare"):
         model["sh_degree"]
-    with pytest.raises(
-        ConfigError, match=r"task 'static' reads task.options.width, which its 'options' does not declare"
-    ):
+    with pytest.raises(ConfigError, match=r"task 'static' reads task.options.width, which its 'options' does not"):
         model["options"]["width"]
     with pytest.raises(KeyError):
         model["no_such_setting"]
     train = loss_settings(shy, TrainSettings(), {})
-    with pytest.raises(
-        ConfigError, match=r"the loss of task 'static' reads train.ssim_weight, which its 'uses' does not declare"
-    ):
+    with pytest.raises(ConfigError, match=r"the loss of task 'static' reads train.ssim_weight, which its 'uses' does"):
         train["ssim_weight"]
 
 
@@ -233,9 +211,7 @@ def test_all_built_in_losses_serve_any_task() -> None:
     """Needs an installation of this version: losses come through its entry points."""
     assert {"compressed", "l1", "photometric", "relative"} <= {info.name for info in LOSSES.list_plugins()}
     rendered, truth = torch.full((4, 4, 3), 0.5, requires_grad=True), torch.full((4, 4, 3), 0.25)
-    from tests.core.tiny import camera
-
-    frame = Supervision(_view(camera(0.0, 0.0)))
+    frame = Supervision(View("v", camera(0.0, 0.0)))
     found = {}
     for name in ("compressed", "l1", "relative"):
         value, parts = LOSSES.load(name).make(loss_settings(LOSSES.load(name), TrainSettings(), {}))(
@@ -253,15 +229,7 @@ def test_all_built_in_losses_serve_any_task() -> None:
     assert found == pytest.approx(expected, rel=1e-5)
 
 
-def _view(camera: Any) -> Any:
-    from neuprim.core.data import View
-
-    return View("v", camera)
-
-
 def test_a_loss_sees_view_mask_alpha_and_progress() -> None:
-    from tests.core import tiny
-
     seen: list[tuple[Tensor, Tensor, Supervision]] = []
     data: Dataset = tiny.two_primitives(random_background=True)
     mask = torch.ones(tiny.SIZE, tiny.SIZE, dtype=torch.bool)

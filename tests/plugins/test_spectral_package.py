@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import csv
 import json
-import os
-import subprocess
-import sys
-import venv
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,7 +12,6 @@ import pytest
 import torch
 from PIL import Image
 
-import neuprim.runs.run as running
 from neuprim.cli import main
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.io.exr import write_exr
@@ -24,7 +19,7 @@ from neuprim.core.io.images import write_png
 from neuprim.runs.open import load_run, read_metrics
 from tests.inspect.pages import layers_of
 from tests.plugins.fakes import site
-from tests.plugins.spectral import NAMES, PACKAGE, fit, forget, install_spectral
+from tests.plugins.spectral import NAMES, fit, forget, install_spectral
 
 __all__ = ["site"]
 
@@ -95,15 +90,8 @@ def folder_of_images(folder: Path) -> Path:
 
 def test_its_files_are_read(package: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data = folder_of_images(tmp_path / "data")
-    words = [
-        "run",
-        "task=spectral",
-        "scene=files",
-        f"scene.path={data}",
-        "scene.test_every=4",
-        "model.primitives=20",
-        "train.iterations=5",
-    ]
+    small = "scene.test_every=4 model.primitives=20 train.iterations=5"
+    words = ["run", "task=spectral", "scene=files", f"scene.path={data}", *small.split()]
     assert call(*words, f"output_dir={tmp_path / 'run'}") == 0
     assert read_metrics(tmp_path / "run")["channels"] == list(NAMES)
     assert refusal(capsys, *words, "scene.path=null", f"output_dir={tmp_path / 'x'}").startswith("scene.path: required")
@@ -199,39 +187,3 @@ def test_what_does_not_fit_ends_a_run(
 ) -> None:
     install_spectral(site, {module: (old, new)})
     assert text in refusal(capsys, *short(tmp_path / "run"))
-
-
-@pytest.mark.slow
-def test_pip_installs_it_and_its_own_tests_pass(tmp_path: Path) -> None:
-    """An editable installation into an environment of its own, and its removal."""
-    home = tmp_path / "env"
-    venv.create(home, with_pip=False)
-    packages = next((home / "lib").glob("python*/site-packages"))
-    root = Path(running.__file__).parents[1]
-    (packages / "base.pth").write_text(
-        "\n".join(p for p in (*sys.path, str(root)) if p.endswith("-packages") or p == str(root))
-    )
-    source = tmp_path / "neuprim-spectral"
-    for path in PACKAGE.rglob("*"):
-        if path.is_file() and "__pycache__" not in path.parts:
-            (source / path.relative_to(PACKAGE)).parent.mkdir(parents=True, exist_ok=True)
-            (source / path.relative_to(PACKAGE)).write_bytes(path.read_bytes())
-
-    def python(*words: str | Path, ok: bool = True) -> str:
-        found = subprocess.run(
-            [home / "bin" / "python", *words], cwd=tmp_path, capture_output=True, text=True, env={**os.environ}
-        )
-        assert (found.returncode == 0) == ok, found.stdout + found.stderr
-        return found.stdout + found.stderr
-
-    pip = ("-m", "pip", "install", "-q", "--no-deps", "--no-build-isolation", "-e", source)
-    neuprim = ("-m", "neuprim")
-    size = "scene.size=16 scene.train_views=4 scene.test_views=1 model.primitives=20 train.iterations=5"
-    python(*pip)
-    python(*neuprim, "run", "task=spectral", *size.split(), "output_dir=out")
-    assert "\n  bands       (neuprim-spectral 0.1)" in python(*neuprim, "tasks")
-    assert "passed" in python("-m", "pytest", "-q", "-p", "no:cacheprovider", source)
-    python("-m", "pip", "uninstall", "-q", "-y", "neuprim-spectral")
-    assert "made by neuprim-spectral 0.1 (task spectral), which is not installed" in python(
-        *neuprim, "eval", "out", ok=False
-    )

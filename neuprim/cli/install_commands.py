@@ -213,16 +213,10 @@ def _describe_memory() -> str:
         total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
     except (ValueError, OSError, AttributeError):
         return "unknown"
-    text = f"{total / 2**30:.1f} GiB"
-    try:
-        limit = int(Path("/sys/fs/cgroup/memory.max").read_text(encoding="ascii"))
-    except (OSError, ValueError):
-        return text  # no control group, or "max"
-    return f"{limit / 2**30:.1f} GiB (limit of this container; machine: {text})" if limit < total else text
+    return f"{total / 2**30:.1f} GiB"
 
 
 def _list_packages() -> Rows:
-    """Each package that neuprim's own metadata names, for itself or for an extra, with what is installed."""
     extras = ["", *(metadata.metadata("neuprim").get_all("Provides-Extra") or [])]
     needed: dict[str, list[tuple[Requirement, str]]] = {}  # several extras may name one package
     for text in metadata.requires("neuprim") or []:

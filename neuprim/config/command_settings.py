@@ -96,11 +96,7 @@ class Target:
 
 
 def take_launcher(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
-    """Return the launcher that overrides ask for, and the other overrides.
-
-    Raises:
-        ConfigError: no such launcher or setting of it, an impossible value, or one that this launcher does not use.
-    """
+    """Return the launcher that overrides ask for, with settings that it uses, and the other overrides."""
     name, settings, others = take_settings(overrides, "launcher", LauncherSettings)
     if name is not None:
         if name not in LAUNCHERS:
@@ -118,11 +114,7 @@ def take_launcher(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]
 
 
 def take_viewer(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
-    """Return the viewer that is asked for, None for none, and the other overrides; a host or port asks for one, too.
-
-    Raises:
-        ConfigError: no such setting, several values, or an impossible one.
-    """
+    """Return the viewer that is asked for, None for none, and the other overrides; a host or port asks for one, too."""
     shown, settings, others = take_settings(overrides, "viewer", ViewerSettings)
     if shown is None:
         shown = len(others) < len(overrides)
@@ -130,11 +122,7 @@ def take_viewer(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[s
 
 
 def take_target(overrides: Sequence[str]) -> tuple[tuple[Target, float] | None, list[str]]:
-    """Return the target and its budget in seconds, None where none is asked for, and the other overrides.
-
-    Raises:
-        ConfigError: a target without a budget or the reverse, no such target, or an impossible value.
-    """
+    """Return the target and its budget in seconds, None where neither is asked for, and the other overrides."""
     budget, _, rest = take_settings(overrides, "budget", _Budget)
     whole, target, others = take_settings(rest, "target", Target)
     if len(others) == len(overrides):
@@ -145,9 +133,8 @@ def take_target(overrides: Sequence[str]) -> tuple[tuple[Target, float] | None, 
     if not target.given():
         raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
     if budget is None:
-        raise ConfigError(
-            f"{target}: expected a budget beside it, the time for search and training together, such as budget=10m"
-        )
+        expected = "a budget beside it, the time for search and training together, such as budget=10m"
+        raise ConfigError(f"{target}: expected {expected}")
     return (target, parse_duration(budget if isinstance(budget, str) else "", asked)), others
 
 
@@ -157,14 +144,7 @@ class _Budget:
 
 
 def parse_duration(text: str, asked: str) -> float:
-    """Return the seconds of a time such as 90s, 5m or 1h.
-
-    Args:
-        asked: what the user typed, for the message.
-
-    Raises:
-        ConfigError: it is something else.
-    """
+    """Return the seconds of a time such as 90s, 5m or 1h; ``asked`` is what the user typed, for the message."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
     if match is None or float(match[1]) == 0:
         raise ConfigError(f"{asked}: expected a time such as 90s, 5m or 1h")

@@ -55,17 +55,13 @@ class CommandLine:
 
 
 def parse(overrides: Sequence[str]) -> list[Assignment]:
-    """Read assignments, in the order given.
-
-    A leading ``+`` or ``++`` means nothing here: whether a key exists is checked by name, not by prefix.
-
-    Raises:
-        ConfigError: for anything that is not one assignment of one value.
-    """
+    """Read assignments of one value each; a leading ``+`` or ``++`` means nothing, as keys are checked by name."""
     found = []
-    for override, text in zip(_read(overrides), overrides, strict=True):
+    for override, text in zip(_parse_with_hydra(overrides), overrides, strict=True):
         if override.is_sweep_override():
-            raise ConfigError(f"{text}: several values; add -m to run each of them, or quote the value: {_quote(text)}")
+            raise ConfigError(
+                f"{text}: several values; add -m to run each of them, or quote the value: {_quote_for_shell(text)}"
+            )
         if override.package is not None:
             raise ConfigError(f"{text}: packages (@) are not used here; expected KEY=VALUE")
         found.append(Assignment(override.key_or_group, override.value(), text))
@@ -78,9 +74,6 @@ def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[A
     Returns:
         The value of ``group=VALUE``, None where it is not given; the settings, from ``group.name=VALUE`` and
         ``group.name.key=VALUE``; and the other overrides.
-
-    Raises:
-        ConfigError: several values for one setting, or none that ``cls`` takes.
     """
     own = [text for text in overrides if key_of(text).partition(".")[0] == group]
     for key in swept_keys(own):
@@ -103,13 +96,15 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
     """
     choices: list[list[str]] = []
     count = 1
-    for override, text in zip(_read(overrides), overrides, strict=True):
+    for override, text in zip(_parse_with_hydra(overrides), overrides, strict=True):
         if not override.is_sweep_override():
             choices.append([text])
             continue
         key = override.get_key_element()
         if key.lstrip("+") in NOT_SWEPT:
-            raise ConfigError(f"{text}: {key} cannot be swept; quote a value that contains commas: {_quote(text)}")
+            raise ConfigError(
+                f"{text}: {key} cannot be swept; quote a value that contains commas: {_quote_for_shell(text)}"
+            )
         try:
             values = [f"{key}={v}" for v in itertools.islice(override.sweep_string_iterator(), MAX_RUNS + 1)]
         except Exception as error:  # interval() and glob() have no list of values; range() may divide by a zero step
@@ -126,7 +121,7 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
 
 def sweep_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]]) -> list[str]:
     """Return a directory name for each combination, made of the swept keys and their values; all different."""
-    swept = [i for i, override in enumerate(_read(overrides)) if override.is_sweep_override()]
+    swept = [i for i, override in enumerate(_parse_with_hydra(overrides)) if override.is_sweep_override()]
     names: list[str] = []
     for combination in combinations:
         text = "_".join(combination[i].lstrip("+").replace("=", "-", 1) for i in swept)
@@ -163,10 +158,10 @@ def drop_place(overrides: Iterable[str]) -> list[str]:
 
 def swept_keys(overrides: Iterable[str]) -> list[str]:
     """Return the keys that have several values."""
-    return [override.key_or_group for override in _read(list(overrides)) if override.is_sweep_override()]
+    return [override.key_or_group for override in _parse_with_hydra(list(overrides)) if override.is_sweep_override()]
 
 
-def _read(overrides: Sequence[str]) -> list[Any]:
+def _parse_with_hydra(overrides: Sequence[str]) -> list[Any]:
     """Parse each with Hydra."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
@@ -182,13 +177,12 @@ def _read(overrides: Sequence[str]) -> list[Any]:
         try:
             found.append(parser.parse_override(text))
         except HydraException as error:
-            raise ConfigError(
-                f"{text}: cannot be read; quote values that contain , = or brackets: {_quote(text)}"
-            ) from error
+            hint = f"quote values that contain , = or brackets: {_quote_for_shell(text)}"
+            raise ConfigError(f"{text}: cannot be read; {hint}") from error
     return found
 
 
-def _quote(text: str) -> str:
+def _quote_for_shell(text: str) -> str:
     """Return how to type an assignment so that both the shell and the grammar take its value literally."""
     key, _, value = text.partition("=")
     value = value.strip("'\"")

@@ -59,11 +59,7 @@ class PluginVersion:
 
     @classmethod
     def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
-        """Record an installed plugin.
-
-        Args:
-            name: the plugin's name if its entry point has another, as a scene's has.
-        """
+        """Record an installed plugin; ``name`` is its name if its entry point has another, as a scene's has."""
         version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
 
@@ -111,11 +107,7 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, value: object) -> Provenance:
-        """Read :meth:`to_dict`'s values from an untrusted file.
-
-        Raises:
-            ConfigError: names the key, what was found and what was expected.
-        """
+        """Read :meth:`to_dict`'s values from an untrusted file."""
         return validate(cls, value, "made_by")
 
     def origins(self) -> dict[str, str]:
@@ -161,14 +153,7 @@ def warn_of_other_neuprim(made_by: Provenance, file: Path | None = None) -> None
 
 
 def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:
-    """Check whether a run may go on from a checkpoint, and warn of other versions.
-
-    Args:
-        stored: the checkpoint's record, as :meth:`Provenance.to_dict` wrote it.
-
-    Raises:
-        CheckpointError: its task comes from another package, or the record is damaged.
-    """
+    """Raise CheckpointError if a run may not go on from a checkpoint with this record; warn of other versions."""
     try:
         before = Provenance.from_dict(stored)
     except ConfigError as error:

@@ -120,7 +120,7 @@ class PluginGroup(Generic[T]):
     typed_name: Callable[[str], str] = lambda name: name
 
     def list_plugins(self) -> list[PluginInfo]:
-        """List all registered plugins by name without importing any. A name registered twice is listed twice."""
+        """List all registered plugins by name without importing any; a name registered twice is listed twice."""
         return [info for info, _ in self._entries()]
 
     def find(self, word: str) -> PluginInfo:
@@ -172,12 +172,13 @@ class PluginGroup(Generic[T]):
         package, name = split_plugin_name(word)
         found = [(i, e) for i, e in entries if i.name == name and package in (None, canonicalize_name(i.distribution))]
         if not found:
-            raise UnknownPlugin(self._unknown(word, [info for info, _ in entries]))
-        if package is None and any(info.built_in for info, _ in found):
+            raise UnknownPlugin(self._unknown_plugin_message(word, [info for info, _ in entries]))
+        built_in = [pair for pair in found if pair[0].built_in]
+        if package is None and built_in:
             for info, _ in found:
                 if not info.built_in:
                     self.warn_of_hidden(info, "neuprim's own")
-            found = [(info, entry) for info, entry in found if info.built_in]
+            found = built_in
         if len(found) > 1:
             origins = " and ".join(f"{info.origin} ({info.target})" for info, _ in found)
             choices = list(dict.fromkeys(self.choice(info) for info, _ in found))
@@ -185,7 +186,7 @@ class PluginGroup(Generic[T]):
             raise PluginError(f"{self.kind} {name!r} is registered by {origins}; {advice}")
         return found[0]
 
-    def _unknown(self, word: str, registered: Sequence[PluginInfo]) -> str:
+    def _unknown_plugin_message(self, word: str, registered: Sequence[PluginInfo]) -> str:
         package, name = split_plugin_name(word)
         names = {info.name for info in registered if package in (None, canonicalize_name(info.distribution))}
         hint = nearest(name, names)
@@ -237,19 +238,16 @@ class PluginGroup(Generic[T]):
         module, _, class_name = self.described_by.partition(":")
         expected = getattr(importlib.import_module(module), class_name)
         if not isinstance(spec, expected):
-            raise PluginError(
-                f"{who}: {info.target} is of type {type(spec).__name__}; expected a {module}.{class_name}"
-            )
+            found = f"{info.target} is of type {type(spec).__name__}"
+            raise PluginError(f"{who}: {found}; expected a {module}.{class_name}")
         api = getattr(spec, "api", None)
         if api != API_VERSION:
             older = isinstance(api, int) and api < API_VERSION
             upgrade = info.distribution if older else "neuprim"
             raise PluginError(f"{who}: written for plugin API {api}, this neuprim has {API_VERSION}; upgrade {upgrade}")
-        problem = validate_spec(spec)
-        if problem is not None:
+        if (problem := validate_spec(spec)) is not None:
             raise PluginError(f"{who}: {class_name}.{problem}")
-        if self.name_of(spec) != info.name:
-            own = self.name_of(spec)
+        if (own := self.name_of(spec)) != info.name:
             raise PluginError(f"{who}: its {class_name} is named {own!r}; expected the name of the entry point")
         return spec  # type: ignore[no-any-return]
 
@@ -296,13 +294,9 @@ class FoundScene:
 
 
 def find_scene(task: TaskSpec, word: str) -> FoundScene:
-    """Find the scene that ``NAME`` or ``PACKAGE:NAME`` chooses, among the task's own and those of other packages.
+    """Find the scene that ``NAME`` or ``PACKAGE:NAME`` chooses; a bare name means the task's own, if it has that one.
 
-    A bare name means the task's own scene if it has one of that name.
-
-    Raises:
-        UnknownPlugin: there is none.
-        PluginError: two packages add the name, or the one that adds it is broken.
+    Raises as :meth:`PluginGroup.load`.
     """
     package, name = split_plugin_name(word)
     own = {scene.name: scene for scene in task.scenes}
@@ -312,7 +306,11 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
             for info in added:
                 if info.name == f"{task.name}.{name}":
                     SCENES.warn_of_hidden(info, f"one of task {task.name!r} itself")
-        if package is None or _is_of_package(task, package):
+        owners = [
+            i for i in TASKS.list_plugins() if i.name == task.name and canonicalize_name(i.distribution) == package
+        ]
+        of_package = any(TASKS.load(qualified_plugin_name(i.distribution, i.name)) is task for i in owners)
+        if package is None or of_package:
             return FoundScene(own[name], task.config_package)
     entry = f"{task.name}.{name}"
     try:
@@ -322,8 +320,3 @@ def find_scene(task: TaskSpec, word: str) -> FoundScene:
         of = f" of {package}" if package else ""
         raise UnknownPlugin(f"scene={word}: task {task.name!r} has no such scene{of}{nearest(name, names)}") from None
     return FoundScene(extension.scene, extension.config_package, info)
-
-
-def _is_of_package(task: TaskSpec, package: str) -> bool:
-    owners = [i for i in TASKS.list_plugins() if i.name == task.name and canonicalize_name(i.distribution) == package]
-    return any(TASKS.load(qualified_plugin_name(info.distribution, info.name)) is task for info in owners)

@@ -27,11 +27,7 @@ class _Invalid(Exception):
 
 
 def validate_spec(spec: Any) -> str | None:
-    """Find the first member of a plugin's description that cannot be used.
-
-    Returns:
-        ``"MEMBER is WHAT; expected WHAT"``, or None if the description is valid.
-    """
+    """Return ``"MEMBER is WHAT; expected WHAT"`` of the first member that cannot be used; None if all can."""
     try:
         _check_spec(spec)
     except _Invalid as problem:
@@ -39,7 +35,7 @@ def validate_spec(spec: Any) -> str | None:
     return None
 
 
-def _require(ok: bool, text: str) -> None:
+def _require_member(ok: bool, text: str) -> None:
     if not ok:
         raise _Invalid(text)
 
@@ -54,31 +50,31 @@ def _check_spec(spec: Any) -> None:
             continue
         if kind == "str":
             required = member.default is MISSING
-            _require(
+            _require_member(
                 isinstance(value, str) and (bool(value.strip()) or not required), f"{name} is {value!r}; expected text"
             )
         elif kind.startswith(_FUNCTIONS):
-            _require(callable(value), f"{found}; expected a function{' or None' * optional}")
+            _require_member(callable(value), f"{found}; expected a function{' or None' * optional}")
         elif kind.startswith("Mapping"):
-            _require(isinstance(value, Mapping), f"{found}; expected a mapping")
+            _require_member(isinstance(value, Mapping), f"{found}; expected a mapping")
         elif kind in _NESTED:
             _check_member(value, _NESTED[kind], name)
         elif kind.startswith("tuple"):
             nested = _NESTED.get(kind.removeprefix("tuple[").removesuffix(", ...]"))
             expected = "a tuple" if nested is None else f"a tuple of {nested.__name__}"
-            _require(isinstance(value, tuple | list), f"{found}; expected {expected}")
+            _require_member(isinstance(value, tuple | list), f"{found}; expected {expected}")
             if nested is not None:
                 for i, entry in enumerate(value):
                     _check_member(entry, nested, f"{name}[{i}]")
                 names = [entry.name for entry in value]
-                _require(len(set(names)) == len(names), f"{name} has two of one name among {', '.join(names)}")
+                _require_member(len(set(names)) == len(names), f"{name} has two of one name among {', '.join(names)}")
     for kind_of_spec, check in _CHECKS.items():
         if isinstance(spec, kind_of_spec):
             check(spec)
 
 
 def _check_member(member: Any, kind: type, where: str) -> None:
-    _require(isinstance(member, kind), f"{where} is of type {type(member).__name__}; expected a {kind.__name__}")
+    _require_member(isinstance(member, kind), f"{where} is of type {type(member).__name__}; expected a {kind.__name__}")
     try:
         _check_spec(member)
     except _Invalid as problem:
@@ -89,33 +85,29 @@ def _check_task(spec: TaskSpec) -> None:
     _check_options(spec, "model.", "train.")
     for name, field in (spec.fields or {}).items():
         where, is_field = f"fields[{name!r}]", isinstance(field, type) and issubclass(field, Field)
-        _require(is_field, f"{where} is {field!r}; expected a subclass of neuprim.core.model.fields.Field")
+        _require_member(is_field, f"{where} is {field!r}; expected a subclass of neuprim.core.model.fields.Field")
         abstract = ", ".join(sorted(getattr(field, "__abstractmethods__", ())))
-        _require(not abstract, f"{where} lacks the methods {abstract}")
+        _require_member(not abstract, f"{where} lacks the methods {abstract}")
     _check_channel_names(spec.channels)
 
 
 def _check_channel_names(names: Any) -> None:
     wrong = channel_name_error(names)
-    _require(wrong is None, f"channels{wrong}")
+    _require_member(wrong is None, f"channels{wrong}")
 
 
 def _check_condition(spec: ConditionSpec) -> None:
     ends = spec.range
     numbers = len(ends) == 2 and all(isinstance(end, int | float) for end in ends)
-    _require(numbers and ends[0] < ends[1], f"range is {ends!r}; expected a lower and a higher number")
+    _require_member(numbers and ends[0] < ends[1], f"range is {ends!r}; expected a lower and a higher number")
 
 
 def _check_layer(spec: LayerSpec) -> None:
     short = spec.name.isidentifier() and spec.name.isascii() and len(spec.name) <= 31
-    _require(short, f"name is {spec.name!r}; expected at most 31 letters, digits and _")
+    _require_member(short, f"name is {spec.name!r}; expected at most 31 letters, digits and _")
     taken = spec.name in {LIGHTS, *(common.name for common in COMMON)} or spec.name.startswith("light_")
-    _require(not taken, f"name is {spec.name!r}, which is taken; expected another name")
+    _require_member(not taken, f"name is {spec.name!r}, which is taken; expected another name")
     _check_channel_names(spec.channels)
-
-
-def _check_loss(spec: LossExtension) -> None:
-    _check_options(spec, "train.")
 
 
 def _check_inspector(spec: Inspector) -> None:
@@ -133,40 +125,40 @@ def _check_inspector(spec: Inspector) -> None:
 def _check_exporter(spec: Exporter) -> None:
     for name, value in spec.options.items():
         pair = isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[1], str)
-        _require(pair, f"options[{name!r}] is {value!r}; expected (default, one line of help)")
+        _require_member(pair, f"options[{name!r}] is {value!r}; expected (default, one line of help)")
     default, suffixes = spec.default, spec.suffixes
     plain = PurePath(default).name == default and default != ".."
-    _require(plain, f"default is {default!r}; expected the name of a file or folder")
+    _require_member(plain, f"default is {default!r}; expected the name of a file or folder")
     lower = all(isinstance(s, str) and s.startswith(".") and s == s.lower() for s in suffixes)
-    _require(lower, f"suffixes is {suffixes!r}; expected a tuple of such as '.json', in lower case")
+    _require_member(lower, f"suffixes is {suffixes!r}; expected a tuple of such as '.json', in lower case")
     fits = not default or not suffixes or default.lower().endswith(tuple(suffixes))
-    _require(fits, f"default is {default!r}; expected a name that ends in {' or '.join(suffixes)}")
+    _require_member(fits, f"default is {default!r}; expected a name that ends in {' or '.join(suffixes)}")
 
 
 def _check_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
     """Check ``options``, and ``uses``, which may name optional settings of these groups."""
     for name, entry in spec.options.items():
         known = isinstance(name, str) and name.isidentifier()
-        _require(known, f"options has {name!r}; expected a name of letters, digits and _")
+        _require_member(known, f"options has {name!r}; expected a name of letters, digits and _")
         where = f"options[{name!r}]"
         fits = isinstance(entry, tuple | list) and len(entry) in (2, 3) and isinstance(entry[1], str)
-        _require(fits, f"{where} is {entry!r}; expected (default, one line of help), and perhaps a type")
+        _require_member(fits, f"{where} is {entry!r}; expected (default, one line of help), and perhaps a type")
         plain = isinstance(entry[0], bool | int | float | str | list | Mapping | None)
-        _require(plain, f"{where} has a default of type {type(entry[0]).__name__}; expected what YAML can hold")
+        _require_member(plain, f"{where} has a default of type {type(entry[0]).__name__}; expected what YAML can hold")
         try:
             coerce(entry[0], option_type(tuple(entry)), where)
         except ConfigError as error:
             raise _Invalid(f"the default of {error}") from None
     names = [name for name in OPTIONAL if name.startswith(groups)]
     for name in spec.uses:
-        _require(name in names, f"uses has {name!r}; expected some of {', '.join(names)}")
+        _require_member(name in names, f"uses has {name!r}; expected some of {', '.join(names)}")
 
 
 _CHECKS: dict[type, Any] = {
     TaskSpec: _check_task,
     ConditionSpec: _check_condition,
     LayerSpec: _check_layer,
-    LossExtension: _check_loss,
+    LossExtension: lambda spec: _check_options(spec, "train."),
     Exporter: _check_exporter,
     Inspector: _check_inspector,
 }

@@ -46,7 +46,7 @@ class EnvironmentFile:
 
 
 @dataclass(frozen=True)
-class Beams:
+class DirectionalLights:
     """Distant light from M directions."""
 
     directions: Tensor  # (M, 3) float64 unit vectors towards where the light comes from, scene axes
@@ -94,23 +94,18 @@ class Environment:
 
     @property
     def irradiance(self) -> Tensor:
-        """(3,) float64 sum of radiance times solid angle over all directions; 4 pi for a uniform environment of
-        radiance 1."""
+        """(3,) float64 sum of radiance times solid angle over all directions; 4 pi for a uniform radiance of 1."""
         return torch.from_numpy(self._flux.sum((0, 1)))
 
-    def beams(self, count: int) -> Beams:
-        """At most ``count`` directions that carry all of the energy; fewer where fewer cells of the image shine, none
-        if it is black.
+    def directional_lights(self, count: int) -> DirectionalLights:
+        """Return at most ``count`` (1 to :data:`MAX_LIGHTS`) directions that carry all of the energy.
 
-        Equal arguments give equal directions; nothing is random.
-
-        Raises:
-            ConfigError: a count outside 1..:data:`MAX_LIGHTS`.
+        They are fewer where fewer cells of the image shine, none if it is black. Nothing is random.
         """
         if not 1 <= count <= MAX_LIGHTS:
             raise ConfigError(f"{count} lights for an environment; expected 1 to {MAX_LIGHTS}")
         directions, irradiance = [], []
-        for r0, r1, c0, c1 in _rectangles(self._moment, self._flux @ _LUMINANCE, count):
+        for r0, r1, c0, c1 in _cut_into_rectangles(self._moment, self._flux @ _LUMINANCE, count):
             flux, moment = self._flux[r0:r1, c0:c1].sum((0, 1)), self._moment[r0:r1, c0:c1].sum((0, 1))
             length = np.linalg.norm(moment)
             if length <= 1e-9 * float(flux @ _LUMINANCE):  # light from all sides alike has no direction; any is as good
@@ -118,13 +113,11 @@ class Environment:
             directions.append(moment / length)
             irradiance.append(flux)
         shape = (len(directions), 3)
-        return Beams(
-            *(torch.from_numpy(np.array(x, dtype=np.float64).reshape(shape)) for x in (directions, irradiance))
-        )
+        arrays = (np.array(x, dtype=np.float64).reshape(shape) for x in (directions, irradiance))
+        return DirectionalLights(*map(torch.from_numpy, arrays))
 
     def share_beyond(self, directions: Tensor, degrees: float) -> float:
-        """Share 0..1 of the energy (luminance) that comes from farther than ``degrees`` from each of (D, 3) unit
-        ``directions``."""
+        """Return the share 0..1 of the luminance from farther than ``degrees`` from each of (D, 3) ``directions``."""
         weight = self._flux @ _LUMINANCE
         total = float(weight.sum())
         if total == 0.0:
@@ -151,10 +144,8 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
     """
     info = image_info(path)
     if info.width != 2 * info.height:
-        raise DataError(
-            f"{path}: image is {info.width}x{info.height}; expected an environment in latitude and "
-            "longitude, twice as wide as high"
-        )
+        expected = "an environment in latitude and longitude, twice as wide as high"
+        raise DataError(f"{path}: image is {info.width}x{info.height}; expected {expected}")
     pixels = read_image(path)[..., :3]
     radiance = pixels if info.linear else srgb_to_linear(pixels.float() / 255.0)
     return Environment(radiance if scale == 1.0 else radiance.float() * scale, up, rotation, str(path))
@@ -174,8 +165,7 @@ def _environment_axes(up: Tensor) -> Array:
 
 
 def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
-    """(R, C, 3) radiance times solid angle, and (R, C, 3) its luminance times direction, summed over blocks of
-    texels."""
+    """(R, C, 3) radiance times solid angle, and its luminance times direction, summed over blocks of texels."""
     height, width = radiance.shape[:2]
     block = -(-height // _ROWS)
     starts = np.arange(0, width, block)
@@ -189,14 +179,11 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
         wrong = ~(np.isfinite(band) & (band >= 0))
         if wrong.any():
             y, x, channel = (int(i[0]) for i in np.nonzero(wrong))
-            raise DataError(
-                f"{where}: radiance {band[y, x, channel]} at row {top + y}, column {x}, channel "
-                f"{channel}; expected 0 or more"
-            )
+            place = f"row {top + y}, column {x}, channel {channel}"
+            raise DataError(f"{where}: radiance {band[y, x, channel]} at {place}; expected 0 or more")
         polar = (rows + 0.5) * (math.pi / height)
-        solid = (
-            (2 * math.pi / width) * 2 * np.sin(polar) * math.sin(0.5 * math.pi / height)
-        )  # cos of the upper edge - cos of the lower
+        # cos of the upper edge - cos of the lower
+        solid = (2 * math.pi / width) * 2 * np.sin(polar) * math.sin(0.5 * math.pi / height)
         energy = band * solid[:, None, None]
         luminance = (energy @ _LUMINANCE)[..., None]
         way = np.sin(polar)[:, None, None] * around + np.cos(polar)[:, None, None] * axes[2]
@@ -205,7 +192,7 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
     return np.stack(flux), np.stack(moment)
 
 
-def _rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
+def _cut_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
     """At most ``count`` rectangles (first row, end, first column, end) with energy, which together have all of it."""
     rows, columns = weight.shape
     table = np.zeros((rows + 1, columns + 1, 4))
@@ -254,9 +241,8 @@ def _cut_rectangle(table: Array, box: tuple[int, int, int, int], least: float) -
         if cost[at] < best:
             best = float(cost[at])
             middle = at + 1
-            parts = (
-                [(r0, r0 + middle, c0, c1), (r0 + middle, r1, c0, c1)]
-                if along_rows
-                else [(r0, r1, c0, c0 + middle), (r0, r1, c0 + middle, c1)]
-            )
+            if along_rows:
+                parts = [(r0, r0 + middle, c0, c1), (r0 + middle, r1, c0, c1)]
+            else:
+                parts = [(r0, r1, c0, c0 + middle), (r0, r1, c0 + middle, c1)]
     return parts

@@ -14,8 +14,7 @@ DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 )
-"""What a disk or a path may refuse wherever a command reads or writes; a missing file is left out, as it may well be a
-bug."""
+"""What a disk or a path may refuse wherever a command reads or writes; a missing file may well be a bug."""
 
 
 class NeuprimError(Exception):
@@ -43,7 +42,7 @@ class NonFiniteError(NeuprimError):
 
 
 class DeviceMemoryError(NeuprimError):
-    """A card's memory is full; the message says with what, and what to lower."""
+    """A GPU's memory is full; the message says with what, and what to lower."""
 
 
 class RankError(NeuprimError):
@@ -59,21 +58,16 @@ class RankError(NeuprimError):
 
 
 class FormError(NeuprimError):
-    """A field handed over tensors that the renderer or the training cannot take; the message names field, method and
-    tensor."""
+    """A field handed over tensors that cannot be used; the message names field, method and tensor."""
 
 
 def cut(text: str, most: int = 80) -> str:
-    """A value's text as messages show it: at most so many characters. Rule: what files and users gave goes into a
-    message through this."""
+    """Return a value's text as messages show it; what files and users gave goes into a message through this."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "") -> str:
-    """``"; did you mean 'a' or 'b'?"`` for the valid names closest to ``name``, or the list of all when none is close.
-
-    ``prefix`` is what users type before each of them.
-    """
+    """Return ``"; did you mean 'a' or 'b'?"`` of the closest names with their ``prefix``, or all if none is close."""
     options = sorted(set(choices))
     close = difflib.get_close_matches(name[:200], options, n=limit, cutoff=0.5)
     if close:
@@ -82,13 +76,11 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
 
 
 _HEAD, _TAIL = 1200, 300
-"""Characters of a line's beginning, with file and key, and of its end, with what was expected; a damaged file's value
-between them is cut."""
+"""Characters of a line's beginning, with file and key, and of its end; a damaged file's value between them is cut."""
 
-_FULL_CARD = (
-    "the card's memory is full; expected a smaller image or grid, fewer primitives, or "
-    "CUDA_VISIBLE_DEVICES= in the environment, "
-    "which leaves cards out. What was saved is intact"
+_FULL_GPU = (
+    "the GPU's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the "
+    "environment, which leaves GPUs out. What was saved is intact"
 )
 
 
@@ -101,5 +93,5 @@ def one_line(error: BaseException) -> str | None:
         return f"{error.filename or 'writing'}: {error.strerror}"
     torch = sys.modules.get("torch")  # what was not imported raised nothing
     if torch is not None and isinstance(error, torch.OutOfMemoryError):
-        return _FULL_CARD
+        return _FULL_GPU
     return None

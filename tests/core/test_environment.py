@@ -49,7 +49,7 @@ def direction(row: int, column: int, height: int) -> list[float]:
 def test_which_texel_is_which_direction(row: int, column: int, expected: tuple[int, int, int]) -> None:
     image = dark(128)
     image[row, column] = 1.0
-    (found,) = Environment(image).beams(5).directions
+    (found,) = Environment(image).directional_lights(5).directions
     assert found.tolist() == pytest.approx(expected, abs=0.03)
     assert found.tolist() == pytest.approx(direction(row, column, 128), abs=1e-12)
 
@@ -62,22 +62,22 @@ def test_which_texel_is_which_direction(row: int, column: int, expected: tuple[i
 def test_energy_is_kept_for_any_number_of_lights(height: int, count: int) -> None:
     image = wild(height)
     environment = Environment(image)
-    beams = environment.beams(count)
+    lights = environment.directional_lights(count)
     polar = (torch.arange(height, dtype=torch.float64) * math.pi / height).cos()
     solid = (polar - torch.cat([polar[1:], -torch.ones(1, dtype=torch.float64)])) * math.pi / height
     expected = (image.double() * solid[:, None, None]).sum((0, 1))
-    assert torch.allclose(beams.irradiance.sum(0), expected, rtol=1e-12)
+    assert torch.allclose(lights.irradiance.sum(0), expected, rtol=1e-12)
     assert torch.allclose(environment.irradiance, expected, rtol=1e-12)
     shining = int((image.amax(-1) > 0).sum())
-    assert len(beams.directions) == min(count, shining)
-    assert torch.allclose(beams.directions.norm(dim=1), torch.ones(len(beams.directions), dtype=torch.float64))
-    assert bool((beams.irradiance >= 0).all()) and bool((beams.irradiance.sum(1) > 0).all())
+    assert len(lights.directions) == min(count, shining)
+    assert torch.allclose(lights.directions.norm(dim=1), torch.ones(len(lights.directions), dtype=torch.float64))
+    assert bool((lights.irradiance >= 0).all()) and bool((lights.irradiance.sum(1) > 0).all())
 
 
 def test_many_lights_light_a_surface_like_the_whole() -> None:
     """Irradiance under a half-dark random environment, of surfaces facing every way."""
     image = wild(32, seed=4).clamp_max(30.0)
-    every, few = Environment(image).beams(4096), Environment(image).beams(256)
+    every, few = Environment(image).directional_lights(4096), Environment(image).directional_lights(256)
     normals = torch.nn.functional.normalize(
         torch.randn(50, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64), dim=1
     )
@@ -89,11 +89,11 @@ def test_many_lights_light_a_surface_like_the_whole() -> None:
 def test_a_sun_gets_a_light_of_its_own() -> None:
     image = torch.full((128, 256, 3), 0.5)
     image[30:32, 100:102] = 5e4
-    beams = Environment(image).beams(32)
+    lights = Environment(image).directional_lights(32)
     sun = torch.tensor(direction(30, 100, 128), dtype=torch.float64)
-    brightest = int(beams.irradiance.sum(1).argmax())
-    assert float(beams.directions[brightest] @ sun) > math.cos(math.radians(2.0))
-    assert len(beams.directions) == 32
+    brightest = int(lights.irradiance.sum(1).argmax())
+    assert float(lights.directions[brightest] @ sun) > math.cos(math.radians(2.0))
+    assert len(lights.directions) == 32
 
 
 # ---------------------------------------------------------------- files

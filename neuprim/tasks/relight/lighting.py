@@ -192,16 +192,16 @@ def lights_from_environment(environment: Environment, count: int, facts: Mapping
     trained = known.array("directions", (number, 3), f"1 to {_MAX_DIRECTIONS} directions of 3 numbers")
     trained = trained / trained.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     factor = exposure * (distance**2 if falloff == "inverse_square" else 1.0 / math.pi)
-    beams = environment.beams(count)
+    found = environment.directional_lights(count)
     frames = [
         {"light": (center + distance * d).float(), "light_intensity": (factor * e).float()}
-        for d, e in zip(beams.directions, beams.irradiance, strict=True)
+        for d, e in zip(found.directions, found.irradiance, strict=True)
     ]
     if not frames:
         dark = {"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)}
         return Illumination((dark,), ("the environment is black",))
     unseen = environment.share_beyond(trained, MAX_LIGHT_ANGLE)
-    extrapolated = ((beams.directions @ trained.T).amax(1) < math.cos(math.radians(MAX_LIGHT_ANGLE))).tolist()
+    extrapolated = ((found.directions @ trained.T).amax(1) < math.cos(math.radians(MAX_LIGHT_ANGLE))).tolist()
     note = (
         f"{unseen:.0%} of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees off every training "
         "light, where the model guesses"

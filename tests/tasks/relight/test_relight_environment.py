@@ -73,7 +73,7 @@ def some_model() -> Primitives:
 def test_intensity_gives_the_centre_the_environments_irradiance(falloff: str, exposure: float, factor: float) -> None:
     environment = Environment(texel())
     (light,) = lights_from_environment(environment, 64, facts(3.0, falloff, exposure)).conditions
-    (beam,) = zip(*vars(environment.beams(64)).values(), strict=True)
+    (beam,) = zip(*vars(environment.directional_lights(64)).values(), strict=True)
     offset = light["light"].double() - torch.tensor([0.1, 0.2, 0.3], dtype=torch.float64)
     assert torch.allclose(offset, 3.0 * beam[0], atol=1e-6)
     assert torch.allclose(light["light_intensity"].double(), factor * beam[1], rtol=1e-6)

@@ -45,8 +45,8 @@ from neuprim.core.render import render
 from neuprim.runs.export import export_run
 from neuprim.runs.fit import prepare_training
 from neuprim.runs.open import open_run
-from neuprim.webpage import Condition, web_page
-from neuprim.webpage.page import camera_numbers
+from neuprim.webpage import Condition, PageScene, web_page
+from neuprim.webpage.model_page import camera_numbers
 
 sys.path.insert(0, str(ROOT))
 
@@ -138,7 +138,7 @@ def measure_preparation(chromium: Any, scene: str, count: int, folder: Path) -> 
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
     conditions = [Condition(spec, view.conditions[spec.name]) for spec in specs]
     path = folder / f"{scene}_{count}.html"
-    page = web_page(scene, model, (0, 1, 2), fitted.config.renderer, conditions=conditions)
+    page = web_page(scene, model, (0, 1, 2), fitted.config.renderer, PageScene(conditions=conditions))
     path.write_text(page.text, encoding="utf-8")
     middle = model.params["means"].detach().mean(0)
     away = float((view.camera.position - middle).norm())

@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.webpage.page import camera_numbers
+from neuprim.webpage.model_page import camera_numbers
 
 __all__ = ["Tab", "browser", "executable", "open_tab"]
 

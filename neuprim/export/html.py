@@ -1,15 +1,10 @@
 """``html``: the model as one web page that draws it, in any browser with WebGL2; lossy by the level of its numbers.
 
-The page needs no network and no server: it opens from disk. It turns, zooms, plays the sequence, moves the light with
-its shadows, shows opacity, depth, a slice of the density and the ellipsoids, and jumps to held-out cameras with their
-true images beside. Every primitive is drawn over its exact silhouette with the closed form of its chord, in float32,
-blended front to back in the order of centres: the image of ``renderer.sort=center`` with one ray a pixel and
-``transmittance_min`` at 0, as blending cannot stop.
-
-``level`` is that of ``neuprim compress``, 1 to 5; 0 keeps every bit. The error is the PSNR of what the page holds
-against the model, on the page's own views, drawn by the run's backend.
-
-Held-out cameras and their true images need the scene's data; without them the page begins with a camera of its own.
+The page needs no network and no server. It draws every primitive over its exact silhouette with the closed form of its
+chord, in float32, front to back in the order of centres: the image of ``renderer.sort=center`` with one ray a pixel and
+``transmittance_min`` at 0. ``level`` is that of ``neuprim compress``, 1 to 5; 0 keeps every bit. The error is the PSNR
+of the page's model against the model, on the page's own views, drawn by the run's backend. Held-out views need the
+scene's data.
 """
 
 from __future__ import annotations
@@ -29,8 +24,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.export.shared import choose_comparison_views, find_rgb_channels
-from neuprim.webpage.page import Condition, PageView, fullest
-from neuprim.webpage.scene import Draw, held_out, scene_page, start_of
+from neuprim.webpage.model_page import PageScene, PageView, fullest_conditions
+from neuprim.webpage.scene_page import DrawView, held_out_views, initial_conditions, page_subtitle, scene_page
 
 OPTIONS = {
     "level": (
@@ -39,82 +34,75 @@ OPTIONS = {
     ),
     "views": (6, "held-out cameras to jump to, with their true images, 0 to 100"),
 }
-_MEASURED = 4
-"""Views of which the error is measured."""
+_MEASURED_VIEWS = 4
 
 
-def _write(job: ExportJob) -> ExportReport:
+def _write_page(job: ExportJob) -> ExportReport:
     run = job.run
     if run.channels.own is not None:
         raise ConfigError(
             f"{run.directory}: pictures show {run.channels.display_text}; a page shows red, green and blue"
         )
     find_rgb_channels(run)
-    level, most = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
-    views, notes = _views(job, most)
-    start = start_of(run.task.conditions, views, job.frames()[0] if job.conditions else {})
-    job.progress("packing", 0.4)
+    level, limit = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
+    views, notes = _load_page_views(job, limit)
+    conditions = initial_conditions(run.task.conditions, views, job.frames()[0] if job.conditions else {})
     data = run.header.get("data")
-    page = scene_page(
-        run.directory.resolve().name,
-        run.model,
-        run.channels,
-        run.settings,
-        _make_draw(run),
-        specs=run.task.conditions,
-        start=start,
-        views=views,
-        background=run.header["background"],
+    scene = PageScene(
+        page_subtitle(run.task.name, str(run.header.get("data_source", "real"))),
+        run.header["background"],
         up=data.get("up", ()) if isinstance(data, Mapping) else (),
-        task=run.task.name,
-        data_source=str(run.header.get("data_source", "real")),
-        level=level,
+        conditions=conditions,
+        views=views,
         world=run.world,
     )
+    job.progress("packing", 0.4)
+    name = run.directory.resolve().name
+    page = scene_page(name, run.model, run.channels, run.settings, _make_draw(run), scene, level)
     job.progress("measuring", 0.7)
-    moment = fullest(run.model, [Condition(spec, start[spec.name]) for spec in run.task.conditions])
-    errors = {} if level == 0 else {"psnr": _measure_psnr(job, page.model, views, moment)}
+    shown = fullest_conditions(run.model, conditions)
+    errors = {} if level == 0 else {"psnr": _measure_page_psnr(job, page.model, views, shown)}
     write_text(job.out, page.text)
-    notes.append(
-        f"{len(page.text.encode()) / 1e6:.2f} MB, {page.numbers / 1e6:.2f} MB of them the model's numbers before base64"
-    )
+    size, numbers = len(page.text.encode()) / 1e6, page.numbers / 1e6
+    notes.append(f"{size:.2f} MB, {numbers:.2f} MB of them the model's numbers before base64")
     if run.settings.sort != "center" or run.settings.samples > 1:
-        notes.append(
-            f"the run draws with sort={run.settings.sort} samples={run.settings.samples}; the page by centres, "
-            "one ray a pixel"
-        )
+        drawn = f"the run draws with sort={run.settings.sort} samples={run.settings.samples}"
+        notes.append(f"{drawn}; the page by centres, one ray a pixel")
     return ExportReport((job.out,), False, errors, tuple(notes))
 
 
-def _views(job: ExportJob, most: int) -> tuple[list[PageView], list[str]]:
+def _load_page_views(job: ExportJob, limit: int) -> tuple[list[PageView], list[str]]:
     """Return held-out views, or the reason why there are none."""
-    if most == 0:
+    if limit == 0:
         return [], []
     job.progress("reading the scene", 0.0)
     try:
-        return held_out(job.run.dataset(), job.run.channels, most), []
+        return held_out_views(job.run.dataset(), job.run.channels, limit), []
     except NeuprimError as error:
         return [], [f"no held-out cameras: {error}"]
 
 
-def _make_draw(run: TrainedModel) -> Draw:
-    background = torch.tensor(run.header["background"])
+def _make_draw(run: TrainedModel) -> DrawView:
+    background, settings = torch.tensor(run.header["background"]), replace(run.settings, samples=1)
 
     @torch.no_grad()
     def draw(model: Primitives, camera: Camera, conditions: Mapping[str, Tensor]) -> Tensor:
-        return render(model, camera, conditions, replace(run.settings, samples=1), background).rgb
+        return render(model, camera, conditions, settings, background).rgb
 
     return draw
 
 
-def _measure_psnr(job: ExportJob, held: Primitives, views: Sequence[PageView], moment: Mapping[str, Tensor]) -> float:
+def _measure_page_psnr(
+    job: ExportJob, stored: Primitives, views: Sequence[PageView], conditions: Mapping[str, Tensor]
+) -> float:
     """Return the PSNR over some views of the page, or over an orbit if it has none, dB."""
-    if not views and not job.run.model.active(moment).geometry.count:
-        return math.inf  # nothing is active anywhere: both are the background
-    draw, shown = _make_draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED]]
-    shown = shown or [(view.camera, moment) for view in choose_comparison_views(job, "orbit", moment)[0]]
-    wrong = [(draw(job.run.model, *view) - draw(held, *view)).double().square().mean() for view in shown]
-    mean = float(torch.stack(wrong).mean())
+    model = job.run.model
+    if not views and not model.active(conditions).geometry.count:
+        return math.inf  # both images are the background
+    draw, shown = _make_draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED_VIEWS]]
+    shown = shown or [(view.camera, conditions) for view in choose_comparison_views(job, "orbit", conditions)[0]]
+    errors = [(draw(model, *view) - draw(stored, *view)).double().square().mean() for view in shown]
+    mean = float(torch.stack(errors).mean())
     return -10.0 * math.log10(mean) if mean else math.inf
 
 
@@ -122,7 +110,7 @@ EXPORTER = Exporter(
     API_VERSION,
     "html",
     "one web page that draws the model: turn it, play it, move the light; opens from disk",
-    _write,
+    _write_page,
     options=OPTIONS,
     conditions=True,
     default="model.html",

@@ -21,7 +21,8 @@ from neuprim.report import Viewer, error_map, write_report
 from neuprim.report.regions import WorstRegions
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
-from neuprim.webpage.scene import held_out, scene_page, start_of
+from neuprim.webpage import PageScene
+from neuprim.webpage.scene_page import held_out_views, initial_conditions, page_subtitle, scene_page
 
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
@@ -87,22 +88,16 @@ def _make_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
     def render_frame(model: Primitives, camera: Camera, conditions: Conditions) -> Tensor:
         return render_image(model, View("", camera, conditions), settings, dataset.background)
 
-    views = held_out(dataset, channels, _SHOWN_VIEWS)
+    views = held_out_views(dataset, channels, _SHOWN_VIEWS)
+    scene = PageScene(
+        page_subtitle(task.name, dataset.data_source),
+        dataset.background.tolist(),
+        up=dataset.up.tolist(),
+        conditions=initial_conditions(task.conditions, views, {}),
+        views=views,
+    )
     try:
-        page = scene_page(
-            directory.resolve().name,
-            model,
-            channels,
-            settings,
-            render_frame,
-            specs=task.conditions,
-            start=start_of(task.conditions, views, {}),
-            views=views,
-            background=dataset.background.tolist(),
-            up=dataset.up.tolist(),
-            task=task.name,
-            data_source=dataset.data_source,
-        )
+        page = scene_page(directory.resolve().name, model, channels, settings, render_frame, scene)
     except (CheckpointError, FormError):  # numbers that cannot be quantized
         return None
     return Viewer(page.text, page.nonce)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,7 +26,8 @@ from neuprim.runs.measure import render_image
 from neuprim.runs.open import move_to_render_device
 from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.quality import Front
-from neuprim.webpage.scene import held_out, start_of
+from neuprim.webpage import PageView
+from neuprim.webpage.scene_page import held_out_views, initial_conditions
 
 COLOUR, ALPHA, DEPTH = "colour", "alpha", "depth"
 
@@ -203,10 +204,10 @@ class ViewerScene:
     def start_view(self) -> View:
         """Return the first view: the held-out view with most contrast, else the whole model from the side."""
         if self.dataset is not None:
-            views = held_out(self.dataset, self.channels, _START_CANDIDATES)
+            views = held_out_views(self.dataset, self.channels, _START_CANDIDATES)
             if views:
-                return View(views[0].name, views[0].camera, _to_float(start_of(self.task.conditions, views, {})))
-        conditions = _to_float(start_of(self.task.conditions, [], {}))
+                return View(views[0].name, views[0].camera, self._initial_conditions(views))
+        conditions = self._initial_conditions([])
         with torch.no_grad():
             means = self.model().active(conditions).geometry.means.double().cpu()
         middle = torch.from_numpy(np.asarray(self.center, np.float64))
@@ -216,6 +217,5 @@ class ViewerScene:
         (camera,) = orbit(template, middle, torch.tensor(self.up, dtype=torch.float64), 3.5 * radius, 0.4, 1)
         return View("", camera, conditions)
 
-
-def _to_float(conditions: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    return {name: value.float() for name, value in conditions.items()}
+    def _initial_conditions(self, views: Sequence[PageView]) -> dict[str, Tensor]:
+        return {c.spec.name: c.value.float() for c in initial_conditions(self.task.conditions, views, {})}

@@ -1,10 +1,9 @@
-"""A model as one web page that draws it: no network, no server, exact in float32 by WebGL2.
+"""A model as one web page that draws it with WebGL2: exact in float32, without network and server.
 
-``numbers`` packs the model's parameters, ``constants`` has what shaders take from the mathematics, ``page`` puts it all
-into one file. What runs in the browser lies in ``assets``, a file per idea, and beside the fields, whose scripts
-(:meth:`~neuprim.core.model.fields.Field.script`) fold time, light and view into closed forms as their Python does.
+What runs in the browser lies in ``assets`` and in the scripts of the fields, which fold time, light and view into
+closed forms (:meth:`~neuprim.core.model.fields.Field.script`).
 """
 
-from neuprim.webpage.page import Condition, PageView, WebPage, web_page
+from neuprim.webpage.model_page import Condition, PageScene, PageView, WebPage, web_page
 
-__all__ = ["Condition", "PageView", "WebPage", "web_page"]
+__all__ = ["Condition", "PageScene", "PageView", "WebPage", "web_page"]

@@ -19,8 +19,7 @@ from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
-from neuprim.webpage.constants import shader_constants
-from neuprim.webpage.numbers import pack_model
+from neuprim.webpage.model_page import pack_model, shader_constants
 from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
 
 

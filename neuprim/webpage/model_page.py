@@ -1,0 +1,332 @@
+"""One HTML file of a model: its parameters, cameras and images of its scene, and the scripts that draw it."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import gzip
+import hashlib
+import html
+import json
+import math
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, orbit
+from neuprim.core.cameras.world import World
+from neuprim.core.compression import bit_table, canonicalize, fit_quantizers, storage_order
+from neuprim.core.compression.quantizers import Rotations
+from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack
+from neuprim.core.conditions import FRAMES
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.edge import EDGES, profile
+from neuprim.core.model.fields import ConditionSpec, Field
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.near_plane import resolve_near
+from neuprim.core.settings import RenderSettings
+
+_SHARED_SCRIPTS = ("lib.js", "codec.js", "sort.js", "prepare.js", "shadow.js", "worker.js")  # run by the worker, too
+_MAIN_SCRIPTS = ("painter.js", "frames.js", "camera.js", "conditions.js", "main.js", "probe.js")
+_SHADERS = ("splat.vert", "splat.frag", "screen.vert", "resolve.frag")
+_PLACEHOLDER = re.compile(r"@(\w+)@")
+_MAX_SLIDER_RANGE = 1e4
+_JSON_INFINITY = 1e30  # JSON has no infinity
+_SWEEP_SECONDS = 6.0
+_QUANTILE_ROWS = 100_000  # torch.quantile is limited
+
+
+@dataclass(frozen=True)
+class Condition:
+    """A condition of the task, and its initial value."""
+
+    spec: ConditionSpec
+    value: Tensor
+
+
+@dataclass(frozen=True)
+class PageView:
+    """A camera to jump to; ``truth`` is its image as ``data:image/...``, or "" without one."""
+
+    name: str
+    camera: Camera
+    conditions: Mapping[str, Tensor]
+    truth: str = ""
+
+
+@dataclass(frozen=True)
+class PageScene:
+    """What a page shows beside the model.
+
+    Attributes:
+        background: (C,) in the model's colour space.
+        linear: whether colours are linear light, which the page converts to sRGB.
+        views: the page begins with the first one.
+        still: image to show where the page cannot draw, as ``data:image/...``.
+        world: the coordinates of the user's files. All numbers of a page are the model's own.
+    """
+
+    subtitle: str = ""
+    background: Sequence[float] = (0.0, 0.0, 0.0)
+    linear: bool = False
+    up: Sequence[float] = (0.0, 0.0, 1.0)
+    conditions: Sequence[Condition] = ()
+    views: Sequence[PageView] = ()
+    still: str = ""
+    world: World | None = None
+
+
+@dataclass(frozen=True)
+class WebPage:
+    """A page.
+
+    Attributes:
+        text: of the file.
+        model: the model in the numbers that the page holds.
+        numbers: size of these, gzipped, bytes.
+        nonce: identifies its scripts in its security policy, for a page that embeds it.
+    """
+
+    text: str
+    model: Primitives
+    numbers: int
+    nonce: str
+
+
+def web_page(
+    name: str,
+    model: Primitives,
+    rgb: tuple[int, int, int],
+    settings: RenderSettings,
+    scene: PageScene,
+    level: int = 0,
+) -> WebPage:
+    """Make the page of a model.
+
+    Args:
+        rgb: which of the model's channels are red, green and blue.
+        settings: of these, only the cuts and the near plane are used.
+        level: see :func:`pack_model`.
+
+    Raises:
+        ConfigError: a field without a script for browsers, or no such level.
+        CheckpointError: numbers that cannot be stored.
+    """
+    scripts = {"density": _field_script("density", model.density), "colour": _field_script("colour", model.colour)}
+    packed = pack_model(model, level)
+    middle, radius, top = _measure_extent(packed.model, fullest_conditions(packed.model, scene.conditions))
+    home = scene.views[0].camera if scene.views else _make_home_camera(middle, radius, scene.up)
+    header = {
+        "name": name,
+        "count": model.count,
+        "fields": {"density": model.density.settings(), "colour": model.colour.settings()},
+        "numbers": packed.parts,
+        "rgb": list(rgb),
+        "background": [float(scene.background[c]) for c in rgb],
+        "linear": scene.linear,
+        "renderer": {key: getattr(settings, key) for key in ("alpha_min", "alpha_max")},
+        "near": resolve_near(settings, packed.model.params["means"], [home]).near_plane,
+        "constants": [shader_constants(edge) for edge in EDGES],
+        "up": [float(x) for x in scene.up],
+        "center": middle,
+        "radius": radius,
+        "top": top,
+        "conditions": [_condition_json(condition, scene.views) for condition in scene.conditions],
+        "views": [_view_json(view) for view in scene.views],
+        "still": bool(scene.still),
+        **({} if scene.world is None or scene.world.identity else {"world": scene.world.to_json()}),
+        "home": camera_numbers(home),
+    }
+    assets = resources.files(__package__).joinpath("assets")
+    names = ("page.html", "page.css", *_SHARED_SCRIPTS, *_MAIN_SCRIPTS, *_SHADERS)
+    texts = {path: assets.joinpath(path).read_text(encoding="utf-8") for path in names}
+    fields = "".join(f"{kind}: {script.rstrip().rstrip(';')},\n" for kind, script in scripts.items())
+    shaders = f"const shaders = {json.dumps({path: texts[path] for path in _SHADERS})};"
+    parts = {
+        "title": html.escape(name),
+        "subtitle": html.escape(scene.subtitle),
+        "style": texts["page.css"],
+        "still": html.escape(scene.still),
+        "page": json.dumps(header, allow_nan=False).replace("<", "\\u003c"),
+        "numbers": base64.b64encode(packed.data).decode(),
+        "shared": "\n".join([*(texts[path] for path in _SHARED_SCRIPTS), f"const fieldScripts = {{\n{fields}}};"]),
+        "main": "\n".join([shaders, *(texts[path] for path in _MAIN_SCRIPTS)]),
+    }
+    parts["nonce"] = hashlib.sha256("".join(parts.values()).encode()).hexdigest()[:32]  # no text inside can know it
+    text = _PLACEHOLDER.sub(lambda place: parts[place.group(1)], texts["page.html"])
+    return WebPage(text, packed.model, len(packed.data), parts["nonce"])
+
+
+def _field_script(kind: str, field: Field) -> str:
+    """Return the field's expression for browsers, without its comment."""
+    text = field.script()
+    if text is None:
+        raise ConfigError(f"{kind} field {type(field).__name__} has no script for browsers; a page cannot show it")
+    if not isinstance(text, str) or "</script" in text.lower() or "<!--" in text:
+        expected = "script() must be a text of JavaScript without an end of its element"
+        raise ConfigError(f"{kind} field {type(field).__name__}: {expected}")
+    return re.sub(r"^(//[^\n]*\n)+", "", text)
+
+
+# ---------------------------------------------------------------- scene
+
+
+def fullest_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
+    """Return the initial conditions; if no primitive is active there, those along one range where most are."""
+    start = {condition.spec.name: condition.value for condition in conditions}
+    if model.active(start).geometry.count:
+        return start
+    candidates = [
+        start | {spec.name: start[spec.name].new_tensor(x)}
+        for spec in (condition.spec for condition in conditions)
+        if spec.shape == () and spec.range[1] - spec.range[0] <= _MAX_SLIDER_RANGE
+        for x in torch.linspace(*spec.range, FRAMES).tolist()
+    ]
+    return max(candidates, key=lambda found: model.active(found).geometry.count, default=start)
+
+
+@torch.no_grad()
+def _measure_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
+    """Return middle and radius of what is drawn, and the 95 % quantile of the extinction at the centres."""
+    active = model.active(conditions)
+    if not active.geometry.count:
+        return [0.0, 0.0, 0.0], 1.0, 1.0
+    means, reach = active.geometry.means.double(), active.geometry.scales.double().amax(1)
+    low, high = (torch.quantile(means[:_QUANTILE_ROWS], q, dim=0) for q in (0.01, 0.99))
+    middle = (low + high) / 2
+    radius = float(torch.quantile(((means - middle).norm(dim=1) + reach)[:_QUANTILE_ROWS], 0.98))
+    sigma = active.sigma(torch.arange(len(means)), active.geometry.means).clamp_min(0).double()
+    return middle.tolist(), radius or 1.0, float(torch.quantile(sigma[:_QUANTILE_ROWS], 0.95)) or 1.0
+
+
+def _make_home_camera(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera:
+    """Make a camera that sees all of a scene, from the side and a little above."""
+    template = Camera(torch.eye(4, dtype=torch.float64), 717.0, 717.0, 256, 256, 512, 512)
+    return orbit(template, torch.tensor(middle), torch.tensor(up), 3.2 * radius, 0.4, 1)[0]
+
+
+def camera_numbers(camera: Camera) -> dict[str, Any]:
+    """Return a camera as the scripts take it: world-to-camera R (row by row) and t, OpenCV axes; intrinsics, pixels."""
+    view = camera.viewmat.detach().double().cpu()
+    names = [key.name for key in dataclasses.fields(camera) if key.name != "viewmat"]
+    numbers = {name: float(getattr(camera, name)) for name in names}
+    return {"R": view[:3, :3].flatten().tolist(), "t": view[:3, 3].tolist(), **numbers}
+
+
+def _view_json(view: PageView) -> dict[str, Any]:
+    conditions = {name: value.double().tolist() for name, value in view.conditions.items()}
+    return {"name": view.name, "camera": camera_numbers(view.camera), "conditions": conditions, "truth": view.truth}
+
+
+def _condition_json(condition: Condition, views: Sequence[PageView]) -> dict[str, Any]:
+    """Describe a condition for its controls. A range that is too long for a slider becomes that of the views."""
+    spec = condition.spec
+    low, high = (min(max(float(end), -_JSON_INFINITY), _JSON_INFINITY) for end in spec.range)
+    if spec.shape == () and high - low > _MAX_SLIDER_RANGE:
+        values = [float(view.conditions[spec.name]) for view in views if spec.name in view.conditions] or [0.0]
+        low, high = min(values), max(values)
+        if low == high:
+            low, high = float(condition.value) - 1.0, float(condition.value) + 1.0
+    place = spec.shape == (3,) and spec.unit.startswith("position")
+    value = condition.value.double().tolist()
+    return {"name": spec.name, "value": value, "range": [low, high], "place": place, "period": _SWEEP_SECONDS}
+
+
+# ---------------------------------------------------------------- constants of the shaders
+
+_DEGREE = 7
+_FIT_SAMPLES = 200
+_QUADRATURE_POINTS = 16  # for chords that the near plane cuts; with 8 of them errors reach 3e-4
+
+
+def shader_constants(edge: int) -> dict[str, list[float]]:
+    """Return polynomials in z = v^2, highest power first, |v| <= 1/2 turns, and the positive half of a Gauss rule.
+
+    ``cos`` is cos(2 pi v), ``sinc`` sin(2 pi v)/(2 pi v), ``edge`` B_p(2 pi v) of :mod:`neuprim.core.model.edge`.
+    """
+    nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
+    turn = 2 * math.pi
+    return {
+        "cos": _fit_polynomial(lambda v: np.cos(turn * v)),
+        "sinc": _fit_polynomial(lambda v: np.sinc(2 * v)),
+        "edge": _fit_polynomial(lambda v: profile(torch.from_numpy(turn * v), edge).numpy()),
+        "nodes": nodes[_QUADRATURE_POINTS // 2 :].tolist(),
+        "weights": weights[_QUADRATURE_POINTS // 2 :].tolist(),
+    }
+
+
+def _fit_polynomial(function: Callable[[np.ndarray], np.ndarray]) -> list[float]:
+    """Fit a polynomial at the Chebyshev points of z in [0, 1/4]."""
+    z = 0.125 * (1 + np.cos(np.pi * (np.arange(_FIT_SAMPLES) + 0.5) / _FIT_SAMPLES))
+    fit = np.polynomial.chebyshev.Chebyshev.fit(z, function(np.sqrt(z)), _DEGREE, domain=[0, 0.25])
+    return fit.convert(kind=np.polynomial.Polynomial).coef[::-1].tolist()  # type: ignore[no-any-return]
+
+
+# ---------------------------------------------------------------- parameters
+
+
+class PackedModel(NamedTuple):
+    """A model as a page holds it; ``assets/codec.js`` reads it.
+
+    Attributes:
+        parts: how each parameter is coded, in the order of ``data``.
+        data: byte planes, gzipped.
+        model: the decoded model.
+    """
+
+    parts: tuple[dict[str, Any], ...]
+    data: bytes
+    model: Primitives
+
+
+def pack_model(model: Primitives, level: int) -> PackedModel:
+    """Pack all parameters: every bit at level 0, else quantised as ``neuprim compress --level`` 1 to 5 does.
+
+    Raises:
+        ConfigError: no such level.
+        CheckpointError: numbers that cannot be stored.
+    """
+    packed = _pack_exact(model) if level == 0 else _pack_quantized(model, level)
+    data = gzip.compress(b"".join(planes for _, planes, _ in packed), 9, mtime=0)
+    decoded = Primitives(model.density, model.colour, {part["name"]: values for part, _, values in packed})
+    return PackedModel(tuple(part for part, _, _ in packed), data, decoded)
+
+
+_PackedParameters = list[tuple[dict[str, Any], bytes, Tensor]]
+
+
+def _pack_exact(model: Primitives) -> _PackedParameters:
+    packed: _PackedParameters = []
+    for spec in model.specs:
+        x = model.params[spec.name].detach().cpu().float().contiguous()
+        bytes_ = x.reshape(model.count, spec.size, 1).numpy().astype("<f4").view(np.uint8)  # (N, C, 4)
+        planes = np.ascontiguousarray(bytes_.transpose(1, 2, 0)).tobytes()
+        packed.append(({"name": spec.name, "shape": list(spec.shape), "coding": "float32"}, planes, x))
+    return packed
+
+
+def _pack_quantized(model: Primitives, level: int) -> _PackedParameters:
+    model = canonicalize(model)
+    quantizers = fit_quantizers(model, bit_table(level, (), model.specs))
+    order = storage_order(model, quantizers)
+    packed: _PackedParameters = []
+    for spec in model.specs:
+        quantizer = quantizers[spec.name]
+        codes = quantizer.codes(model.params[spec.name].reshape(model.count, spec.size)[order])
+        part: dict[str, Any] = {"name": spec.name, "shape": list(spec.shape)}
+        if isinstance(quantizer, Rotations):
+            kind = ROTATIONS
+            part |= {"coding": "rotations", "bits": quantizer.bits}
+        else:
+            kind = COLUMNS
+            table = {key: getattr(quantizer, key).tolist() for key in ("bits", "low", "high")}
+            part |= {"coding": "columns", **table}
+        section = pack(spec.name, spec.shape, quantizer, codes.numpy(), kind)
+        packed.append((part, b"".join(section.planes), quantizer.values(codes).reshape(model.count, *spec.shape)))
+    return packed

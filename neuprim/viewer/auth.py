@@ -68,9 +68,7 @@ class TokenAuth:
 
         viser passes its own request hook to ``websockets.asyncio.server.serve`` and offers no way to add one. So
         ``serve`` is replaced while viser starts. A proxy in front would leave viser's own port open to every page.
-
-        Args:
-            check_message, on_refusal: see :class:`CheckedConnection`.
+        The arguments are those of :class:`CheckedConnection`.
         """
         from websockets.asyncio import server
 
@@ -108,12 +106,7 @@ class TokenAuth:
         return check
 
     def refuse_request(self, path: str, headers: Any) -> str | None:
-        """Return why a request is refused, None if it is allowed.
-
-        Args:
-            path: with its query.
-            headers: a websockets ``Headers``.
-        """
+        """Return why a request (its path with the query, websockets ``Headers``) is refused, None if it is allowed."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             return "no host, or several"
@@ -213,31 +206,18 @@ class GuiUpdateMessage(_Message):
     updates: _Updates
 
 
-_KINDS = (
-    ViewerCameraMessage,
-    ScenePointerMessage,
-    TransformControlsUpdateMessage,
-    TransformControlsDragStartMessage,
-    TransformControlsDragEndMessage,
-    GuiUpdateMessage,
-)
+_KINDS = tuple(_Message.__subclasses__())
 _DECODER = msgspec.msgpack.Decoder(functools.reduce(operator.or_, _KINDS))  # type: ignore[arg-type]
 
 
 def is_known_protocol(messages: Any) -> bool:
     """Whether viser's messages module defines these messages with these fields; other versions may not."""
     kinds = ((kind, getattr(messages, kind.__name__, None)) for kind in _KINDS)
-    return all(
-        own is not None and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__)
-        for kind, own in kinds
-    )
+    return all(own and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__) for kind, own in kinds)
 
 
 class CheckedConnection(ServerConnection):
-    """A connection that drops every message for which ``check_message`` (of its bytes) returns a reason.
-
-    ``on_refusal`` is called with the connection and the reason.
-    """
+    """Drops messages for which ``check_message`` returns a reason, and calls ``on_refusal`` with itself and it."""
 
     def __init__(
         self,
@@ -256,21 +236,15 @@ class CheckedConnection(ServerConnection):
 
 
 def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> str | None:
-    """Return why a message is dropped, None if it passes.
-
-    Args:
-        find_control: viser's handle of a control by its id; None if there is none.
-    """
+    """Return why a message is dropped, None if it passes; ``find_control`` returns viser's handle of an id or None."""
     if not isinstance(message, bytes):
         return "a message in text; expected msgpack"
     try:
         decoded = _DECODER.decode(message)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         return f"a message that this page does not send: {' '.join(str(error).split())[:200]}"
-    if (
-        isinstance(decoded, ViewerCameraMessage | TransformControlsUpdateMessage)
-        and not 0.99 < math.hypot(*decoded.wxyz) < 1.01
-    ):
+    turned = isinstance(decoded, ViewerCameraMessage | TransformControlsUpdateMessage)
+    if turned and not 0.99 < math.hypot(*decoded.wxyz) < 1.01:
         return "a message that this page does not send: expected a unit quaternion - at `$.wxyz`"
     if not isinstance(decoded, GuiUpdateMessage):
         return None

@@ -1,29 +1,39 @@
-"""Controls of a page: conditions such as time and light, render settings, and held-out views."""
+"""Controls of a page: conditions, render settings, held-out views, and primitives drawn as ellipsoids."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, get_args
+from typing import Any, NamedTuple, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
+from neuprim.core.channels import Channels
 from neuprim.core.conditions import flag, read_conditions
-from neuprim.core.errors import NeuprimError
+from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
 from neuprim.core.settings import SortOrder
+from neuprim.inspect.field import measure_absorption
+from neuprim.inspect.views import unit_sphere
 from neuprim.viewer.session import DEFAULT_LONGEST, Pose, Session
-from neuprim.viewer.viewer_scene import list_quantities
+from neuprim.viewer.viewer_scene import Viewpoint, list_quantities
 
 _MAX_SLIDER_RANGE = 1e4
 _PLAY_FPS = 12.0
 _NUMBERS = ("samples", "alpha_max", "alpha_min", "transmittance_min", "near")
 _NO_VIEW = "none"
 _PANEL_HALF = 320  # pixels that half of the panel has at least, on a high-density screen
+_MAX_NUMBERS = 24  # of a parameter that are written out
+_NONE, _WIRE, _SOLID = "none", "wire", "solid"
+_MAX_ELLIPSOIDS, _DEFAULT_ELLIPSOIDS = 20_000, 1_000
 
 
 def format_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
@@ -39,33 +49,36 @@ class ConditionControls:
         self.session = session
         self._updaters: dict[str, Callable[..., None]] = {}
         for spec in session.scene.task.conditions:
-            self._add(spec)
+            self._add_condition(spec)
 
-    def refresh(self) -> None:
+    def refresh_conditions(self) -> None:
         """Show the session's conditions in the controls."""
         for name, update in self._updaters.items():
             update(self.session.conditions[name])
 
-    def _add(self, spec: ConditionSpec) -> None:
+    def _add_condition(self, spec: ConditionSpec) -> None:
         gui, name = self.session.client.gui, spec.name
         low, high = spec.range
         slider: Any = None
         if not spec.shape and high - low <= _MAX_SLIDER_RANGE:
-            slider = gui.add_slider(name, low, high, (high - low) / 1000, float(self._value(spec).clamp(low, high)))
+            start = float(self.session.conditions[name].clamp(low, high))
+            slider = gui.add_slider(name, low, high, (high - low) / 1000, start)
             slider.on_update(lambda _: self._on_slider(spec, slider.value))
         hint = f"{spec.unit}; as `neuprim render` takes it"
-        text = gui.add_text(flag(name), self._format(spec, self._value(spec)), hint=hint)
+        text = gui.add_text(flag(name), self._format(spec), hint=hint)
         handle = self._add_handle(spec)
         hint = f"{flag(name)} {spec.sweep}, or the values above where they are several"
         play = gui.add_checkbox(f"play {name}", False, hint=hint)
 
         def update(value: Tensor, typed: bool = False) -> None:
             # Setting a control calls its callback. Controls that already have the value are left alone.
-            near = float(value.clamp(low, high)) if slider is not None else 0.0
-            if slider is not None and not math.isclose(slider.value, near, abs_tol=1e-6):
-                slider.value = near
-            if text.value != self._format(spec, value) and not play.value and not typed:
-                text.value = self._format(spec, value)
+            if slider is not None:
+                near = float(value.clamp(low, high))
+                if not math.isclose(slider.value, near, abs_tol=1e-6):
+                    slider.value = near
+            written = format_condition(spec, value, self.session.scene.world)
+            if text.value != written and not play.value and not typed:
+                text.value = written
             if handle is not None:
                 handle.position = tuple(value.tolist())
 
@@ -73,35 +86,32 @@ class ConditionControls:
         text.on_update(lambda _: self._on_text(spec, text.value))
         play.on_update(lambda _: self._play(spec, text.value, play) if play.value else None)
 
-    def _format(self, spec: ConditionSpec, value: Tensor) -> str:
-        return format_condition(spec, value, self.session.scene.world)
-
-    def _value(self, spec: ConditionSpec) -> Tensor:
-        return self.session.conditions[spec.name]
+    def _format(self, spec: ConditionSpec) -> str:
+        return format_condition(spec, self.session.conditions[spec.name], self.session.scene.world)
 
     def _add_handle(self, spec: ConditionSpec) -> Any:
         """Add a draggable handle for a position in the scene."""
         if spec.shape != (3,) or "scene units" not in spec.unit:
             return None
-        value, scene = self._value(spec), self.session.client.scene
+        value, scene = self.session.conditions[spec.name], self.session.client.scene
         size = 0.15 * (float(value.norm()) or 1.0)
         scene.add_icosphere(f"/{spec.name}/ball", 0.15 * size, color=(255, 220, 90))
         handle = scene.add_transform_controls(
             f"/{spec.name}", scale=size, disable_rotations=True, disable_sliders=True, position=value.tolist()
         )
-        handle.on_update(lambda _: self._set(spec, torch.tensor(handle.position, dtype=torch.float32)))
+        handle.on_update(lambda _: self._set_condition(spec, torch.tensor(handle.position, dtype=torch.float32)))
         return handle
 
     def _on_slider(self, spec: ConditionSpec, value: float) -> None:
         # A value beyond the slider's range leaves the slider at its end; that is no input.
-        if not math.isclose(value, float(self._value(spec).clamp(*spec.range)), abs_tol=1e-6):
-            self._set(spec, torch.tensor(value, dtype=torch.float32).clamp(*spec.range))
+        if not math.isclose(value, float(self.session.conditions[spec.name].clamp(*spec.range)), abs_tol=1e-6):
+            self._set_condition(spec, torch.tensor(value, dtype=torch.float32).clamp(*spec.range))
 
     def _on_text(self, spec: ConditionSpec, text: str) -> None:
-        if text == self._format(spec, self._value(spec)):
+        if text == self._format(spec):
             return
         try:
-            self._set(spec, self._parse(spec, text)[0], typed=True)
+            self._set_condition(spec, self._parse(spec, text)[0], typed=True)
         except NeuprimError as error:
             self.session.set_status(str(error))  # the text may be incomplete
 
@@ -109,8 +119,8 @@ class ConditionControls:
         values = read_conditions([spec], {spec.name: text}, self.session.set_status)[spec.name]
         return [value.float() for value in values]
 
-    def _set(self, spec: ConditionSpec, value: Tensor, typed: bool = False) -> None:
-        if not torch.equal(value, self._value(spec)):
+    def _set_condition(self, spec: ConditionSpec, value: Tensor, typed: bool = False) -> None:
+        if not torch.equal(value, self.session.conditions[spec.name]):
             self.session.set_conditions({spec.name: value})
             self._updaters[spec.name](value, typed)
 
@@ -164,7 +174,7 @@ class RenderControls:
             if overrides:
                 hint = "as `neuprim render` takes it: resolution=0.5 density.neurons=1"
                 self._overrides = gui.add_text("operating point", "", hint=hint)
-                self._overrides.on_update(lambda _: self._apply())
+                self._overrides.on_update(lambda _: self._apply_settings())
             for name, control in inputs.items():
                 control.on_update(lambda event, name=name: self._set_setting(name, event.target.value))
 
@@ -175,12 +185,12 @@ class RenderControls:
     def _set_setting(self, name: str, value: Any) -> None:
         # Only settings that were changed here: a page rounds numbers to its own steps.
         self._values[name] = type(getattr(self.session.scene.settings, name))(value)
-        self._apply()
+        self._apply_settings()
 
-    def _apply(self) -> None:
+    def _apply_settings(self) -> None:
         try:
-            words = tuple(self._overrides.value.split()) if self._overrides is not None else ()
-            self.session.set_settings(replace(self.session.scene.settings, **self._values), words)
+            overrides = tuple(self._overrides.value.split()) if self._overrides is not None else ()
+            self.session.set_settings(replace(self.session.scene.settings, **self._values), overrides)
         except NeuprimError as error:
             self.session.set_status(str(error))  # the text may be incomplete
 
@@ -195,11 +205,11 @@ class ViewControls:
         if not names:
             return
         self._choice = gui.add_dropdown("held-out view", [_NO_VIEW, *names], initial_value=_NO_VIEW)
-        self._choice.on_update(lambda _: self._choose(self._choice.value))
+        self._choice.on_update(lambda _: self._choose_view(self._choice.value))
         self._folder = gui.add_folder("held-out view", visible=False)
-        session.on_full_image.append(self._update)
+        session.on_full_image.append(self._update_comparison)
 
-    def _choose(self, name: str) -> None:
+    def _choose_view(self, name: str) -> None:
         if name == _NO_VIEW:
             self._folder.visible = False
         else:
@@ -210,15 +220,16 @@ class ViewControls:
         self.session.set_camera(Pose.from_camera(view.camera))
         self.session.set_conditions({key: value.float() for key, value in view.conditions.items()})
         self._on_jump()
-        self._compare(name)
+        self._show_comparison(name)
 
-    def _update(self) -> None:
+    def _update_comparison(self) -> None:
         if self.session.training and self._folder.visible and self._choice.value != _NO_VIEW:
-            self._compare(self._choice.value)
+            self._show_comparison(self._choice.value)
 
-    def _compare(self, name: str) -> None:
+    def _show_comparison(self, name: str) -> None:
         found = self.session.scene.compare_view(name)
-        image = np.concatenate([_enlarge(found.truth), _enlarge(found.drawn)], axis=1)
+        times = max(_PANEL_HALF // found.truth.shape[1], 1)  # each image fills half of the panel
+        image = np.concatenate([found.truth, found.drawn], axis=1).repeat(times, 0).repeat(times, 1)
         if self._image is None:
             gui = self.session.client.gui
             with self._folder:
@@ -228,7 +239,172 @@ class ViewControls:
         self._folder.visible = True
 
 
-def _enlarge(image: np.ndarray) -> np.ndarray:
-    """Repeat pixels of a small image, so that it fills half of the panel."""
-    times = max(_PANEL_HALF // image.shape[1], 1)
-    return image.repeat(times, 0).repeat(times, 1)
+# ---------------------------------------------------------------- primitives
+
+
+class FrameEllipsoids(NamedTuple):
+    """M ellipsoids of a frame, float32, scene units.
+
+    Attributes:
+        rows: (M,) rows of the model.
+        positions: (M, 3); wxyz: (M, 4) unit quaternions; scales: (M, 3) semi-axes.
+        colours: (M, 3) uint8 sRGB at their centres, as seen from the frame's camera.
+    """
+
+    rows: np.ndarray
+    positions: np.ndarray
+    wxyz: np.ndarray
+    scales: np.ndarray
+    colours: np.ndarray
+
+
+def list_ellipsoids(model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int) -> FrameEllipsoids:
+    """Return the ellipsoids of a frame: at most ``limit``, those that absorb most."""
+    with torch.no_grad():
+        lowered = model.lower(viewpoint.camera, viewpoint.conditions)
+        count = lowered.geometry.count
+        chosen = torch.arange(count)
+        if count > limit:
+            mass = measure_absorption(model.to(torch.device("cpu")).active(viewpoint.conditions))
+            chosen = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:limit]))
+        colours = lowered.center_colors(viewpoint.camera.position.to(lowered.geometry.means)).float().cpu()
+        shown = np.rint(255 * channels.display_rows(colours.clamp_min(0)).numpy()).astype(np.uint8)
+        return _select_ellipsoids(lowered.geometry, lowered.rows, chosen, shown)
+
+
+def make_ellipsoid(model: Primitives, viewpoint: Viewpoint, row: int) -> FrameEllipsoids | None:
+    """Return one primitive in yellow; None if it is not active in the frame.
+
+    Raises:
+        ConfigError: the model has no such primitive.
+    """
+    if not 0 <= row < model.count:
+        raise ConfigError(f"primitive {row}: the model has {model.count} primitives, 0 to {model.count - 1}")
+    with torch.no_grad():
+        active = model.active(viewpoint.conditions)
+    rows = torch.arange(model.count) if active.rows is None else active.rows.cpu()
+    chosen = (rows == row).nonzero()[:, 0]
+    yellow = np.tile(np.array([[255, 210, 0]], np.uint8), (len(rows), 1))
+    return _select_ellipsoids(active.geometry, rows, chosen, yellow) if len(chosen) else None
+
+
+def _select_ellipsoids(geometry: Geometry, rows: Tensor | None, chosen: Tensor, colours: np.ndarray) -> FrameEllipsoids:
+    tensors = (geometry.means, geometry.scales, geometry.quats)
+    means, scales, quats = (x.detach().float().cpu()[chosen] for x in tensors)
+    numbers = chosen if rows is None else rows.cpu()[chosen]
+    wxyz = quats / quats.norm(dim=-1, keepdim=True)
+    return FrameEllipsoids(numbers.numpy(), means.numpy(), wxyz.numpy(), scales.numpy(), colours[chosen.numpy()])
+
+
+def pick_primitive(
+    model: Primitives, viewpoint: Viewpoint, direction: np.ndarray, settings: RenderSettings
+) -> int | None:
+    """Return the row of the primitive with the largest weight along a ray from the camera; None if the ray is empty.
+
+    Args:
+        direction: (3,) of the ray, scene axes, any norm.
+    """
+    camera = viewpoint.camera
+    x, y, z = (camera.viewmat[:3, :3].double() @ torch.as_tensor(np.asarray(direction, np.float64))).tolist()
+    if z <= 0:
+        return None
+    ray = Camera(camera.viewmat, camera.fx, camera.fy, 0.5 - camera.fx * x / z, 0.5 - camera.fy * y / z, 1, 1)
+    params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
+    output = render(Primitives(model.density, model.colour, params), ray, viewpoint.conditions, settings)
+    contributions = output.request_contributions(torch.ones(1, 1, device=output.rgb.device))
+    output.rgb.sum().backward()
+    weight, _ = contributions.of_all(model.count)
+    return int(weight.argmax()) if len(weight) and float(weight.max()) > 0 else None
+
+
+def describe_primitive(model: Primitives, row: int) -> str:
+    """Return a primitive's semi-axes and parameters, one a line."""
+    lines = [f"primitive {row} of {model.count}"]
+    axes = model.params["log_scales"][row].detach().double().exp().tolist()
+    lines.append(f"semi-axes {' '.join(f'{x:.4g}' for x in axes)} scene units")
+    for spec in model.specs:
+        values = model.params[spec.name][row].detach().double().flatten().tolist()
+        more = f" … ({len(values)} numbers)" if len(values) > _MAX_NUMBERS else ""
+        lines.append(f"{spec.name}: {' '.join(f'{x:.4g}' for x in values[:_MAX_NUMBERS])}{more}")
+    return "\n".join(lines)
+
+
+class PrimitiveControls:
+    """Controls that draw ellipsoids over the image and describe a chosen primitive."""
+
+    def __init__(self, session: Session) -> None:
+        self.session = session
+        gui = session.client.gui
+        self._meshes: dict[str, Any] = {}
+        self._style = gui.add_dropdown("ellipsoids", [_NONE, _WIRE, _SOLID], initial_value=_NONE)
+        hint = "those that absorb most"
+        self._limit = gui.add_slider("at most", 100, _MAX_ELLIPSOIDS, 100, _DEFAULT_ELLIPSOIDS, hint=hint)
+        hint = "the primitive that contributes most under the mouse"
+        self._click = gui.add_checkbox("choose by a click", False, hint=hint)
+        self._row = gui.add_number("primitive", -1, min=-1, step=1, hint="its number; -1 for none")
+        self._text = gui.add_text("its parameters", "", multiline=True, disabled=True)
+        for control in (self._style, self._limit):
+            control.on_update(lambda _: self._refresh_primitives())
+        self._row.on_update(lambda _: session.submit("primitive", self._describe_chosen))
+        self._click.on_update(lambda _: self._toggle_click())
+
+    def _refresh_primitives(self) -> None:
+        self.session.submit("ellipsoids", self._draw_ellipsoids)
+        if int(self._row.value) >= 0:
+            self.session.submit("primitive", self._describe_chosen)
+
+    def _toggle_click(self) -> None:
+        scene = self.session.client.scene
+        if not self._click.value:
+            scene.remove_click_callback()
+            return
+
+        @scene.on_click()
+        def _(event: Any) -> None:
+            direction = np.asarray(event.ray_direction, np.float64)
+            self.session.submit("click", lambda: self._pick(direction))
+
+    def _pick(self, direction: np.ndarray) -> None:
+        session = self.session
+        row = pick_primitive(session.scene.model(), session.viewpoint(), direction, session.settings)
+        if row is None:
+            session.set_status("nothing is there")
+        else:
+            self._row.value = row  # calls _describe_chosen
+
+    def _draw_ellipsoids(self) -> None:
+        found = None
+        if self._style.value != _NONE:
+            scene = self.session.scene
+            found = list_ellipsoids(scene.model(), self.session.viewpoint(), scene.channels, int(self._limit.value))
+        self._show_meshes("/ellipsoids", found, wire=self._style.value == _WIRE)
+
+    def _describe_chosen(self) -> None:
+        self._show_meshes("/chosen", None, wire=True)
+        row, model, found, text = int(self._row.value), self.session.scene.model(), None, ""
+        if row >= 0:
+            found = make_ellipsoid(model, self.session.viewpoint(), row)
+            text = describe_primitive(model, row) + ("" if found is not None else "\nnot active in this frame")
+        self._text.value = text
+        self._show_meshes("/chosen", found, wire=True)
+
+    def _show_meshes(self, name: str, found: FrameEllipsoids | None, wire: bool) -> None:
+        """Replace the ellipsoids of this name."""
+        if name in self._meshes:
+            self._meshes.pop(name).remove()
+        if found is None or not len(found.rows):
+            return
+        points, faces = unit_sphere(2 if len(found.rows) == 1 else 1)
+        self._meshes[name] = self.session.client.scene.add_batched_meshes_simple(
+            name,
+            points.astype(np.float32),
+            faces.astype(np.uint32),
+            batched_wxyzs=found.wxyz,
+            batched_positions=found.positions,
+            batched_scales=found.scales,
+            batched_colors=found.colours,
+            wireframe=wire,
+            lod="off",
+            cast_shadow=False,
+            receive_shadow=False,
+        )

@@ -11,7 +11,6 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from types import TracebackType
 from typing import Any, Self
 
 import numpy as np
@@ -28,43 +27,22 @@ from neuprim.viewer.viewer_scene import ViewerScene
 
 _UPDATE_SECONDS = 0.5  # between updates of a page's numbers
 _PAUSE_SECONDS = 0.1  # between checks of a paused training
-_PLOT_HEIGHT = 150  # pixels
+_PLOT_HEIGHT, _PLOT_POINTS = 150, 1000  # pixels; points of a curve
 _SMOOTHING = 0.98
-
-
-class Curve:
-    """A curve of finite values."""
-
-    def __init__(self) -> None:
-        self.x: list[float] = []
-        self.y: list[float] = []
-
-    def add(self, x: float, y: float) -> None:
-        """Add a point, unless it is not finite."""
-        if math.isfinite(y):
-            self.y.append(y)
-            self.x.append(x)
-
-    def to_arrays(self, limit: int = 1000) -> tuple[np.ndarray, np.ndarray]:
-        """Copy x and y of at most ``limit`` points at equal distances; safe while another thread adds some."""
-        count = len(self.x)
-        every = -(-count // limit) or 1
-        return np.array(self.x[:count:every]), np.array(self.y[:count:every])
 
 
 class TrainingProgress:
     """Collect what a page shows from a run's events.
 
     Attributes:
-        step: steps done.
         fraction: used part of the budget, 0..1.
         text: what the run does now.
-        train_psnr: of the training views, smoothed, dB over steps; held_out_psnr: of the held-out views.
+        curves: finite (step, PSNR in dB) of the training views, smoothed, and of the held-out views.
     """
 
     def __init__(self) -> None:
         self.step, self.fraction, self.text = 0, 0.0, ""
-        self.train_psnr, self.held_out_psnr = Curve(), Curve()
+        self.curves: dict[str, list[tuple[int, float]]] = {"training views": [], "held-out views": []}
         self._mean: float | None = None
 
     def __call__(self, event: Event) -> None:
@@ -75,10 +53,10 @@ class TrainingProgress:
                 if math.isfinite(report.psnr):
                     mean = report.psnr if self._mean is None else self._mean
                     self._mean = _SMOOTHING * mean + (1 - _SMOOTHING) * report.psnr
-                    self.train_psnr.add(report.step, self._mean)
+                    self.curves["training views"].append((report.step, self._mean))
                 self.text = f"step {report.step}, {report.primitives:,} primitives, {report.seconds:.0f} s of training"
-            case Evaluated():
-                self.held_out_psnr.add(self.step, event.psnr)
+            case Evaluated() if math.isfinite(event.psnr):
+                self.curves["held-out views"].append((self.step, event.psnr))
             case Preparing() | Finishing() as work:
                 self.text = work.text
 
@@ -97,24 +75,23 @@ class TrainingControls:
         buttons = gui.add_button_group("", ["one step", "checkpoint", "stop"], hint=hint)
         calls = {"one step": training.step_once, "checkpoint": training.checkpoint, "stop": self._stop}
         buttons.on_click(lambda _: calls[buttons.value]())
-        self._curves = {"training views": progress.train_psnr, "held-out views": progress.held_out_psnr}
         self._plots: dict[str, Any] = {}
-        self._sent: dict[str, int] = dict.fromkeys(self._curves, -1)
+        self._sent = dict.fromkeys(progress.curves, 1)
         self._folder = gui.add_folder("PSNR, dB")
 
-    def refresh(self) -> None:
+    def refresh_progress(self) -> None:
         """Show the current numbers."""
         progress = self.training.progress
         self._text.value, self._bar.value = progress.text, 100 * progress.fraction
         if self._pause.value != self.training.paused:
             self._pause.value = self.training.paused
-        for name, curve in self._curves.items():
-            if len(curve.x) > 1 and len(curve.x) != self._sent[name]:
-                self._sent[name] = len(curve.x)
-                self._plot(name, curve)
+        for name, curve in progress.curves.items():
+            if len(curve) > self._sent[name]:
+                self._sent[name] = len(curve)
+                self._plot_curve(name, np.array(curve[:: -(-len(curve) // _PLOT_POINTS)], np.float64))
 
-    def _plot(self, name: str, curve: Curve) -> None:
-        data: tuple[np.ndarray, ...] = curve.to_arrays()
+    def _plot_curve(self, name: str, points: np.ndarray) -> None:
+        data = (points[:, 0].copy(), points[:, 1].copy())
         if name in self._plots:
             self._plots[name].data = data
             return
@@ -135,21 +112,14 @@ class TrainingControls:
 class LiveTraining:
     """Context manager around a run: an event listener whose :meth:`between` is called between steps.
 
-    Attributes:
-        progress: of the training.
-        paused: whether it is paused.
-        address: of the page, with its token.
+    Raises:
+        ConfigError, BackendUnavailable: as :class:`~neuprim.viewer.server.PageServer`.
     """
 
     def __init__(
         self, settings: ViewerSettings, config: RunConfig, on_open: Callable[[str], None], events: Events
     ) -> None:
-        """Start the server; raise as :class:`~neuprim.viewer.server.PageServer`.
-
-        Args:
-            on_open: called with the address.
-            events: receives every event, too.
-        """
+        """Start the server; ``on_open`` gets the address, ``events`` every event, too."""
         self.config, self.events = config, events
         self.queue, self.progress, self.paused = RenderQueue(), TrainingProgress(), False
         self._steps, self._save, self._stop = 0, False, False
@@ -163,19 +133,18 @@ class LiveTraining:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, value: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *error: object) -> None:
         self._server.close()
 
     def __call__(self, event: Event) -> None:
         self.progress(event)
         self.events(event)
         if isinstance(event, Finishing):
-            later = f"afterwards `neuprim view {self.config.output_dir}` shows it"
-            self._notify_all(f"the training has ended, {event.text}; {later}")
+            self._notify_all(
+                f"the training has ended, {event.text}; afterwards `neuprim view {self.config.output_dir}` shows it"
+            )
 
-    # Orders of pages, from any thread.
+    # Called by pages, from any thread.
 
     def pause(self, paused: bool) -> None:
         """Pause or continue the training."""
@@ -202,16 +171,18 @@ class LiveTraining:
         """Serve the pages; see :data:`~neuprim.runs.training.BetweenSteps`."""
         if self._sessions is None:
             scene = self._make_scene(fitted)
-            self._sessions = SessionManager(self._server, scene, self.queue, self._add_controls)
+            self._sessions = SessionManager(
+                self._server, scene, self.queue, lambda session: self._controls.append(TrainingControls(session, self))
+            )
         if not (self.queue.pending or self.paused or self._save or self._stop):
             return
         self.queue.work(0.0)
         self._update_pages()
-        while self._obey(fitted, stop):
+        while self._carry_out_orders(fitted, stop):
             self.queue.work(_PAUSE_SECONDS)
             self._update_pages()
 
-    def _obey(self, fitted: Fitted, stop: threading.Event) -> bool:
+    def _carry_out_orders(self, fitted: Fitted, stop: threading.Event) -> bool:
         """Carry out orders; return whether the training stays paused."""
         if self._stop:
             stop.set()
@@ -237,14 +208,10 @@ class LiveTraining:
         self._updated = now
         self._controls = [controls for controls in self._controls if not controls.session.closed]
         for controls in self._controls:
-            controls.refresh()
-
-    def _add_controls(self, session: Session) -> None:
-        self._controls.append(TrainingControls(session, self))
+            controls.refresh_progress()
 
     def _make_scene(self, fitted: Fitted) -> ViewerScene:
         dataset = fitted.dataset
-        x, y, z = (float(value) for value in dataset.up)
         conditions = tuple(spec.within(dataset.world) for spec in fitted.task.conditions)
         return ViewerScene(
             name=self.config.output_dir.name,
@@ -253,7 +220,7 @@ class LiveTraining:
             channels=fitted.channels,
             settings=fitted.trainer.renderer,
             background=dataset.background,
-            up=(x, y, z),
+            up=tuple(dataset.up.tolist()),
             center=np.asarray(dataset.center.numpy()),
             world=dataset.world,
             dataset=dataset,

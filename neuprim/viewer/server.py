@@ -15,11 +15,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError
 
 
 def require_viser() -> Any:
-    """Import viser.
-
-    Raises:
-        BackendUnavailable: it is not installed.
-    """
+    """Import viser; raise BackendUnavailable if it is missing."""
     try:
         import viser
     except ImportError as error:
@@ -91,10 +87,7 @@ class PageServer:
         return is_known_protocol(_messages)
 
     def on_client(
-        self,
-        connect: Callable[[Any], None],
-        disconnect: Callable[[Any], None],
-        refuse: Callable[[int, str], None],
+        self, connect: Callable[[Any], None], disconnect: Callable[[Any], None], refuse: Callable[[int, str], None]
     ) -> None:
         """Set callbacks for opened and closed pages (``viser.ClientHandle``) and refused messages (id, reason)."""
         self._on_refusal = refuse
@@ -117,15 +110,10 @@ class PageServer:
 
 
 def _free_port(host: str, port: int) -> int:
-    """Return a free port: this one, or any for 0.
-
-    Raises:
-        ConfigError: the host is not an address of this machine, or the port is taken.
-    """
+    """Return a free port: this one, or any for 0."""
     try:
-        family, kind, number, _, address = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
+        found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
+        family, kind, number, _, address = found[0]
         with socket.socket(family, kind, number) as probe:
             probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
             probe.bind(address)

@@ -69,9 +69,8 @@ class Pose:
 
 def fit_size(size: Sequence[int], longest: int) -> tuple[int, int]:
     """Scale (width, height) down to at most ``longest`` pixels a side, at least 1."""
-    width, height = size
-    scale = min(1.0, longest / max(width, height, 1))
-    return max(1, round(scale * width)), max(1, round(scale * height))
+    scale = min(1.0, longest / max(*size, 1))
+    return max(1, round(scale * size[0])), max(1, round(scale * size[1]))
 
 
 class Session:

@@ -18,8 +18,7 @@ from neuprim.core.errors import NeuprimError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import RenderConfig
-from neuprim.viewer.controls import ConditionControls, RenderControls, ViewControls
-from neuprim.viewer.ellipsoids import PrimitiveControls
+from neuprim.viewer.controls import ConditionControls, PrimitiveControls, RenderControls, ViewControls
 from neuprim.viewer.quality import read_front
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer, require_viser
@@ -30,11 +29,7 @@ _POLL_SECONDS = 0.25  # between checks whether the viewer is to end
 
 
 class SessionManager:
-    """Create a session for each opened page, and drop it when the page closes.
-
-    Attributes:
-        sessions: client id -> session of the open pages.
-    """
+    """Create a session for each opened page, and drop it when the page closes; ``sessions`` has those of open pages."""
 
     def __init__(
         self,
@@ -43,7 +38,7 @@ class SessionManager:
         queue: RenderQueue,
         add_training: Callable[[Session], None] | None = None,
     ) -> None:
-        """Start accepting pages; ``add_training`` adds the controls of a training's tab."""
+        """Start accepting pages; ``add_training`` fills the tab of a training."""
         self.server, self.scene, self.queue, self._add_training = server, scene, queue, add_training
         self.sessions: dict[int, Session] = {}
         self._lock = threading.Lock()
@@ -57,7 +52,7 @@ class SessionManager:
             if not isinstance(error, NeuprimError):
                 raise error
 
-        self.queue.submit((client.client_id, "open"), lambda: self._open(client), report)
+        self.queue.submit((client.client_id, "open"), lambda: self._open_session(client), report)
 
     def _disconnect(self, client: Any) -> None:
         with self._lock:
@@ -70,7 +65,7 @@ class SessionManager:
         if (session := self.sessions.get(client)) is not None:
             session.set_status(f"refused: {reason}")
 
-    def _open(self, client: Any) -> None:
+    def _open_session(self, client: Any) -> None:
         if client.client_id not in self.server.viser.get_clients():
             return  # closed before its turn
         if self._start is None:
@@ -87,7 +82,7 @@ class SessionManager:
         with tabs.add_tab("View"):
             conditions = ConditionControls(session)
             RenderControls(session, overrides=not training)
-            ViewControls(session, conditions.refresh)
+            ViewControls(session, conditions.refresh_conditions)
         with tabs.add_tab("Primitives"):
             PrimitiveControls(session)
 
@@ -115,7 +110,6 @@ def open_scene(
     center = _read_vector(header, "center", means.median(0).values if len(means) else torch.zeros(3))
     if dataset is not None:
         up, center = dataset.up, dataset.center
-    x, y, z = (float(value) for value in up)
     return ViewerScene(
         name=run_dir.resolve().name,
         task=task,
@@ -123,7 +117,7 @@ def open_scene(
         channels=read_stored_channels(run_dir, header, task, model.colour.channels),
         settings=config.renderer,
         background=torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)]),
-        up=(x, y, z),
+        up=tuple(up.tolist()),
         center=np.asarray(center.double().numpy()),
         world=World.of(header, str(run_dir)),
         dataset=dataset,

@@ -49,13 +49,7 @@ class Viewpoint:
 
 @dataclass(frozen=True, eq=False)
 class Picture:
-    """A drawn image.
-
-    Attributes:
-        image: (H, W, 3) uint8 sRGB, at the resolution that it was rendered at.
-        caption: meaning of its colours; may be empty.
-        seconds: drawing time.
-    """
+    """A drawn image, (H, W, 3) uint8 sRGB at its rendered resolution; the meaning of its colours, may be empty."""
 
     image: np.ndarray
     caption: str
@@ -91,10 +85,8 @@ def draw_viewpoint(
     settings = replace(config.settings, depth=viewpoint.quantity == DEPTH)
     width, height = view.camera.width, view.camera.height
     if width * height * settings.samples**2 > _MAX_RAYS:
-        raise ConfigError(
-            f"{width} x {height} pixels with renderer.samples={settings.samples} take more than {_MAX_RAYS:,} rays; "
-            "lower either"
-        )
+        size = f"{width} x {height} pixels with renderer.samples={settings.samples}"
+        raise ConfigError(f"{size} take more than {_MAX_RAYS:,} rays; lower either")
     with torch.no_grad():
         output = render(model, view.camera, view.conditions, settings, background)
     caption = ""
@@ -150,7 +142,7 @@ class ViewerScene:
     channels: Channels
     settings: RenderSettings
     background: Tensor
-    up: tuple[float, float, float]
+    up: tuple[float, ...]
     center: np.ndarray
     world: World = field(default_factory=World)
     dataset: Dataset | None = None

@@ -30,7 +30,7 @@ from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import TASK as STATIC
 from neuprim.tasks.static import SphericalHarmonics
-from neuprim.viewer.ellipsoids import describe_primitive, list_ellipsoids, make_ellipsoid, pick_primitive
+from neuprim.viewer.controls import describe_primitive, list_ellipsoids, make_ellipsoid, pick_primitive
 from neuprim.viewer.quality import QualityLadder, QualityLevel, read_front
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.session import Pose, fit_size

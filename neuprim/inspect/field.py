@@ -22,8 +22,7 @@ from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.inspect.layers import Scale
 
-_OUTSIDE = 0.002
-"""Part of all that is absorbed which may lie outside a model's box, at each of its faces."""
+_OUTSIDE = 0.002  # part of the absorption that may lie outside a model's box, at each of its faces
 
 
 @dataclass(frozen=True)
@@ -33,12 +32,10 @@ class ViewOptions:
     Attributes:
         levels: of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of the largest value shown.
         primitive: row of the primitive to show alone; None for the one that absorbs most.
-        limit: number of ellipsoids to draw, those that absorb most.
     """
 
     levels: tuple[float, ...] = ()
     primitive: int | None = None
-    limit: int = 20_000
 
 
 @dataclass(frozen=True)
@@ -78,7 +75,7 @@ class FieldFrame:
     _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
     def of_side(self, side: str) -> FieldFrame:
-        """Return the same frame showing its "model" or its "truth"; computed grids are shared."""
+        """Return the same frame showing its "model" or its "truth"; the grids are shared."""
         return replace(self, side=side)
 
     @property
@@ -107,9 +104,8 @@ class FieldFrame:
         """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below, or of the truth."""
         if self.side not in self._grids:
             if self.side == "model":
-                grid = density_grid(
-                    self.model, self.conditions, self.scene_from_index, self.shape, where=self.device
-                ).numpy()
+                place = (self.scene_from_index, self.shape)
+                grid = density_grid(self.model, self.conditions, *place, where=self.device).numpy()
             elif self.truth is None:
                 raise ConfigError("there is no ground truth to show; give --against")
             else:
@@ -180,14 +176,12 @@ class FieldFrame:
         wanted = self.options.primitive
         if wanted is None:
             return int(self.masses.argmax())
-        if wanted >= self.model.count:
-            count = self.model.count
+        if wanted >= (count := self.model.count):
             raise ConfigError(f"--primitive {wanted}: the model has {count} primitives, 0 to {count - 1}")
         found = np.flatnonzero(self.rows == wanted)
         if not len(found):
-            raise ConfigError(
-                f"--primitive {wanted}: it absorbs nothing at {self.title}; choose another one or another frame"
-            )
+            reason = f"it absorbs nothing at {self.title}; choose another one or another frame"
+            raise ConfigError(f"--primitive {wanted}: {reason}")
         return int(found[0])
 
 
@@ -220,13 +214,10 @@ class _GivenConditions(dict[str, Tensor]):
 def read_condition_frames(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = lambda text: None
 ) -> list[Conditions]:
-    """Read the conditions of each frame, e.g. of ``{"time": "0:1:5"}``.
+    """Read the conditions of each frame with :func:`~neuprim.core.conditions.read_conditions`.
 
     A number that is not given is the middle of its range. Other conditions that are not given are left out. Of two
     animated conditions, the shorter is stretched.
-
-    Raises:
-        ConfigError: as :func:`neuprim.core.conditions.read_conditions`.
     """
     given = read_conditions(specs, texts, warn)
     found: dict[str, list[Tensor]] = {}
@@ -252,11 +243,7 @@ def describe_conditions(conditions: Conditions) -> str:
 
 
 def parse_box(numbers: Sequence[float]) -> np.ndarray:
-    """Return the (2, 3) box of ``--box``.
-
-    Raises:
-        ConfigError: not six numbers, or a box without a volume.
-    """
+    """Return the (2, 3) box of ``--box``; raise ConfigError unless it has six numbers and a volume."""
     if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
         given = ",".join(f"{x:g}" for x in numbers)
         raise ConfigError(f"--box {given}: expected the lower and the upper corner, as -1,-1,-1,1,1,1")
@@ -265,8 +252,6 @@ def parse_box(numbers: Sequence[float]) -> np.ndarray:
 
 def find_matter_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
     """Return a (2, 3) float64 box around nearly all that the model absorbs in some of the frames.
-
-    A few far primitives do not widen it.
 
     Raises:
         DataError: the model absorbs nothing.
@@ -279,14 +264,14 @@ def find_matter_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarr
             continue
         reach = (geometry.rotations * geometry.scales[:, None, :]).norm(dim=2).double().numpy()
         means = geometry.means.double().numpy()
-        lows.append([_quantile(means[:, a] - reach[:, a], weights, _OUTSIDE) for a in range(3)])
-        highs.append([_quantile(means[:, a] + reach[:, a], weights, 1 - _OUTSIDE) for a in range(3)])
+        lows.append([_weighted_quantile(means[:, a] - reach[:, a], weights, _OUTSIDE) for a in range(3)])
+        highs.append([_weighted_quantile(means[:, a] + reach[:, a], weights, 1 - _OUTSIDE) for a in range(3)])
     if not lows:
         raise DataError("the model absorbs nothing in any of these frames; there is nothing to look at")
     return np.stack([np.min(lows, 0), np.max(highs, 0)])
 
 
-def _quantile(values: np.ndarray, weights: np.ndarray, part: float) -> float:
+def _weighted_quantile(values: np.ndarray, weights: np.ndarray, part: float) -> float:
     order = values.argsort()
     total = weights[order].cumsum()
     return float(values[order[min(int(np.searchsorted(total, part * total[-1])), len(order) - 1)]])

@@ -37,10 +37,8 @@ from neuprim.inspect.layers import (
 )
 from neuprim.inspect.views import DIFFERENCE, ISOSURFACE, SLICES, VOLUME, find_viewpoint, unit_sphere
 
-ELLIPSOIDS_LIMIT = 4000
-"""Ellipsoids of a layer that a page holds, the first ones."""
-_ALWAYS = (VOLUME, ISOSURFACE, SLICES, DIFFERENCE)
-"""Views that cost a page nothing, as they show grids that it has anyway; the last one only with a ground truth."""
+ELLIPSOIDS_LIMIT = 4000  # of a layer, the first ones
+_ALWAYS = (VOLUME, ISOSURFACE, SLICES, DIFFERENCE)  # they show grids that the page has anyway
 _SIZE_LIMIT = 2**29  # bytes of a page; browsers refuse longer strings
 
 
@@ -67,7 +65,7 @@ def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> N
     stored: list[dict[str, Any]] = []
     size = 0
     for i in range(len(frames)):
-        packed = PackedFrame()
+        packed = PackedFrameArrays()
         stored.append(_frame_data(frames.frame(i), views, frames.up, packed))
         size += packed.size
         if size > _SIZE_LIMIT:
@@ -82,7 +80,7 @@ def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> N
         "box": first.box.tolist(),
         "views": kinds,
         "first": inspectors[0].name,
-        "maps": {name: colormap_bytes(name).ravel().tolist() for name in sorted(set(_colormaps(stored)))},
+        "maps": {name: colormap_bytes(name).ravel().tolist() for name in sorted(set(_used_colormaps(stored)))},
         "ball": {"points": points.ravel().round(6).tolist(), "faces": faces.ravel().tolist()},
         "frames": stored,
     }
@@ -92,25 +90,22 @@ def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> N
     write_text(path, template.replace("__TITLE__", title).replace("__DATA__", text))
 
 
-def _frame_data(frame: FieldFrame, views: Sequence[Inspector], up: str, packed: PackedFrame) -> dict[str, Any]:
+def _frame_data(frame: FieldFrame, views: Sequence[Inspector], up: str, packed: PackedFrameArrays) -> dict[str, Any]:
     layers: dict[str, Any] = {}
-    stands: dict[str, Any] = {}
+    viewpoints: dict[str, Any] = {}
     for view in views:
         sides = ("model", "truth") if view.shows == "sigma" and frame.truth is not None else ("model",)
         layers[view.name] = {side: packed.pack_layers(view.layers(frame.of_side(side))) for side in sides}
         if view.shows == "primitive":
             point = find_viewpoint(view, frame, up)
-            stands[view.name] = {
-                "focus": point.focus.tolist(),
-                "radius": point.radius,
-                "away": point.direction.tolist(),
-            }
+            place = {"focus": point.focus.tolist(), "radius": point.radius, "away": point.direction.tolist()}
+            viewpoints[view.name] = place
     numbers = None if frame.numbers is None else dict(frame.numbers)
     words = {"title": frame.title, "truthName": frame.truth_name, "numbers": numbers}
-    return {**words, "stands": stands, "layers": layers, "arrays": packed.arrays}
+    return {**words, "stands": viewpoints, "layers": layers, "arrays": packed.arrays}
 
 
-def _colormaps(frames: Sequence[dict[str, Any]]) -> Iterator[str]:
+def _used_colormaps(frames: Sequence[dict[str, Any]]) -> Iterator[str]:
     for frame in frames:
         for sides in frame["layers"].values():
             for layers in sides.values():
@@ -141,7 +136,7 @@ def encode_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
     return np.asarray(np.rint(byte).astype(np.uint8)), code
 
 
-class PackedFrame:
+class PackedFrameArrays:
     """The arrays of one frame, compressed, in the order in which layers use them."""
 
     def __init__(self) -> None:

@@ -199,10 +199,11 @@ def layer_colours(layer: Painted, count: int) -> np.ndarray:
 # ---------------------------------------------------------------- validation
 
 _KINDS = ", ".join(kind.__name__ for kind in get_args(Layer))
+_CORNERS = ("upper_right", "lower_right")
 _LARGEST = float(np.finfo(np.float32).max)
 
 
-class _Invalid(Exception):
+class _InvalidLayer(Exception):
     """A layer that cannot be drawn; the text says which member is what, and what was expected."""
 
 
@@ -219,71 +220,65 @@ def validate_layers(found: Any) -> str | None:
         if not isinstance(layer, get_args(Layer)):
             return f"returned a {type(layer).__name__} as layer {i}; expected one {expected}"
         try:
-            _check_layer(layer)
-        except _Invalid as problem:
+            (_check_text if isinstance(layer, Text) else _check_grid if isinstance(layer, Grid) else _check_shape)(
+                layer
+            )
+        except _InvalidLayer as problem:
             return f"returned layer {i}, a {type(layer).__name__}, whose {problem}"
     return None
 
 
-def _require(ok: bool, name: str, found: object, expected: str) -> None:
+def _require(ok: object, name: str, found: object, expected: str) -> None:
     if not ok:
-        raise _Invalid(f"{name} is {found}; expected {expected}")
+        raise _InvalidLayer(f"{name} is {found}; expected {expected}")
 
 
-def _check_layer(layer: Any) -> None:
-    if isinstance(layer, Text):
-        _require(isinstance(layer.text, str), "text", repr(layer.text), "text")
-        corners = ("upper_right", "lower_right")
-        _require(layer.corner in corners, "corner", repr(layer.corner), " or ".join(corners))
-    elif isinstance(layer, Grid):
-        _check_grid(layer)
-    else:
-        points = _check_array(layer, "vertices" if isinstance(layer, Mesh | Lines) else "centres", (None, 3))
-        if isinstance(layer, Ellipsoids):
-            _check_array(layer, "axes", (len(points), 3, 3))
-        elif isinstance(layer, Points):
-            _require(_is_number(layer.size) and layer.size > 0, "size", repr(layer.size), "a positive number of pixels")
-        else:
-            name, width = ("faces", 3) if isinstance(layer, Mesh) else ("pairs", 2)
-            rows = _check_array(layer, name, (None, width))
-            _require(rows.dtype.kind in "iu", name, f"of type {rows.dtype}", "integers")
-            inside = not rows.size or 0 <= int(rows.min()) <= int(rows.max()) < len(points)
-            _require(inside, name, "an index beyond the vertices", f"rows 0 to {len(points) - 1} of them")
-        if isinstance(layer, Lines):
-            fine = _is_number(layer.width) and layer.width > 0
-            _require(fine, "width", repr(layer.width), "a positive number of pixels")
-        _check_paint(layer, len(points))
+def _check_text(layer: Text) -> None:
+    _require(isinstance(layer.text, str), "text", repr(layer.text), "text")
+    _require(layer.corner in _CORNERS, "corner", repr(layer.corner), " or ".join(_CORNERS))
 
 
-def _check_grid(layer: Grid) -> None:
+def _check_grid(layer: Any) -> None:
     values = _check_array(layer, "values", (None, None, None))
-    _require(min(values.shape) > 0, "values", f"of shape {values.shape}", "at least one point along each axis")
+    _require(min(values.shape), "values", f"of shape {values.shape}", "at least one point along each axis")
     _check_array(layer, "origin", (3,))
     _check_scale(layer.scale)
     several = isinstance(layer.spacing, tuple | list | np.ndarray) and len(layer.spacing) == 3
-    spacing: list[Any] = list(layer.spacing) if several else [layer.spacing]  # type: ignore[arg-type]
-    positive = all(_is_number(step) and step > 0 for step in spacing)
+    positive = all(_is_number(step, 0) and step for step in (layer.spacing if several else [layer.spacing]))
     _require(positive, "spacing", repr(layer.spacing), "a positive number of scene units, or three")
     if isinstance(layer, Volume):
-        _require(_is_number(layer.depth) and layer.depth >= 0, "depth", repr(layer.depth), "a number from 0")
+        _require(_is_number(layer.depth, 0), "depth", repr(layer.depth), "a number from 0")
     if isinstance(layer, Slices) and layer.through is not None:
         _check_array(layer, "through", (3,))
     if isinstance(layer, Isosurfaces):
-        fine = isinstance(layer.levels, tuple | list) and bool(layer.levels) and all(map(_is_number, layer.levels))
+        fine = isinstance(layer.levels, tuple | list) and layer.levels and all(map(_is_number, layer.levels))
         _require(fine, "levels", repr(layer.levels), "a tuple of at least one number")
 
 
-def _check_paint(layer: Painted, count: int) -> None:
-    fine = _is_number(layer.opacity) and 0 <= layer.opacity <= 1
-    _require(fine, "opacity", repr(layer.opacity), "a number from 0 to 1")
+def _check_shape(layer: Any) -> None:
+    points = _check_array(layer, "vertices" if isinstance(layer, Mesh | Lines) else "centres", (None, 3))
+    count = len(points)
+    if isinstance(layer, Ellipsoids):
+        _check_array(layer, "axes", (count, 3, 3))
+    if isinstance(layer, Mesh | Lines):
+        name, corners = ("faces", 3) if isinstance(layer, Mesh) else ("pairs", 2)
+        rows = _check_array(layer, name, (None, corners))
+        _require(rows.dtype.kind in "iu", name, f"of type {rows.dtype}", "integers")
+        inside = not rows.size or 0 <= int(rows.min()) <= int(rows.max()) < count
+        _require(inside, name, "an index beyond the vertices", f"rows 0 to {count - 1} of them")
+    if isinstance(layer, Points | Lines):
+        name = "size" if isinstance(layer, Points) else "width"
+        pixels = getattr(layer, name)
+        _require(_is_number(pixels, 0) and pixels, name, repr(pixels), "a positive number of pixels")
+    _require(_is_number(layer.opacity, 0, 1), "opacity", repr(layer.opacity), "a number from 0 to 1")
     if layer.values is not None:
         _require(layer.colours is None, "colours", "given beside values", "one of them")
         _check_array(layer, "values", (count,))
         _check_scale(layer.scale)
     elif layer.colours is not None:
         colours = _check_array(layer, "colours", (3,) if np.ndim(layer.colours) == 1 else (count, 3))
-        fine = not colours.size or 0 <= colours.min() <= colours.max() <= 1
-        _require(bool(fine), "colours", "beyond 0 or 1", "numbers from 0 to 1")
+        inside = not colours.size or bool(0 <= colours.min() <= colours.max() <= 1)
+        _require(inside, "colours", "beyond 0 or 1", "numbers from 0 to 1")
 
 
 def _check_scale(scale: Any) -> None:
@@ -296,17 +291,16 @@ def _check_scale(scale: Any) -> None:
     _require(known, "scale", f"of colours {scale.colours!r}", "a colour map of matplotlib, as 'inferno'")
 
 
-def _check_array(layer: Any, name: str, shape: tuple[int | None, ...]) -> np.ndarray:
+def _check_array(layer: Any, name: str, shape: tuple[int | None, ...]) -> Any:
     value = getattr(layer, name)
     _require(isinstance(value, np.ndarray), name, f"a {type(value).__name__}", "a numpy array")
     fits = len(value.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, value.shape, strict=True))
-    wanted = ", ".join("N" if n is None else str(n) for n in shape)
-    _require(fits, name, f"of shape {value.shape}", f"({wanted})")
+    _require(fits, name, f"of shape {value.shape}", f"({', '.join('N' if n is None else str(n) for n in shape)})")
     _require(value.dtype.kind in "fiub", name, f"of type {value.dtype}", "real numbers")
-    finite = not value.size or -_LARGEST <= value.min() <= value.max() <= _LARGEST  # False for NaN, too
-    _require(bool(finite), name, "not finite in float32", "finite numbers")
-    return value  # type: ignore[no-any-return]
+    finite = not value.size or bool(-_LARGEST <= value.min() <= value.max() <= _LARGEST)  # False for NaN, too
+    _require(finite, name, "not finite in float32", "finite numbers")
+    return value
 
 
-def _is_number(value: Any) -> bool:
-    return isinstance(value, Real) and not isinstance(value, bool) and bool(abs(value) <= _LARGEST)  # type: ignore[operator]
+def _is_number(value: Any, low: float = -_LARGEST, high: float = _LARGEST) -> bool:
+    return isinstance(value, Real) and not isinstance(value, bool) and bool(low <= value <= high)  # type: ignore[operator]

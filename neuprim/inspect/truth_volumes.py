@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -48,12 +47,10 @@ def open_ground_truth(path: str, volume: Callable[[], VolumeSource | None], worl
     scene = volume()
     if scene is not None:
         return scene.open_files(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
-    per_world = (
-        f", its world as that of the run's data, of {world.scale:g} scene units"
-        if not world.identity
-        else ", its world as the scene"
-    )
-    return VdbGroundTruth(frames, world), f"ground truth: {path}, taken as extinction in 1/scene unit{per_world}"
+    place = "the scene" if world.identity else f"that of the run's data, of {world.scale:g} scene units"
+    return VdbGroundTruth(
+        frames, world
+    ), f"ground truth: {path}, taken as extinction in 1/scene unit, its world as {place}"
 
 
 def pair_frames(frames: Sequence[Conditions], truth: DensityTruth, given: bool) -> list[tuple[Conditions, int]]:
@@ -68,14 +65,14 @@ def pair_frames(frames: Sequence[Conditions], truth: DensityTruth, given: bool) 
         return [(type(frames[0])({**frames[0], **truth.frames[0].conditions}), 0)]  # type: ignore[call-arg]
     pairs: dict[int, Conditions] = {}
     for i, conditions in enumerate(frames):
-        distances = [_distance(conditions, frame.conditions) for frame in truth.frames]
+        distances = [_condition_distance(conditions, frame.conditions) for frame in truth.frames]
         known = all(frame.conditions for frame in truth.frames)
         nearest = int(np.argmin(distances)) if known else min(i, len(truth.frames) - 1)
         pairs.setdefault(nearest, type(conditions)({**conditions, **truth.frames[nearest].conditions}))  # type: ignore[call-arg]
     return [(conditions, number) for number, conditions in pairs.items()]
 
 
-def _distance(a: Conditions, b: Conditions) -> float:
+def _condition_distance(a: Conditions, b: Conditions) -> float:
     return sum(float((a[name] - b[name]).abs().sum()) for name in b if name in a)
 
 
@@ -90,13 +87,14 @@ class VdbGroundTruth(DensityTruth):
         self._files, self._world = list(frames), world
         self.frames, lows, highs = [], [], []
         for frame in frames:
-            grid = self._read(frame)
+            grid = self._read_extinction(frame)
             found = {
-                k.removeprefix(_CONDITION): torch.tensor(v) for k, v in grid.metadata.items() if _is_condition(k, v)
+                name.removeprefix(_CONDITION): torch.tensor(value)
+                for name, value in grid.metadata.items()
+                if name.startswith(_CONDITION) and isinstance(value, float) and np.isfinite(value)
             }
             self.frames.append(TruthFrame(frame.path.name, found))
-            bounds = grid.world_bounds()
-            if bounds is not None:
+            if (bounds := grid.world_bounds()) is not None:
                 low, high = world.scene_box(bounds)
                 lows.append(low)
                 highs.append(high)
@@ -105,14 +103,12 @@ class VdbGroundTruth(DensityTruth):
         self.bounds = torch.from_numpy(np.stack([np.min(lows, 0), np.max(highs, 0)])).double()
 
     @staticmethod
-    def _read(frame: VdbFrame) -> Grid:
+    def _read_extinction(frame: VdbFrame) -> Grid:
         names = [g.name for g in read_header(frame.path).grids if g.refusal() is None]
         chosen = next((name for name in _USUAL if name in names), names[0] if len(names) == 1 else None)
         if chosen is None:
-            raise DataError(
-                f"{frame.path}: grids {', '.join(map(repr, names)) or 'none'}; expected one, or one of "
-                f"{', '.join(_USUAL)}"
-            )
+            found = ", ".join(map(repr, names)) or "none"
+            raise DataError(f"{frame.path}: grids {found}; expected one, or one of {', '.join(_USUAL)}")
         grid = read_grid(frame.path, chosen)
         if grid.channels != 1:
             raise DataError(f"{frame.path}: grid {chosen!r} has {grid.channels} channels; expected one")
@@ -123,27 +119,22 @@ class VdbGroundTruth(DensityTruth):
         return np.asarray(self._world.scene_from_world.numpy() @ grid.transform)
 
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
-        source = self._read(self._files[frame])
+        source = self._read_extinction(self._files[frame])
         return None if source.bounds is None else voxels_in_box(self.bounds, self._scene_from_index(source))
 
     def grid(
         self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
     ) -> Tensor:
-        source = self._read(self._files[frame])
+        source = self._read_extinction(self._files[frame])
         if source.bounds is None:
             return torch.zeros(shape)
         (x0, y0, z0), (x1, y1, z1) = source.bounds
-        values = np.nan_to_num(
-            source.to_dense(((x0 - 1, y0 - 1, z0 - 1), (x1 + 1, y1 + 1, z1 + 1))), nan=0.0, posinf=0.0, neginf=0.0
-        )
+        dense = source.to_dense(((x0 - 1, y0 - 1, z0 - 1), (x1 + 1, y1 + 1, z1 + 1)))
+        values = np.nan_to_num(dense, nan=0.0, posinf=0.0, neginf=0.0)
         chain = np.linalg.inv(self._scene_from_index(source)) @ scene_from_index.numpy()
         offset = chain[:3, 3] - (np.array(source.bounds[0]) - 1)
         found = ndimage.affine_transform(values, chain[:3, :3], offset, shape, order=1, mode="constant")
         return torch.from_numpy(np.ascontiguousarray(found, np.float32))
-
-
-def _is_condition(name: str, value: Any) -> bool:
-    return name.startswith(_CONDITION) and isinstance(value, float) and bool(np.isfinite(value))
 
 
 def _written_by_neuprim(path: Path) -> bool:

@@ -12,47 +12,45 @@ from neuprim.core.task import API_VERSION
 from neuprim.inspect.field import FieldFrame
 from neuprim.inspect.layers import Ellipsoids, Isosurfaces, Layer, Mesh, Scale, Slices, Text, Volume
 
-SURFACES = "plasma"  # brighter at its lower end, where the outermost surface is
-SIGNED = "coolwarm"
-FAINT = 1.0 / 255.0
-"""Opacity from which an ellipsoid is drawn."""
+_SURFACE_COLOURS = "plasma"  # brighter at its lower end, where the outermost surface is
+_SIGNED_COLOURS = "coolwarm"
+_MIN_OPACITY = 1.0 / 255.0  # of an ellipsoid that is drawn
+_MAX_ELLIPSOIDS = 20_000
 
 
-def _volume(frame: FieldFrame) -> list[Layer]:
+def _show_volume(frame: FieldFrame) -> list[Layer]:
     return [Volume(frame.sigma, frame.origin, frame.step, frame.scale, depth=frame.gain)]
 
 
-def _difference(frame: FieldFrame) -> list[Layer]:
+def _show_difference(frame: FieldFrame) -> list[Layer]:
     reach = frame.top / 2  # errors are smaller than the values
-    scale = Scale(-reach, reach, SIGNED, "model - truth", frame.scale.unit)
+    scale = Scale(-reach, reach, _SIGNED_COLOURS, "model - truth", frame.scale.unit)
     return [Volume(frame.difference, frame.origin, frame.step, scale, depth=frame.gain)]
 
 
-def _isosurface(frame: FieldFrame) -> list[Layer]:
+def _show_isosurface(frame: FieldFrame) -> list[Layer]:
     levels = frame.options.levels or tuple(part * frame.top for part in (0.1, 1 / 3, 2 / 3))
-    scale = Scale(0.0, frame.top, SURFACES, frame.scale.title, frame.scale.unit)
+    scale = Scale(0.0, frame.top, _SURFACE_COLOURS, frame.scale.title, frame.scale.unit)
     return [Isosurfaces(frame.sigma, frame.origin, frame.step, scale, levels=levels)]
 
 
-def _slices(frame: FieldFrame) -> list[Layer]:
+def _show_slices(frame: FieldFrame) -> list[Layer]:
     return [Slices(frame.sigma, frame.origin, frame.step, frame.scale, through=np.array(frame.focus))]
 
 
-def strongest_primitives(frame: FieldFrame) -> np.ndarray:
-    """Return positions in ``frame.rows`` of the ellipsoids to draw: the visible ones, by what they absorb."""
+def _visible_primitives(frame: FieldFrame) -> np.ndarray:
+    """Return positions in ``frame.rows`` of the ellipsoids to draw, by what they absorb.
+
+    Their opacity is that of a ray along the mean radius through the mean extinction.
+    """
     order = frame.masses.argsort()[::-1]
-    visible = estimate_opacity(frame) >= FAINT
-    return np.asarray(order[visible[order]][: frame.options.limit])
-
-
-def estimate_opacity(frame: FieldFrame) -> np.ndarray:
-    """Return (M,) opacity 0..1 of a ray along each primitive's mean radius through its mean extinction."""
     volume = frame.geometry.scales.double().numpy().prod(1)
-    return np.asarray(1 - np.exp(-2 * frame.masses / (4.18879 * volume) * volume ** (1 / 3)))
+    visible = 1 - np.exp(-2 * frame.masses / (4.18879 * volume) * volume ** (1 / 3)) >= _MIN_OPACITY
+    return np.asarray(order[visible[order]][:_MAX_ELLIPSOIDS])
 
 
-def _primitives(frame: FieldFrame) -> list[Layer]:
-    chosen = strongest_primitives(frame)
+def _show_primitives(frame: FieldFrame) -> list[Layer]:
+    chosen = _visible_primitives(frame)
     geometry = frame.geometry[torch.from_numpy(chosen)]
     axes = (geometry.rotations * geometry.scales[:, None, :]).transpose(1, 2).detach().numpy()
     text = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
@@ -60,7 +58,7 @@ def _primitives(frame: FieldFrame) -> list[Layer]:
     return [Ellipsoids(geometry.means.detach().numpy(), axes, colours=colours), Text(text)]
 
 
-def _primitive(frame: FieldFrame) -> list[Layer]:
+def _show_primitive(frame: FieldFrame) -> list[Layer]:
     position, (unit, faces) = frame.chosen_position(), make_cut_ball()
     geometry = frame.geometry[position : position + 1]
     axes = (geometry.rotations * geometry.scales[:, None, :])[0].double()
@@ -69,7 +67,7 @@ def _primitive(frame: FieldFrame) -> list[Layer]:
     low, high = float(sigma.min()), float(sigma.max())
     reach = max(abs(low), abs(high)) or 1.0
     negative = low < 0
-    colours = SIGNED if negative else frame.scale.colours
+    colours = _SIGNED_COLOURS if negative else frame.scale.colours
     scale = Scale(-reach if negative else 0.0, reach, colours, frame.scale.title, frame.scale.unit)
     used, surface = np.unique(faces, return_inverse=True)
     mesh = Mesh(points.numpy()[used], surface.reshape(faces.shape), values=sigma[used], scale=scale)
@@ -79,14 +77,16 @@ def _primitive(frame: FieldFrame) -> list[Layer]:
     return [mesh, Text(f"{text}extinction {low:.3g} to {high:.3g}, unclamped", "upper_right")]
 
 
-VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _volume)
-ISOSURFACE = Inspector(API_VERSION, "isosurface", "surfaces of equal extinction", _isosurface)
-SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the matter", _slices)
-PRIMITIVES = Inspector(API_VERSION, "primitives", "the ellipsoids in their own colours", _primitives, shows="model")
-PRIMITIVE = Inspector(
-    API_VERSION, "primitive", "the density inside one primitive, cut open", _primitive, shows="primitive"
+VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _show_volume)
+ISOSURFACE = Inspector(API_VERSION, "isosurface", "surfaces of equal extinction", _show_isosurface)
+SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the matter", _show_slices)
+PRIMITIVES = Inspector(
+    API_VERSION, "primitives", "the ellipsoids in their own colours", _show_primitives, shows="model"
 )
-DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _difference, shows="both")
+PRIMITIVE = Inspector(
+    API_VERSION, "primitive", "the density inside one primitive, cut open", _show_primitive, shows="primitive"
+)
+DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _show_difference, shows="both")
 
 
 # ---------------------------------------------------------------- viewpoints

@@ -62,12 +62,12 @@ class Window:
         pixels = size or (columns * _PANEL[0], self.shape[0] * _PANEL[1])
         make: Any = pyvista.Plotter
         self.plotter = make(shape=self.shape, off_screen=off_screen, window_size=list(pixels), border_color="#39424c")
-        self._up, self._placed = up, False
+        self._up, self._cameras_placed = up, False
         for panel in range(self.shape[0] * self.shape[1]):
-            self._enter(panel)
+            self._select_panel(panel)
             self.plotter.set_background("#0d1117", top="#27303a", all_renderers=False)
 
-    def _enter(self, panel: int) -> None:
+    def _select_panel(self, panel: int) -> None:
         self.plotter.subplot(*divmod(panel, self.shape[1]))
 
     def draw(self, frame: FieldFrame) -> None:
@@ -75,30 +75,29 @@ class Window:
         for title in list(self.plotter.scalar_bars.keys()):
             self.plotter.remove_scalar_bar(title, render=False)
         for panel, (inspector, side) in enumerate(self.panels):
-            self._enter(panel)
+            self._select_panel(panel)
             self.plotter.renderer.clear_actors()
             part = frame.of_side(side)
             _add_layers(self.plotter, inspector.layers(part), panel)
             if inspector.shows != "primitive":
                 _add_box(self.plotter, part.box)
-            self.plotter.add_text(
-                _caption(inspector, part), position="upper_left", font_size=10, color="white", name="caption"
-            )
+            look = {"position": "upper_left", "font_size": 10, "color": "white", "name": "caption"}
+            self.plotter.add_text(_panel_caption(inspector, part), **look)
             self.plotter.add_axes(color="white", line_width=2)
-        if not self._placed:
-            self._place(frame)
+        if not self._cameras_placed:
+            self._place_cameras(frame)
 
-    def _place(self, frame: FieldFrame) -> None:
+    def _place_cameras(self, frame: FieldFrame) -> None:
         linked = [i for i, (inspector, _) in enumerate(self.panels) if inspector.shows != "primitive"]
         for panel, (inspector, _) in enumerate(self.panels):
-            self._enter(panel)
+            self._select_panel(panel)
             point, camera = find_viewpoint(inspector, frame, self._up), self.plotter.camera
             camera.focal_point, camera.up = point.focus, point.up
             camera.position = point.focus + point.direction * point.radius / np.sin(np.radians(camera.view_angle) / 2)
             self.plotter.renderer.reset_camera_clipping_range()
         if len(linked) > 1:
             self.plotter.link_views(linked)
-        self._placed = True
+        self._cameras_placed = True
 
     def picture(self) -> np.ndarray:
         """Return (H, W, 3) uint8 of what was drawn last."""
@@ -123,25 +122,17 @@ class Window:
                 shown[0] = wanted
                 self.draw(frame(wanted))
 
-        self._enter(0)
-        self.plotter.add_slider_widget(
-            moved,
-            (1, count),
-            value=1,
-            title="frame",
-            fmt="%.0f",
-            pointa=(0.62, 0.93),
-            pointb=(0.95, 0.93),
-            color="white",
-            title_height=0.02,
-        )
+        self._select_panel(0)
+        ends = {"pointa": (0.62, 0.93), "pointb": (0.95, 0.93)}
+        look = {"title": "frame", "fmt": "%.0f", "color": "white", "title_height": 0.02}
+        self.plotter.add_slider_widget(moved, (1, count), value=1, **ends, **look)
 
     def close(self) -> None:
         """Free the window."""
         self.plotter.close()
 
 
-def _caption(inspector: Inspector, frame: FieldFrame) -> str:
+def _panel_caption(inspector: Inspector, frame: FieldFrame) -> str:
     first = frame.truth_name or "ground truth" if frame.side == "truth" else frame.title or "model"
     lines = [f"{inspector.name}: {'ground truth, ' if frame.side == 'truth' else ''}{first}"]
     if frame.numbers and frame.side == "model" and inspector.shows in ("sigma", "both"):
@@ -151,16 +142,12 @@ def _caption(inspector: Inspector, frame: FieldFrame) -> str:
 
 # ---------------------------------------------------------------- layers to VTK's objects
 
-_STEPS = 256
-_FINE = 4000  # ellipsoids up to which each gets many triangles
+_OPACITY_STEPS = 256
+_FINE_ELLIPSOIDS = 4000  # ellipsoids up to which each gets many triangles
 
 
 def _add_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> None:
-    """Draw valid layers and a bar for each of their scales into the plotter's current panel.
-
-    Args:
-        panel: number of the panel; plotters identify bars by their titles only.
-    """
+    """Draw valid layers and a bar for each of their scales into the plotter's current panel, number ``panel``."""
     scales: dict[Scale, None] = {}
     for layer in layers:
         if isinstance(layer, Text):
@@ -178,9 +165,7 @@ def _add_box(plotter: Any, box: np.ndarray) -> None:
     """Draw the edges of a (2, 3) box."""
     import pyvista
 
-    low, high = box
-    edges = pyvista.Box(np.stack([low, high], 1).ravel())
-    plotter.add_mesh(edges.outline(), color="#8894a0", line_width=1, lighting=False)
+    plotter.add_mesh(pyvista.Box(box.T.ravel()).outline(), color="#8894a0", line_width=1, lighting=False)
 
 
 def _add_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
@@ -191,11 +176,11 @@ def _add_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
     mapper.lookup_table = pyvista.LookupTable(scale.colours, scalar_range=(scale.low, scale.high))
     look = {"title_font_size": 15, "label_font_size": 13, "n_labels": 2, "fmt": "%.3g", "color": "white"}
     size = {"width": 0.6, "height": 0.09, "position_x": 0.2, "position_y": 0.02 + 0.11 * place}
-    title = scale.label + " " * panel + "\u200a" * place
+    title = scale.label + " " * panel + "\u200a" * place  # plotters identify bars by their titles only
     plotter.add_scalar_bar(title, mapper=mapper, render=False, **size, **look)
 
 
-def _image(layer: Grid, values: np.ndarray, around: int = 0) -> Any:
+def _make_image(layer: Grid, values: np.ndarray, around: int = 0) -> Any:
     """Make ``pyvista.ImageData`` of values at the layer's points, with some layers of zeros around."""
     import pyvista
 
@@ -205,11 +190,11 @@ def _image(layer: Grid, values: np.ndarray, around: int = 0) -> Any:
     return found
 
 
-def _volume(plotter: Any, layer: Volume) -> None:
+def _add_volume(plotter: Any, layer: Volume) -> None:
     scale, step = layer.scale, float(layer.steps.min())
-    ramp = np.linspace(scale.low, scale.high, _STEPS)
+    ramp = np.linspace(scale.low, scale.high, _OPACITY_STEPS)
     plotter.add_volume(
-        _image(layer, np.clip(layer.values, scale.low, scale.high)),
+        _make_image(layer, np.clip(layer.values, scale.low, scale.high)),
         scalars="values",
         cmap=scale.colours,
         clim=(scale.low, scale.high),
@@ -221,79 +206,80 @@ def _volume(plotter: Any, layer: Volume) -> None:
     )
 
 
-def _isosurfaces(plotter: Any, layer: Isosurfaces) -> None:
-    data, levels = _image(layer, layer.values, around=1), sorted(layer.levels)
+def _add_isosurfaces(plotter: Any, layer: Isosurfaces) -> None:
+    data, levels = _make_image(layer, layer.values, around=1), sorted(layer.levels)
     for i, level in enumerate(levels):
         surface = data.contour([level], scalars="values")
         if surface.n_points:
             opacity = 0.95 if i == len(levels) - 1 else min(0.22 + 0.2 * i, 0.95)
-            plotter.add_mesh(surface, opacity=opacity, smooth_shading=True, specular=0.25, **_numbers(layer.scale))
+            plotter.add_mesh(
+                surface, opacity=opacity, smooth_shading=True, specular=0.25, **_scale_arguments(layer.scale)
+            )
 
 
-def _slices(plotter: Any, layer: Slices) -> None:
+def _add_slices(plotter: Any, layer: Slices) -> None:
     x, y, z = layer.box.mean(0) if layer.through is None else layer.through
-    cut = _image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
+    cut = _make_image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
     if any(part.n_points for part in cut):
-        plotter.add_mesh(cut, lighting=False, **_numbers(layer.scale))
+        plotter.add_mesh(cut, lighting=False, **_scale_arguments(layer.scale))
 
 
-def _ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
+def _add_ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
     count = len(layer.centres)
-    points, faces = _ellipsoid_triangles(layer.centres, layer.axes, 2 if count <= _FINE else 1)
+    points, faces = _ellipsoid_triangles(layer.centres, layer.axes, 2 if count <= _FINE_ELLIPSOIDS else 1)
     if count:
-        data, colours = (
-            _poly(points, faces=_cells(faces)),
-            np.repeat(layer_colours(layer, count), len(points) // count, 0),
-        )
+        data = _make_polydata(points, faces=_prefix_counts(faces))
+        colours = np.repeat(layer_colours(layer, count), len(points) // count, 0)
         look = {"smooth_shading": True, "ambient": 0.3, "diffuse": 0.8, "specular": 0.15, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_bytes(data, colours))
+        plotter.add_mesh(data, **look, **_colour_bytes(data, colours))
 
 
-def _mesh(plotter: Any, layer: Mesh) -> None:
+def _add_mesh(plotter: Any, layer: Mesh) -> None:
     if len(layer.faces):
-        data = _poly(layer.vertices, faces=_cells(layer.faces))
+        data = _make_polydata(layer.vertices, faces=_prefix_counts(layer.faces))
+        look = {"smooth_shading": True, "ambient": 0.5, "diffuse": 0.6, "opacity": layer.opacity}
+        plotter.add_mesh(data, **look, **_colour_arguments(layer, data))
+
+
+def _add_points(plotter: Any, layer: Points) -> None:
+    if len(layer.centres):
+        data = _make_polydata(layer.centres)
+        look = {"render_points_as_spheres": True, "point_size": layer.size, "opacity": layer.opacity}
+        plotter.add_mesh(data, **look, **_colour_arguments(layer, data))
+
+
+def _add_lines(plotter: Any, layer: Lines) -> None:
+    if len(layer.pairs):
+        data = _make_polydata(layer.vertices, lines=_prefix_counts(layer.pairs))
         plotter.add_mesh(
-            data, smooth_shading=True, ambient=0.5, diffuse=0.6, opacity=layer.opacity, **_paint(layer, data)
+            data, line_width=layer.width, lighting=False, opacity=layer.opacity, **_colour_arguments(layer, data)
         )
 
 
-def _points(plotter: Any, layer: Points) -> None:
-    if len(layer.centres):
-        data = _poly(layer.centres)
-        look = {"render_points_as_spheres": True, "point_size": layer.size, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_paint(layer, data))
-
-
-def _lines(plotter: Any, layer: Lines) -> None:
-    if len(layer.pairs):
-        data = _poly(layer.vertices, lines=_cells(layer.pairs))
-        plotter.add_mesh(data, line_width=layer.width, lighting=False, opacity=layer.opacity, **_paint(layer, data))
-
-
-def _poly(points: np.ndarray, **cells: np.ndarray) -> Any:
+def _make_polydata(points: np.ndarray, **cells: np.ndarray) -> Any:
     import pyvista
 
     return pyvista.PolyData(np.ascontiguousarray(points, np.float32), **cells)  # type: ignore[arg-type]
 
 
-def _cells(rows: np.ndarray) -> np.ndarray:
+def _prefix_counts(rows: np.ndarray) -> np.ndarray:
     return np.c_[np.full(len(rows), rows.shape[1]), rows].ravel()
 
 
-def _paint(layer: Painted, data: Any) -> dict[str, Any]:
+def _colour_arguments(layer: Painted, data: Any) -> dict[str, Any]:
     """Return arguments of ``add_mesh`` that colour a layer's vertices; numbers are interpolated before colouring."""
     if layer.values is not None and layer.scale is not None:
         data.point_data["values"] = layer.values.astype(np.float32)
-        return _numbers(layer.scale)
-    return _bytes(data, layer_colours(layer, data.n_points))
+        return _scale_arguments(layer.scale)
+    return _colour_bytes(data, layer_colours(layer, data.n_points))
 
 
-def _bytes(data: Any, colours: np.ndarray) -> dict[str, Any]:
+def _colour_bytes(data: Any, colours: np.ndarray) -> dict[str, Any]:
     data.point_data["colours"] = colours
     return {"scalars": "colours", "rgb": True, "show_scalar_bar": False}
 
 
-def _numbers(scale: Scale) -> dict[str, Any]:
+def _scale_arguments(scale: Scale) -> dict[str, Any]:
     return {"scalars": "values", "cmap": scale.colours, "clim": (scale.low, scale.high), "show_scalar_bar": False}
 
 
@@ -306,13 +292,13 @@ def _ellipsoid_triangles(centres: np.ndarray, axes: np.ndarray, subdivisions: in
 
 
 _ADD: dict[type, Any] = {
-    Volume: _volume,
-    Isosurfaces: _isosurfaces,
-    Slices: _slices,
-    Ellipsoids: _ellipsoids,
-    Mesh: _mesh,
-    Points: _points,
-    Lines: _lines,
+    Volume: _add_volume,
+    Isosurfaces: _add_isosurfaces,
+    Slices: _add_slices,
+    Ellipsoids: _add_ellipsoids,
+    Mesh: _add_mesh,
+    Points: _add_points,
+    Lines: _add_lines,
 }
 
 
@@ -320,25 +306,12 @@ _ADD: dict[type, Any] = {
 
 _VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 _PROBE = """
-from vtkmodules.vtkRenderingCore import vtkActor, vtkPolyDataMapper, vtkRenderer, vtkRenderWindow
-from vtkmodules.vtkRenderingCore import vtkWindowToImageFilter
-from vtkmodules.vtkFiltersSources import vtkSphereSource
-import vtkmodules.vtkRenderingOpenGL2
-window, renderer, actor, mapper, ball, image = (
-    vtkRenderWindow(), vtkRenderer(), vtkActor(), vtkPolyDataMapper(), vtkSphereSource(), vtkWindowToImageFilter()
-)
-mapper.SetInputConnection(ball.GetOutputPort())
-actor.SetMapper(mapper)
-renderer.AddActor(actor)
-window.SetOffScreenRendering(1)
-window.SetSize(32, 32)
-window.AddRenderer(renderer)
-window.Render()
-image.SetInput(window)
-image.Update()
-print("drawn" if image.GetOutput().GetScalarRange()[1] > 0 else "black")
+import pyvista
+plotter = pyvista.Plotter(off_screen=True, window_size=(32, 32))
+plotter.add_mesh(pyvista.Sphere())
+print("drawn" if plotter.screenshot(return_img=True).std() > 0 else "black")
 """
-_SECONDS = 120.0
+_PROBE_SECONDS = 120.0
 
 
 def require_pyvista() -> None:
@@ -366,13 +339,13 @@ def prepare_headless() -> None:
         BackendUnavailable: none of them works; names the packages to install.
     """
     chosen = os.environ.get(_VARIABLE)
-    ways = (chosen,) if chosen else (*([""] if has_display() else []), "vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow")
+    ways = [chosen] if chosen else [""] * has_display() + ["vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"]
     failures = []
     for way in ways:
-        failure = _try(way)
+        environment = {**os.environ, **({_VARIABLE: way} if way else {})}
+        failure = _probe_drawing(environment)
         if failure is None:
-            if way:
-                os.environ[_VARIABLE] = way
+            os.environ.update(environment)
             return
         failures.append(f"{way or 'display'}: {failure}")
     raise BackendUnavailable(
@@ -381,15 +354,13 @@ def prepare_headless() -> None:
     )
 
 
-def _try(way: str) -> str | None:
-    """Try one way in another process; return why it does not work, or None."""
-    environment = {**os.environ, **({_VARIABLE: way} if way else {})}
+def _probe_drawing(environment: dict[str, str]) -> str | None:
+    """Draw in another process; return why it does not work, or None."""
+    command = [sys.executable, "-c", _PROBE]
     try:
-        done = subprocess.run(
-            [sys.executable, "-c", _PROBE], env=environment, capture_output=True, text=True, timeout=_SECONDS
-        )
+        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS)
     except subprocess.TimeoutExpired:
-        return f"no picture after {_SECONDS:.0f} s"
+        return f"no picture after {_PROBE_SECONDS:.0f} s"
     if done.returncode < 0:
         return f"ended by {signal.Signals(-done.returncode).name}"
     if done.returncode:

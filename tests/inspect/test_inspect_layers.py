@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable
-from neuprim.inspect.html_page import ELLIPSOIDS_LIMIT, PackedFrame
+from neuprim.inspect.html_page import ELLIPSOIDS_LIMIT, PackedFrameArrays
 from neuprim.inspect.layers import (
     Ellipsoids,
     Isosurfaces,
@@ -236,7 +236,7 @@ def test_layers_of_nothing_are_drawn(site: Path, run_dir: Path, tmp_path: Path) 
 
 def test_a_page_says_how_many_ellipsoids_it_left_out() -> None:
     count = ELLIPSOIDS_LIMIT + 5
-    packed = PackedFrame()
+    packed = PackedFrameArrays()
     (found,) = packed.pack_layers(
         [Ellipsoids(np.arange(3.0 * count).reshape(-1, 3), np.broadcast_to(np.eye(3), (count, 3, 3)))]
     )

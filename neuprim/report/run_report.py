@@ -75,7 +75,6 @@ def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer
 def _render_report(
     run: RunRecord, conditions: Sequence[ConditionSpec], viewer: Viewer | None = None, linked: str = ""
 ) -> str:
-    """Return the report as HTML text, with a viewer in it or a link to one."""
     names = [name for name in (run.name_of("task"), run.name_of("scene")) if name]
     sections = (
         _report_head(run),
@@ -249,7 +248,6 @@ def _report_model(viewer: str, linked: str) -> str:
 
 
 def _report_films(run: RunRecord) -> str:
-    """Return held-out cameras over time, ground truth on the left and render on the right."""
     figures = ""
     for path in run.clips:
         name = escape(path.stem.removeprefix("clip_"))
@@ -323,7 +321,6 @@ def _report_worst_regions(run: RunRecord) -> str:
 
 
 def _report_curves(run: RunRecord) -> str:
-    """Return PSNR and loss over time and steps, primitives over time, PSNR per view and frame."""
     views = [from_json(entry, "psnr") for entry in per_view(run)]
     mean, frames = from_json(run.metrics or {}, "psnr"), run.field("per_frame")
     known = [
@@ -352,7 +349,6 @@ def _report_curves(run: RunRecord) -> str:
 
 
 def _report_curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
-    """Return a chart of a logged number; that of PSNR with the held-out views."""
     lines = [Points(*run.series(x, key), band=True)]
     if key == "psnr":
         lines.append(Points(*run.series(x, "eval_psnr"), HELD_OUT))
@@ -363,7 +359,6 @@ def _report_curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
 
 
 def _report_view_table(run: RunRecord) -> str:
-    """Return every held-out view's numbers, folded."""
     entries = per_view(run)
     if not entries:
         return ""
@@ -377,7 +372,6 @@ def _report_view_table(run: RunRecord) -> str:
 
 
 def _report_settings(run: RunRecord) -> str:
-    """Return every setting that is not at its default."""
     changed = run.field("non_default")
     if not isinstance(changed, Mapping):
         body = note(f"{MISSING} not recorded")
@@ -394,7 +388,6 @@ def _report_settings(run: RunRecord) -> str:
 
 
 def _report_facts(run: RunRecord) -> str:
-    """Return where the numbers come from: split, data, machine, versions."""
     keys = ("split", "data_source", "color_space", "channels", "downsampling", "background", "seed", "iterations")
     pairs = [(key.replace("_", " "), run.field(key)) for key in (*keys, "checkpoint", "backend", "device")]
     pairs = [
@@ -422,7 +415,6 @@ def _report_commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str
 
 
 def _report_config(run: RunRecord) -> str:
-    """Return the resolved configuration, folded."""
     if run.config_text is None:
         return note("There is no config.yaml in this run directory.")
     return folded("Full configuration", f"<pre><code>{escape(run.config_text)}</code></pre>")

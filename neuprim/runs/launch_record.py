@@ -10,8 +10,8 @@ from typing import Any
 
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.files import read_json, write_json
+from neuprim.core.errors import ConfigError
+from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.validation import coerce, validate
 from neuprim.runs.ground_truth import render_ground_truth_of_runs
 from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
@@ -113,20 +113,16 @@ def read_launch_record(file: Path, what: str) -> LaunchRecord | None:
     Raises:
         DataError: the file is damaged, or of another version.
     """
-    data: Any = read_json(file, what, RECORD_HINT)
-    if data is None:
-        return None
-    try:
-        if data["format"] != _FORMAT:
-            raise DataError(f"{file}: format {data['format']!r}; this neuprim reads {_FORMAT}; {RECORD_HINT}")
+
+    def parse(data: Mapping[str, Any]) -> LaunchRecord:
         words = coerce(data["words"], tuple[str, ...], "words")
         runs = tuple(validate(LaunchedRun, run, "runs") for run in data["runs"])
         for run in runs:
             if Path(run.name).name != run.name or run.name in ("", ".", ".."):
                 raise ValueError(f"name {run.name!r} is no folder's")
         return LaunchRecord(file, words, runs, coerce(data.get("joined_steps"), int | None, "joined_steps"))
-    except (KeyError, TypeError, ValueError, AttributeError, ConfigError) as error:
-        raise DataError(f"{file}: not {what} ({type(error).__name__}: {error}); {RECORD_HINT}") from error
+
+    return read_json_record(file, what, RECORD_HINT, _FORMAT, parse)
 
 
 def is_complete(run_dir: Path) -> bool:

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from PIL import Image
 
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 
 FOLDER = Path(__file__).parent / "pictures"
 PICTURES = {
@@ -35,7 +35,9 @@ def main(run: Path, against: str = "scene", time: str = "0.62") -> None:
     for name, (show, beside, size) in PICTURES.items():
         out = FOLDER / f"inspect_{name}.png"
         inspect_run(
-            Request(run, show, {"time": time}, against=against if beside else None, out=out, size=size, overwrite=True)
+            InspectRequest(
+                run, show, {"time": time}, against=against if beside else None, out=out, size=size, overwrite=True
+            )
         )
         reduce(out)
 

@@ -205,7 +205,7 @@ def launch_runs(
     from neuprim.cli.progress import RunLaunchProgress
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
     from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
-    from neuprim.runs.launch_record import run_job
+    from neuprim.runs.launch_record import make_run_job
     from neuprim.runs.sweep import run_sweep
 
     with RunLaunchProgress(configs) as progress:
@@ -213,7 +213,7 @@ def launch_runs(
             _, results = run_sweep(configs, overrides, settings, progress)
         else:
             render_ground_truth_of_runs(configs, settings, progress)
-            results = launch([run_job(configs[0])], settings, configs[0].output_dir / LAUNCH_FOLDER, progress)
+            results = launch([make_run_job(configs[0])], settings, configs[0].output_dir / LAUNCH_FOLDER, progress)
     status = _report_launched_runs(configs, results, progress.live, typed)
     if len(configs) > 1:
         print(configs[0].output_dir.parent / "sweep.html")
@@ -320,7 +320,7 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
         if sys.exc_info()[0] is not None:  # on its way out already, with an error that says more
             return
-        raise group.explain(RankError("ended by SIGTERM"))
+        raise group.explain_broken_connection(RankError("ended by SIGTERM"))
 
     # torchrun sends it when another rank ended; a training handles it by itself
     before = signal.signal(signal.SIGTERM, terminate)

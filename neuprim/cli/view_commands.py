@@ -166,11 +166,11 @@ def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
 def _inspect(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import print_notes
     from neuprim.inspect import ViewOptions, parse_box
-    from neuprim.runs.inspect import Request, inspect_run
+    from neuprim.runs.inspect import InspectRequest, inspect_run
 
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
     names += ["primitives"] * arguments.primitives + ["primitive"] * (arguments.primitive is not None)
-    request = Request(
+    request = InspectRequest(
         arguments.run,
         names or ["volume"],
         arguments.conditions,

@@ -10,7 +10,7 @@ from neuprim.core import checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.train.trainer_state import select_prefix
+from neuprim.core.train.trainer_state import select_state_tensors
 from neuprim.runs.fit import keep_model_settings, make_loss
 
 BEGIN = 0.8
@@ -33,7 +33,7 @@ _PACE_WARMUP, _PACE_STEPS = 5, 20
 """Steps before the pace is measured, and those that it is measured over."""
 
 
-def fine_tuner(
+def make_finetune_trainer(
     job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
     """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
@@ -64,15 +64,15 @@ def fine_tuner(
     trainer.step = total - steps
     saved = config.output_dir / "checkpoint.safetensors"
     if trainer.exposures is not None and saved.exists():
-        trainer.exposures.load_state(select_prefix(checkpoint.read(saved, "checkpoint")[1], "exposure."))
+        trainer.exposures.load_state(select_state_tensors(checkpoint.read(saved, "checkpoint")[1], "exposure."))
     return trainer
 
 
-def steps_in(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
+def count_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
     """How many steps of fine-tuning fit into some seconds, at the measured pace; none in 0 seconds."""
     if seconds <= 0:
         return 0
-    trainer = fine_tuner(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)
+    trainer = make_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)
     for _ in range(_PACE_WARMUP):
         trainer.train_step()
     before = trainer.elapsed

@@ -40,7 +40,7 @@ _DEPTH = 6.0  # optical depth that a volume is shown with where it is deepest
 
 
 @dataclass(frozen=True)
-class Request:
+class InspectRequest:
     """Arguments of ``neuprim inspect``.
 
     Attributes:
@@ -66,7 +66,7 @@ class Request:
     overwrite: bool = False
 
 
-def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
+def inspect_run(request: InspectRequest, events: Events = ignore_event) -> list[Path]:
     """Show a run's density in a window, or write files and return them.
 
     Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a
@@ -92,7 +92,7 @@ def inspect_run(request: Request, events: Events = ignore_event) -> list[Path]:
             prepare_headless()
     if request.against is None and any(i.shows == "both" for i in inspectors):
         raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
-    film = _FrameSequence(request, events)
+    film = _InspectedFrames(request, events)
     if film.channels.hides_channels and any(i.shows == "model" for i in inspectors):
         events(Note(f"shown: {film.channels.display_text}"))
     if request.out is not None and kind == ".html":
@@ -135,7 +135,7 @@ def _output_paths(out: Path, count: int) -> list[Path]:
     return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
 
 
-def _write_pictures(out: Path, film: _FrameSequence, window: Window) -> list[Path]:
+def _write_pictures(out: Path, film: _InspectedFrames, window: Window) -> list[Path]:
     def draw(frame: FieldFrame) -> Tensor:
         window.draw(frame)
         return torch.from_numpy(window.picture().copy()).float() / 255.0
@@ -147,7 +147,7 @@ def _write_pictures(out: Path, film: _FrameSequence, window: Window) -> list[Pat
     return [out]
 
 
-def _write_frames(out: Path, film: _FrameSequence, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+def _write_frames(out: Path, film: _InspectedFrames, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
     paths = _output_paths(out, len(film))
     for i, path in enumerate(paths):
@@ -155,10 +155,10 @@ def _write_frames(out: Path, film: _FrameSequence, write: Callable[[Path, FieldF
     return paths
 
 
-class _FrameSequence:
+class _InspectedFrames:
     """The requested frames, made one at a time, with one box and scale for all."""
 
-    def __init__(self, request: Request, events: Events) -> None:
+    def __init__(self, request: InspectRequest, events: Events) -> None:
         run = open_run(request.run)
         self.model, self.device, self.world = run.model, computing_device(run.settings), run.world
         self.truth: DensityTruth | None = None

@@ -125,12 +125,12 @@ def read_launch_record(file: Path, what: str) -> LaunchRecord | None:
     return read_json_record(file, what, RECORD_HINT, _FORMAT, parse)
 
 
-def is_complete(run_dir: Path) -> bool:
+def is_finished_run(run_dir: Path) -> bool:
     """Whether a directory has all that the end of a run writes."""
     return all(file.is_file() for file in (run_dir / "config.yaml", run_dir / "metrics.json", model_file(run_dir)))
 
 
-def run_job(config: RunConfig) -> LaunchJob:
+def make_run_job(config: RunConfig) -> LaunchJob:
     """Make a run a job."""
     return LaunchJob(config.output_dir.name, FIT_JOB, config.to_dict())
 
@@ -155,7 +155,9 @@ def launch_missing_runs(
         OSError: the record cannot be written.
     """
     results: list[JobResult | None] = [
-        JobResult("done", str(config.output_dir)) if run.state == "done" and is_complete(config.output_dir) else None
+        JobResult("done", str(config.output_dir))
+        if run.state == "done" and is_finished_run(config.output_dir)
+        else None
         for run, config in zip(record.runs, configs, strict=False)
     ]
     todo = [number for number, result in enumerate(results) if result is None]
@@ -181,6 +183,6 @@ def launch_missing_runs(
 
     chosen = [configs[number] for number in todo]
     render_ground_truth_of_runs(chosen, settings, hear)
-    launch([run_job(config) for config in chosen], settings, record.file.parent / LAUNCH_FOLDER, hear, end)
+    launch([make_run_job(config) for config in chosen], settings, record.file.parent / LAUNCH_FOLDER, hear, end)
     record.write()
     return record, results

@@ -132,7 +132,7 @@ class _RenderSession:
         self.lights = self._load_lights(request.environment)
         self.views, self.fps = self._load_views()
         with run.plugins.attribute_errors():
-            self.views, animated = with_conditions(self.views, self.task, request.conditions, notify)
+            self.views, animated = set_view_conditions(self.views, self.task, request.conditions, notify)
             model = self.render_config.prepare_model(run.model)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
         suffix = "" if request.out is None else request.out.suffix.lower().removeprefix(".")
@@ -236,14 +236,14 @@ class _RenderSession:
         return [folder / f"{name}{suffix}" for name in _view_file_names([view.name for view in self.views])]
 
     def write_animation(self, path: Path) -> None:
-        stack = [self.channels.display(self._render(view)) for view in self.views]
+        stack = [self.channels.display(self._render_pixels(view)) for view in self.views]
         self._check_visible()
         write_animation(path, stack, self.fps or min(30.0, max(len(self.views) / 4.0, 5.0)))
 
     def write_images(self, paths: Sequence[Path]) -> None:
         for view, path in zip(self.views, paths, strict=True):
             if self.layers is None:
-                _write_image(path, self.format, self._render(view), self.channels, self.fps)
+                _write_image(path, self.format, self._render_pixels(view), self.channels, self.fps)
             else:
                 with self.run.plugins.attribute_errors():
                     self.layers.write(path, self.model, view, self._count_pass)
@@ -254,7 +254,7 @@ class _RenderSession:
                 path.unlink()
             raise
 
-    def _render(self, view: View) -> torch.Tensor:
+    def _render_pixels(self, view: View) -> torch.Tensor:
         config = self.render_config
         with self.run.plugins.attribute_errors():
             if not self.lights:
@@ -322,7 +322,7 @@ def _camera_file_views(file: CameraViews, task: TaskSpec, conditions: Mapping[st
     return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
 
 
-def with_conditions(
+def set_view_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
     """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along

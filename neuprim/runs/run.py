@@ -26,7 +26,7 @@ from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.finetune import fine_tuner, steps_in
+from neuprim.runs.finetune import count_finetune_steps, make_finetune_trainer
 from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_event, is_chunked, refuse_chunks
 from neuprim.runs.ground_truth import render_ground_truth_for_training
 from neuprim.runs.launch.jobs import ENDED, JobStatus
@@ -227,9 +227,9 @@ def train_in_chunks(
         steps = record.joined_steps
         if steps is None:
             assert plan.seconds is not None, "a budget is in steps, in seconds or both"
-            steps = min(steps_in(plan.seconds, job, dataset, model), plan.steps or 2**62)
+            steps = min(count_finetune_steps(plan.seconds, job, dataset, model), plan.steps or 2**62)
             replace(record, joined_steps=steps).write()
-        trainer = fine_tuner(job, dataset, model, max(steps, 1), 1 - JOINT_SHARE, config.train.voxels_every)
+        trainer = make_finetune_trainer(job, dataset, model, max(steps, 1), 1 - JOINT_SHARE, config.train.voxels_every)
         trainer.elapsed = sum(float(read_metrics(own.output_dir)["train_seconds"]) for own in plan.configs)
         return trainer
 

@@ -87,7 +87,7 @@ def train_in_directory(
         compile_kernels(trainer, events)
     if isinstance(trainer, DistributedTrainer):
         trainer.check_same_start()
-    return fitted, _train(fitted, events, between) if trainer.rank == 0 else _train_as_follower(trainer)
+    return fitted, _train_and_save(fitted, events, between) if trainer.rank == 0 else _train_as_follower(trainer)
 
 
 def _resume_training(fitted: Fitted, events: Events) -> None:
@@ -110,7 +110,7 @@ def _resume_training(fitted: Fitted, events: Events) -> None:
     events(Note(f"resumed at step {fitted.trainer.step}"))
 
 
-def _train(fitted: Fitted, events: Events, between: BetweenSteps) -> bool:
+def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bool:
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
     curve, saved = config.output_dir / CURVE_FILE, config.output_dir / "checkpoint.safetensors"

@@ -15,7 +15,7 @@ from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.finetune import steps_in
+from neuprim.runs.finetune import count_finetune_steps
 from neuprim.runs.fit import use_one_torch_thread
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, load_run
@@ -156,7 +156,7 @@ def _quantize(
 ) -> QuantizedModel:
     steps = request.steps
     if steps is None:
-        steps = steps_in(request.seconds, Job(data.config, data.task), data.dataset, model)
+        steps = count_finetune_steps(request.seconds, Job(data.config, data.task), data.dataset, model)
     if request.by_level:
         return finetune_for_table(data, model, table, steps, progress)
     tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance

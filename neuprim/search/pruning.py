@@ -20,7 +20,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.finetune import fine_tuner, steps_in
+from neuprim.runs.finetune import count_finetune_steps, make_finetune_trainer
 from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import PRUNED, kept_shares, load_dataset, load_run, model_file, move_to_render_device
@@ -212,7 +212,7 @@ class ModelShrinker:
         """Return the state after a round of fine-tuning."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
-            trainer = fine_tuner(Job(self.config, self.task), self.dataset, model, steps)
+            trainer = make_finetune_trainer(Job(self.config, self.task), self.dataset, model, steps)
             trainer.zero_masks, left = zero_masks(trainer.model), state.numbers
             for done in range(steps):
                 trainer.train_step()
@@ -295,7 +295,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
         begun, steps = time.monotonic(), request.steps
         if steps is None:
-            steps = steps_in(request.seconds, Job(config, task), dataset, model)
+            steps = count_finetune_steps(request.seconds, Job(config, task), dataset, model)
         shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
         small, words = shrinker.shrink(model)
         seconds = time.monotonic() - begun

@@ -16,7 +16,7 @@ from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.export import vdb as exporter
 from neuprim.runs.export import export_run
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import open_run
 from tests.plugins import marked
 from tests.pretend_card import CARD, pretended
@@ -124,7 +124,7 @@ def test_extinction_is_computed_where_the_run_draws(
         export_run(own, "vdb", tmp_path / "there", ["time=0.5", "grid=24"])
         assert len(asked) >= 2 and set(asked) == {CARD}
         asked.clear()
-        inspect_run(Request(own, ("volume",), {"time": "0.5"}, 16, against="scene", out=tmp_path / "seen.vdb"))
+        inspect_run(InspectRequest(own, ("volume",), {"time": "0.5"}, 16, against="scene", out=tmp_path / "seen.vdb"))
         assert len(asked) >= 4 and set(asked) == {CARD}
     (here,), (there,) = (list((tmp_path / name).iterdir()) for name in ("own", "there"))
     assert np.array_equal(read_grid(here, "density").to_dense(), read_grid(there, "density").to_dense())

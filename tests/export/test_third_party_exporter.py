@@ -13,7 +13,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import read_grid
 from neuprim.plugins.registry import PluginError
 from neuprim.runs.export import export_run, import_run
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from tests.plugins.strangers import EXPORTER, INSPECTOR, add, run_dir, site
 
 __all__ = ["run_dir", "site"]
@@ -287,5 +287,5 @@ def test_a_full_disk_is_not_the_plugins_fault(
 def test_a_crash_of_an_inspector_names_its_package(site: Path, run_dir: Path, tmp_path: Path) -> None:
     add(site, "inspector", INSPECTOR.replace("frame.box", "frame.nowhere"))
     with pytest.raises(PluginError, match=r"^inspector 'crumbs' of strange-inspector 0\.3: AttributeError: "):
-        inspect_run(Request(run_dir, ["crumbs"], grid=8, out=tmp_path / "a.html"))
+        inspect_run(InspectRequest(run_dir, ["crumbs"], grid=8, out=tmp_path / "a.html"))
     assert not (tmp_path / "a.html").exists()

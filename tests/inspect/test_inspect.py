@@ -23,7 +23,7 @@ from neuprim.inspect.html_page import encode_values
 from neuprim.inspect.layers import Scale
 from neuprim.plugins.registry import load_task
 from neuprim.runs.fit import Event, Note
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import load_dataset, load_run
 from tests.inspect.pages import array, layers_of
 from tests.plugins import runs
@@ -44,7 +44,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def look(run_dir: Path, **words: Any) -> tuple[list[Path], list[str]]:
     heard: list[Event] = []
-    paths = inspect_run(Request(run_dir, **words), heard.append)
+    paths = inspect_run(InspectRequest(run_dir, **words), heard.append)
     return paths, [event.text for event in heard if isinstance(event, Note)]
 
 

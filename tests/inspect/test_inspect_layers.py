@@ -28,7 +28,7 @@ from neuprim.inspect.layers import (
 )
 from neuprim.inspect.views import make_cut_ball
 from neuprim.inspect.window import prepare_headless
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from tests.inspect.pages import array, layers_of
 from tests.plugins import runs
 from tests.plugins.fakes import install, site
@@ -99,7 +99,7 @@ def stranger(site: Path, found: str) -> None:
 
 
 def look(run_dir: Path, out: Path | None, **words: Any) -> list[Path]:
-    return inspect_run(Request(run_dir, ["marks"], **{"out": out, "grid": 16, "size": (240, 200), **words}))
+    return inspect_run(InspectRequest(run_dir, ["marks"], **{"out": out, "grid": 16, "size": (240, 200), **words}))
 
 
 def green(picture: Any) -> int:

@@ -14,7 +14,7 @@ from PIL import Image
 from neuprim.core.errors import BackendUnavailable
 from neuprim.inspect import window
 from neuprim.inspect.window import prepare_headless
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from tests.plugins import runs
 
 pytest.importorskip("pyvista", exc_type=ImportError)
@@ -35,7 +35,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def look(run_dir: Path, **words: Any) -> list[Path]:
-    return inspect_run(Request(run_dir, **{"grid": 24, "size": (240, 200), **words}))
+    return inspect_run(InspectRequest(run_dir, **{"grid": 24, "size": (240, 200), **words}))
 
 
 def pixels(path: Path) -> np.ndarray:

@@ -29,7 +29,7 @@ from neuprim.core.render import render
 from neuprim.export import mesh, shared
 from neuprim.plugins.registry import load_task
 from neuprim.runs.export import export_run, import_run
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, read_metrics
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -140,7 +140,8 @@ def test_exr_and_npy_hold_every_channel(trained: Path, tmp_path: Path) -> None:
 def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: Path) -> None:
     said: list[str] = []
     inspect_run(
-        Request(trained, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: said.append(event.text)
+        InspectRequest(trained, ("primitives",), grid=8, out=tmp_path / "page.html"),
+        lambda event: said.append(event.text),
     )
     (frame,) = layers_of(tmp_path / "page.html")["frames"]
     (shown,) = (layer for layer in frame["layers"]["primitives"]["model"] if layer["kind"] == "ellipsoids")
@@ -227,9 +228,8 @@ def test_without_a_display_it_is_said_what_is_shown(
     assert lines == [f"shown: {SHOWN}; --format exr and npy hold all channels"]
     render_run(out, RenderRequest("orbit", format="exr", out=tmp_path / "exr", frames=1), notify=lines.append)
     assert len(lines) == 1
-    inspect_run(
-        Request(out, ("primitives",), grid=8, out=tmp_path / "page.html"), lambda event: lines.append(event.text)
-    )
+    request = InspectRequest(out, ("primitives",), grid=8, out=tmp_path / "page.html")
+    inspect_run(request, lambda event: lines.append(event.text))
     assert f"shown: {SHOWN}" in lines
     monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):

@@ -23,7 +23,7 @@ from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
 from neuprim.export.shared import Harmonics, fibonacci_sphere
 from neuprim.runs.export import export_run, import_run
-from neuprim.runs.inspect import Request, inspect_run
+from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import open_run, read_metrics
 from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.tasks.relight import TASK as RELIGHT
@@ -139,12 +139,12 @@ def test_meshes_are_in_the_world(tmp_path: Path, world: World, suffix: str) -> N
 def test_boxes_and_volumes_of_inspect_are_in_the_world(tmp_path: Path) -> None:
     run = run_in(tmp_path / "run", UTM)
     box = UTM.world_box(np.array([[-0.5, -0.5, -0.5], [0.5, 0.5, 0.5]]))
-    inspect_run(Request(run, grid=16, box=box, out=tmp_path / "v.vdb"))
+    inspect_run(InspectRequest(run, grid=16, box=box, out=tmp_path / "v.vdb"))
     grid = read_grid(tmp_path / "v.vdb", "extinction")
     assert np.abs(np.stack(grid.world_bounds()).mean(0) - box.mean(0)).max() < 0.1  # type: ignore[arg-type]
     said = list[str]()
     inspect_run(
-        Request(run, grid=16, against=str(tmp_path / "v.vdb"), out=tmp_path / "w.vdb"),
+        InspectRequest(run, grid=16, against=str(tmp_path / "v.vdb"), out=tmp_path / "w.vdb"),
         lambda event: said.append(str(event)),
     )
     assert any("correlation 1.0000" in line for line in said)

@@ -61,7 +61,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 
 @exact_kernel
-def _largest_bits(x):  # type: ignore[no-untyped-def]
+def _largest_gradient_bits(x):  # type: ignore[no-untyped-def]
     """The largest of float32 numbers' bits without their signs: those of infinity or more where one is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
@@ -70,15 +70,15 @@ def _largest_bits(x):  # type: ignore[no-untyped-def]
     return largest
 
 
-def _all_finite(gradients: list[Tensor]) -> bool:
+def _all_gradients_finite(gradients: list[Tensor]) -> bool:
     if all(device.on_numba(g) and g.dtype == torch.float32 for g in gradients):
-        return all(_largest_bits(g.contiguous().reshape(-1).numpy()) < _INFINITY for g in gradients)
+        return all(_largest_gradient_bits(g.contiguous().reshape(-1).numpy()) < _INFINITY for g in gradients)
     # one wait for the GPU; the largest of a NaN and anything is a NaN
     return bool(torch.isfinite(torch.stack([torch.linalg.vector_norm(g, torch.inf).double() for g in gradients])).all())
 
 
 @lru_cache(maxsize=4)
-def _corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
+def _bias_corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
     """1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; powers take longer than all else that a step does per
     row."""
     age = np.arange(1.0, ages)
@@ -126,8 +126,8 @@ class RowAdam:
         float32 = all(update.value.dtype == torch.float32 for update in updates)
         if updates and float32 and device.on_warp(self.age) and self._step_on_gpu(updates):
             return
-        if updates and not _all_finite([update.grad for update in updates]):
-            raise NonFiniteError(_describe_gradient(updates))
+        if updates and not _all_gradients_finite([update.grad for update in updates]):
+            raise NonFiniteError(_describe_bad_gradient(updates))
         self.age += 1
         if float32 and device.on_numba(self.age):
             self._step_on_cpu(updates)
@@ -149,7 +149,7 @@ class RowAdam:
     def _step_on_cpu(self, updates: list[_ParameterUpdate]) -> None:
         age = self.age.numpy()
         breaks = np.flatnonzero(age[1:] != age[:-1]) + 1
-        shared = (self.beta2, age, breaks, *_corrections(self.beta2, 1 << int(age.max(initial=0)).bit_length()))
+        shared = (self.beta2, age, breaks, *_bias_corrections(self.beta2, 1 << int(age.max(initial=0)).bit_length()))
         work: list[tuple[Any, ...]] = []  # arguments of _adam_rows, small enough to share out
         for update in updates:
             count, width = len(update.value), update.value[0].numel()
@@ -182,7 +182,7 @@ class RowAdam:
         self.age = state["age"]
 
 
-def _describe_gradient(updates: list[_ParameterUpdate]) -> str:
+def _describe_bad_gradient(updates: list[_ParameterUpdate]) -> str:
     """Name the first primitive whose gradient is not finite."""
     for update in updates:
         bad = (~torch.isfinite(update.grad.reshape(len(update.grad), -1)).all(dim=1)).nonzero()

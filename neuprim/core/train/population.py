@@ -165,7 +165,7 @@ class RelocatePopulation(Population):
             return None
         count = len(weight)
         budget = int(self.settings.fraction * count)
-        births = self._births(count)
+        births = self._count_births(count)
         busiest = torch.argsort(error, descending=True, stable=True)
         busy = torch.zeros(count, dtype=torch.bool, device=weight.device)
         busy[busiest[:budget]] = True
@@ -185,9 +185,9 @@ class RelocatePopulation(Population):
             return None
         new = torch.arange(count, count + births, device=weight.device)
         text = ", ".join(f"{what} {number}" for what, number in (("moved", moves), ("grew by", births)) if number)
-        return _split_into(model, parents, torch.cat([idle, new]), births, text)
+        return _split_into_rows(model, parents, torch.cat([idle, new]), births, text)
 
-    def _births(self, count: int) -> int:
+    def _count_births(self, count: int) -> int:
         """How many primitives to add, by the same factor in each of the remaining interventions."""
         missing = max((self.settings.grow_to or 0) - count, 0)
         due = math.ceil(count * ((1 + missing / count) ** (1 / (self._remaining + 1)) - 1) - 1e-9)
@@ -203,7 +203,7 @@ class RelocatePopulation(Population):
         self.error = state["error"].clone() if "error" in state else None
 
 
-def _split_into(model: Primitives, parents: Tensor, others: Tensor, births: int, text: str) -> PopulationChange:
+def _split_into_rows(model: Primitives, parents: Tensor, others: Tensor, births: int, text: str) -> PopulationChange:
     """Split ``parents`` (P,): first children take their parents' rows, second ones the rows ``others`` (P,), of which
     the last ``births`` are new."""
     children = split_primitives(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)

@@ -32,7 +32,7 @@ from neuprim.core.train.losses import MaxScreenSize, PointResult, point_loss, sc
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.population import PopulationChange, make_population
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.train.trainer_state import check_state, hash_names, select_prefix
+from neuprim.core.train.trainer_state import check_state, hash_view_names, select_state_tensors
 from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_view, resolution_factor
 
 MIN_COOLDOWN = 0.02
@@ -138,8 +138,7 @@ class Trainer:
         self.max_screen_size = None if size is None else MaxScreenSize(train, size)
         self.exposures = Exposures(len(train), dataset.channels, rate, self.device) if rate > 0 else None
         self.generator = torch.Generator().manual_seed(seed + 1)
-        self.order = torch.empty(0, dtype=torch.int64)
-        self.step, self.elapsed = 0, 0.0
+        self.order, self.step, self.elapsed = torch.empty(0, dtype=torch.int64), 0, 0.0
         self.fake_quantize: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
         self.zero_masks: dict[str, Tensor] = {}
         self.stop_requested: Callable[[], bool] = lambda: False
@@ -397,7 +396,7 @@ class Trainer:
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
         train = self.dataset.train
-        header = {"step": self.step, "elapsed": self.elapsed, "views": len(train), "names": hash_names(train)}
+        header = {"step": self.step, "elapsed": self.elapsed, "views": len(train), "names": hash_view_names(train)}
         return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
@@ -409,11 +408,11 @@ class Trainer:
         check_state(tensors, header, where, *self.state())
         moved = {name: value.to(self.device, copy=True) for name, value in tensors.items()}
         self.model.params = {spec.name: moved[f"params.{spec.name}"] for spec in self.model.specs}
-        self.optimizer.load_state(select_prefix(moved, "adam."))
-        self.population.load_state(select_prefix(moved, "population."))
+        self.optimizer.load_state(select_state_tensors(moved, "adam."))
+        self.population.load_state(select_state_tensors(moved, "population."))
         if self.exposures is not None:
-            self.exposures.load_state(select_prefix(moved, "exposure."))
-        self.zero_masks = select_prefix(moved, "zeros.")
+            self.exposures.load_state(select_state_tensors(moved, "exposure."))
+        self.zero_masks = select_state_tensors(moved, "zeros.")
         self.order = tensors["order"].clone()
         self.generator.set_state(tensors["generator"])
         self.step, self.elapsed = header["step"], float(header["elapsed"])

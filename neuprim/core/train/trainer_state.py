@@ -14,13 +14,13 @@ from neuprim.core.data import ViewSet
 from neuprim.core.errors import CheckpointError
 
 
-def hash_names(views: ViewSet) -> str:
+def hash_view_names(views: ViewSet) -> str:
     """Hash the names of views: other frames or images of the same number are other data."""
     text = "\n".join(views.view(i).name for i in range(len(views)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def select_prefix(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
+def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Tensors whose names begin with a prefix, without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 

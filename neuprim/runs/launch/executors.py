@@ -195,7 +195,7 @@ class RayExecutor:
             self._call = ray.remote(WorkerTask.__call__).options(**options, max_retries=0)
         except (ValueError, TypeError) as error:
             self.close(True)
-            raise ConfigError(f"launcher.options: Ray refuses them: {_join_lines(error)}") from None
+            raise ConfigError(f"launcher.options: Ray refuses them: {_error_line(error)}") from None
         except ConfigError:
             self.close(True)
             raise
@@ -213,9 +213,9 @@ class RayExecutor:
             result: JobResult = self._ray.get(handle)
             return result
         except self._ray.exceptions.RayTaskError as error:  # the worker lacks a package; a job's errors are results
-            return JobResult("failed", line=f"the worker cannot do it: {_join_lines(error.cause)}", trace=str(error))
+            return JobResult("failed", line=f"the worker cannot do it: {_error_line(error.cause)}", trace=str(error))
         except self._ray.exceptions.RayError as error:
-            raise WorkerDied(_join_lines(error)) from None
+            raise WorkerDied(_error_line(error)) from None
 
     def cancel(self, handle: Any) -> None:
         self._ray.cancel(handle, force=False)
@@ -236,7 +236,7 @@ def _connect_to_ray(ray: Any, address: str) -> None:
     try:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **options)
     except (ValueError, ConnectionError, RuntimeError, SystemExit) as error:
-        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_join_lines(error)})") from None
+        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_error_line(error)})") from None
 
 
 def _check_ray_address(address: str) -> None:
@@ -310,9 +310,9 @@ class SlurmExecutor:
             with suppress(OSError):  # it has other files
                 folder.rmdir()
             if not isinstance(error, RuntimeError):
-                raise ConfigError(f"launcher.options: submitit refuses them: {_join_lines(error)}") from None
+                raise ConfigError(f"launcher.options: submitit refuses them: {_error_line(error)}") from None
             raise BackendUnavailable(
-                f"launcher=slurm: {_join_lines(error)}; launcher.address=local does without a cluster"
+                f"launcher=slurm: {_error_line(error)}; launcher.address=local does without a cluster"
             ) from None
 
     def submit(self, task: WorkerTask) -> Any:
@@ -348,5 +348,5 @@ class SlurmExecutor:
             shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def _join_lines(error: BaseException) -> str:
+def _error_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__

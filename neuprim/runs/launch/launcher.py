@@ -186,15 +186,15 @@ class _JobLoop:
                         number, task = self._waiting.popleft()
                         task.status.unlink(missing_ok=True)
                         self._running[number] = self._executor.submit(task), task
-                        self._notify(number, JobStatus("starting", attempt=task.attempt))
+                        self._notify_status(number, JobStatus("starting", attempt=task.attempt))
                     for number, (handle, task) in list(self._running.items()):
                         if self._executor.done(handle):
                             del self._running[number]
-                            self._finish(number, handle, task)
+                            self._finish_job(number, handle, task)
                             continue
                         status = read_status(task.status)
                         if status and status.attempt >= task.attempt and status != self._statuses[number]:
-                            self._notify(number, status)
+                            self._notify_status(number, status)
                     time.sleep(_INTERVAL)
             finished = True
         finally:
@@ -215,7 +215,7 @@ class _JobLoop:
             if not task.status.exists():  # it waits in the executor's queue
                 self._executor.cancel(handle)
 
-    def _finish(self, number: int, handle: Any, task: WorkerTask) -> None:
+    def _finish_job(self, number: int, handle: Any, task: WorkerTask) -> None:
         try:
             result = self._executor.result(handle)
         except WorkerDied as death:
@@ -223,7 +223,7 @@ class _JobLoop:
             if self._stop.exists():
                 result = JobResult("interrupted", attempts=attempts)
             elif task.attempt < self._retries:
-                self._notify(number, JobStatus("waiting", "its worker died", attempt=attempts))
+                self._notify_status(number, JobStatus("waiting", "its worker died", attempt=attempts))
                 self._waiting.appendleft((number, task.retry()))
                 return
             else:
@@ -233,8 +233,8 @@ class _JobLoop:
         if self._stop_at_failure and result.state == "failed" and not self._stop.exists():
             self._stop_all()
         self._on_result(number, result)
-        self._notify(number, (read_status(task.status) or JobStatus()).end(result))
+        self._notify_status(number, (read_status(task.status) or JobStatus()).end(result))
 
-    def _notify(self, number: int, status: JobStatus) -> None:
+    def _notify_status(self, number: int, status: JobStatus) -> None:
         self._statuses[number] = status
         self._on_status(number, status)

@@ -24,7 +24,7 @@ from neuprim.core.task import Loss
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
-from neuprim.core.train.trainer_state import hash_names
+from neuprim.core.train.trainer_state import hash_view_names
 
 _ALIGNMENT = 16
 """Numbers; tensors start at multiples of 64 bytes, which vector units read at once."""
@@ -92,7 +92,7 @@ class DistributedTrainer(Trainer):
         settings = hashlib.sha256(repr((self.settings, self.renderer)).encode())
         facts = {
             "steps done": self.step,
-            "training views": f"{len(views)} ({hash_names(views)})",
+            "training views": f"{len(views)} ({hash_view_names(views)})",
             "pixels of the first view": hashlib.sha256(views.pixels(0).rgb.numpy().tobytes()).hexdigest()[:16],
             "settings": settings.hexdigest()[:16],
             "state": digest.hexdigest()[:16],

@@ -177,9 +177,9 @@ class ProcessGroup:
         try:
             yield
         except RuntimeError as error:  # a closed connection, or a timeout
-            raise self.explain(error) from error
+            raise self.explain_broken_connection(error) from error
 
-    def explain(self, error: Exception) -> RankError:
+    def explain_broken_connection(self, error: Exception) -> RankError:
         """The reason for a broken connection: the recorded failure of another rank, or that one ended without a
         word."""
         try:

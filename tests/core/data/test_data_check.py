@@ -1,5 +1,4 @@
-"""What a data set promises: every broken promise is one line that names view, member, what was found and what was
-expected."""
+"""What a data set promises, and training views that judge: a broken promise is one line that names the member."""
 
 from __future__ import annotations
 
@@ -14,7 +13,9 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import PointCloud, PointSamples
+from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import DatasetError, check_dataset, check_points, check_samples
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.train.initial_model import initial_model
@@ -193,3 +194,29 @@ def test_points_to_learn_from(text: str) -> None:
     with pytest.raises(DatasetError) as caught:
         check_samples(replace(good, **SAMPLES[text]), tiny.two_primitives())
     assert str(caught.value) == f"two: points of f: {text}"
+
+
+def names(views: tiny.Views) -> list[str]:
+    return [views.view(i).name for i in range(len(views))]
+
+
+def test_one_of_each_group_takes_the_place_of_the_test_views() -> None:
+    dataset = tiny.two_primitives()
+    found = hold_out_views(dataset, 3)
+    assert names(found.test) == ["v0", "v4"] and names(found.train) == ["v1", "v2", "v3", "v5"]  # type: ignore[arg-type]
+    assert found.test.pixels(1) is dataset.train.pixels(4) and found.name == dataset.name and len(dataset.train) == 6
+
+
+def test_no_moment_of_a_film_is_held_out_of_every_camera() -> None:
+    frames = 8
+    dataset = tiny.two_primitives(views=lambda count, start: tiny.Views(2 * frames, start))
+    moments = {int(name[1:]) % frames for name in names(hold_out_views(dataset, frames).test)}  # type: ignore[arg-type]
+    assert moments == {0, 1}
+
+
+def test_what_cannot_be_held_out_is_refused() -> None:
+    dataset = tiny.two_primitives()
+    with pytest.raises(ConfigError, match=r"every 1\. of 6 training views"):
+        hold_out_views(dataset, 1)
+    with pytest.raises(ConfigError, match="of 1 training views held out; expected 2"):
+        hold_out_views(replace(dataset, train=tiny.Views(1, 0.0)), 2)

@@ -1,17 +1,20 @@
-"""Shadows as layers, against every chord by brute force."""
+"""Shadows as layers against every chord by brute force; depth images read alike by the kernel and by torch."""
 
 from __future__ import annotations
 
+import numpy as np
+import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.fields import RayNet
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.draw import unproject_depth
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
-from neuprim.tasks.relight.visibility import light_visibility
+from neuprim.tasks.relight.visibility import _visibility_kernel, light_visibility, sample_visibility
 from tests import scenes
 from tests.chords import chords
 from tests.lit_models import light, model
@@ -59,3 +62,36 @@ def test_shadows_of_pixels_multiply() -> None:
     V = light_visibility(one.lowered.geometry, one.lowered.density, one.conditions["light"], EXACT)
     expected = V(unproject_depth(one.drawn.depth, CAMERA).reshape(-1, 3)).reshape(visibility.shape)
     assert (visibility - torch.where(one.drawn.alpha > 0, expected, 0.0)).abs().max() < 1e-6
+
+
+SIZE, NEAR, FOCAL = 24, 0.05, 20.0
+
+
+def light_camera() -> Camera:
+    eye, up = torch.tensor([1.0, 2.0, -4.0], dtype=torch.float64), torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)
+    return Camera(look_at(eye, torch.zeros(3, dtype=torch.float64), up), 50.0, 50.0, 8.0, 8.0, 16, 16)
+
+
+@pytest.mark.parametrize("slabs", [1, 4])
+def test_both_read_the_same(slabs: int) -> None:
+    """Points anywhere: inside the images, across their borders, behind the camera and at its centre; and not finite."""
+    generator = torch.Generator().manual_seed(slabs)
+    alphas = torch.rand(slabs, SIZE, SIZE, generator=generator)
+    alphas[torch.rand(alphas.shape, generator=generator) < 0.4] = 0.0
+    depths = torch.where(alphas > 0, 0.01 + 4 * torch.rand(alphas.shape, generator=generator), 0.0)
+    view = light_camera().viewmat[:3].contiguous()
+    points = 6 * torch.rand(5000, 3, generator=generator, dtype=torch.float64) - 3
+    points[:50] = light_camera().position + 1e-3 * points[:50]
+    points[50] = light_camera().position
+    points[51:54] = torch.tensor([[torch.nan, 0, 0], [torch.inf, 0, 0], [0, 0, -torch.inf]])
+    edge = torch.rand(200, 3, generator=generator, dtype=torch.float64)  # about the border of the images
+    side = torch.where(edge[:, 0] < 0.5, -1.0, 1.0) * (SIZE / 2 + (edge[:, 1] - 0.5) * 3) / FOCAL
+    local = torch.stack([side, 0.4 * (edge[:, 2] - 0.5), torch.ones(200, dtype=torch.float64)], -1) * 3
+    points = torch.cat([points, (local - view[:, 3]) @ view[:, :3]])
+    found = np.full(len(points), -1.0, np.float32)
+    images = (alphas.numpy(), depths.numpy())
+    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, 0.2, 0.3, found)
+    wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, 0.2, 0.3)
+    assert wanted.dtype == torch.float32 and torch.allclose(torch.from_numpy(found), wanted, rtol=0, atol=5e-7)
+    assert 0.1 < float((wanted < 0.99).float().mean()) and float(wanted.min()) < 0.3
+    assert found[50:54].tolist() == wanted[50:54].tolist() == [1.0] * 4

@@ -104,29 +104,19 @@ def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path
 
 @dataclass(frozen=True)
 class ImageSet(Generic[V]):
-    """The images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view.
-
-    Attributes:
-        key: hash of everything the files depend on.
-        size: width and height in pixels, for messages.
-        splits: views of each split, in order.
-        lens: fields of a transforms file before its frames.
-        frame: (split, view) -> entry in the transforms file.
-        files: view -> names of its files in the folder of its split.
-        draw: (scene, view, paths) writes these files; called from several threads.
-        facts: scene -> further fields of a transforms file.
-    """
+    """The images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view."""
 
     name: str
-    key: str
-    size: int
-    splits: Mapping[str, Sequence[V]]
-    lens: Mapping[str, float]
+    key: str  # hash of everything the files depend on
+    size: int  # width and height in pixels, for messages
+    splits: Mapping[str, Sequence[V]]  # views of each split, in order
+    lens: Mapping[str, float]  # fields of a transforms file before its frames
     build: Callable[[], Scene]
-    frame: Callable[[str, V], Mapping[str, Any]]
-    files: Callable[[V], Sequence[str]]
+    frame: Callable[[str, V], Mapping[str, Any]]  # (split, view) -> entry in the transforms file
+    files: Callable[[V], Sequence[str]]  # view -> names of its files in the folder of its split
+    # (scene, view, paths) writes these files; called from several threads
     draw: Callable[[Any, V, Sequence[Path]], None]
-    facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}
+    facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}  # scene -> further fields of a transforms file
 
     def generate(self, cache_dir: Path, progress: Progress) -> Path:
         """Write the data set unless it is complete; return its folder ``cache_dir/NAME-KEY``."""

@@ -243,9 +243,9 @@ def shade_point_light(
 ) -> ShadedRays:
     """Cast N rays and shade them under one point light at ``light`` (3,).
 
-    Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. Classes: attached shadow, where
-    the surface or its shading normal faces away; cast shadow, where something lies between; highlight, where it is
-    brighter than the diffuse part and :data:`_BRIGHT`; lit otherwise.
+    Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. A highlight is brighter than
+    the
+    diffuse part and :data:`_BRIGHT`; attached shadow faces away; in cast shadow something lies between.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)

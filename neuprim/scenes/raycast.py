@@ -24,32 +24,23 @@ _DEPTH = 64  # of the traversal's stack; median splits of 2^31 triangles need 32
 
 @dataclass(frozen=True)
 class Hits:
-    """Hits of N rays. Only ``hit`` has a row per ray; the others have one per hit, M in all, in order.
+    """Hits of N rays. Only ``hit`` has a row per ray; the others have one per hit, M in all, in order."""
 
-    Attributes:
-        hit: (N,) bool.
-        position: (M, 3) float32, scene units.
-        distance: (M,) float32, in lengths of the ray direction.
-        normal, face: (M, 3) float32 unit normals: for shading, and of the triangle.
-        albedo: (M, 3) float32 linear RGB.
-        gloss, specular: (M,) float32, see :class:`~neuprim.scenes.shapes.Solid`.
-        solid, triangle: (M,) indices of the solid, and among the faces of all solids.
-        weight: (M, 3) float32 barycentric coordinates.
-        emission: (M, 3) float32 linear RGB of emitted light, if any.
-    """
-
-    hit: NDArray[np.bool_]
-    position: NDArray[np.float32]
-    distance: NDArray[np.float32]
+    hit: NDArray[np.bool_]  # (N,) bool
+    position: NDArray[np.float32]  # (M, 3) float32, scene units
+    distance: NDArray[np.float32]  # (M,) float32, in lengths of the ray direction
+    # normal, face: (M, 3) float32 unit normals: for shading, and of the triangle
     normal: NDArray[np.float32]
     face: NDArray[np.float32]
-    albedo: NDArray[np.float32]
+    albedo: NDArray[np.float32]  # (M, 3) float32 linear RGB
+    # gloss, specular: (M,) float32, see :class:`~neuprim.scenes.shapes.Solid`
     gloss: NDArray[np.float32]
     specular: NDArray[np.float32]
+    # solid, triangle: (M,) indices of the solid, and among the faces of all solids
     solid: NDArray[np.intp]
     triangle: NDArray[np.integer]
-    weight: NDArray[np.float32]
-    emission: NDArray[np.float32] | None = None
+    weight: NDArray[np.float32]  # (M, 3) float32 barycentric coordinates
+    emission: NDArray[np.float32] | None = None  # (M, 3) float32 linear RGB of emitted light, if any
 
     def lifted(self) -> NDArray[np.float32]:
         """(M, 3) positions just off the surface, where shadow rays start."""

@@ -258,30 +258,24 @@ def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class ReconstructedPoints(NamedTuple):
-    """N points.
+    """N points."""
 
-    Attributes:
-        surface, position: (N, 3) float64 where they really are, and where they are said to be.
-        rgb: (N, 3) uint8 sRGB of the surface as its camera sees it, without the photograph's own exposure.
-        camera: (N,) index of the training camera that found them.
-    """
-
+    # surface, position: (N, 3) float64 where they really are, and where they are said to be
     surface: NDArray[np.float64]
     position: NDArray[np.float64]
+    # (N, 3) uint8 sRGB of the surface as its camera sees it, without the photograph's own exposure
     rgb: NDArray[np.uint8]
-    camera: NDArray[np.intp]
+    camera: NDArray[np.intp]  # (N,) index of the training camera that found them
 
 
 def reconstruct_points(
     room: Room, lens: Lens, poses: Sequence[NDArray[np.float64]], luma: Callable[[int], NDArray[np.float32]], count: int
 ) -> ReconstructedPoints:
-    """``count`` points, each seen by the camera that found it and at least one other.
+    """Return ``count`` points, each seen by the training camera that found it and at least one other.
 
-    Raises ConfigError: the cameras have too little in view together.
-
-    Args:
-        poses: (4, 4) camera to world, OpenGL axes, of the training cameras.
-        luma: camera -> (H, W) brightness of its photograph, in which detail is looked for.
+    ``poses`` (4, 4) are camera to world; detail is looked for in ``luma``: camera -> (H, W) brightness. Raises
+    ConfigError
+    if the cameras have too little in view together.
     """
     chances = [_pixel_detail_chances(luma(i)) for i in range(len(poses))]
     directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)

@@ -18,16 +18,11 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Daylight:
-    """Sun and sky.
+    """Sun and sky."""
 
-    Attributes:
-        direction: (3,) towards the sun; any length.
-        sun: linear RGB irradiance of a surface facing it.
-        sky, ground: linear RGB radiance from straight above and straight below, blended in between.
-    """
-
-    direction: tuple[float, float, float] = (0.42, -0.62, 0.92)
-    sun: Colour = (2.3, 2.2, 2.0)
+    direction: tuple[float, float, float] = (0.42, -0.62, 0.92)  # (3,) towards the sun; any length
+    sun: Colour = (2.3, 2.2, 2.0)  # linear RGB irradiance of a surface facing it
+    # sky, ground: linear RGB radiance from straight above and straight below, blended in between
     sky: Colour = (0.42, 0.46, 0.53)
     ground: Colour = (0.22, 0.2, 0.18)
 

@@ -85,13 +85,10 @@ def arc_tube(
     radii: ArrayLike,
     sections: int = 64,
 ) -> trimesh.Trimesh:
-    """A tube swept along a circular arc.
+    """Sweep a tube along a circular arc of the plane of ``first`` (angle 0) and ``second``, at (n,) ascending
+    ``angles``.
 
-    Args:
-        first, second: orthonormal axes of the circle's plane; angle 0 lies on ``first``, 90 degrees on ``second``.
-        angles: (n,) ascending, in radians.
-        radii: (n, 2) half axes of the elliptic cross-section, in the arc's plane and across it; (n,) or a number for a
-            round one.
+    ``radii`` are (n, 2) half axes in the arc's plane and across it; (n,) or a number for a round cross-section.
     """
     one, two = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     outward = np.cos(angles)[:, None] * one + np.sin(angles)[:, None] * two
@@ -151,21 +148,14 @@ def corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Solid:
-    """One closed body.
-
-    Attributes:
-        mesh: watertight, scene units.
-        albedo: diffuse reflectance as a function of position.
-        gloss: 0 (matt) to 1 (polished); see :mod:`neuprim.scenes.shading`.
-        specular: strength of the highlight of a polished solid.
-        normals: (F, 3, 3) unit normals at the faces' corners; None: :func:`corner_normals`.
-    """
+    """One closed body."""
 
     name: str
-    mesh: trimesh.Trimesh
-    albedo: Albedo
-    gloss: float
-    specular: float = 0.12
+    mesh: trimesh.Trimesh  # watertight, scene units
+    albedo: Albedo  # diffuse reflectance as a function of position
+    gloss: float  # 0 (matt) to 1 (polished); see :mod:`neuprim.scenes.shading`
+    specular: float = 0.12  # strength of the highlight of a polished solid
+    # (F, 3, 3) unit normals at the faces' corners; None: :func:`corner_normals`
     normals: NDArray[np.float64] | None = None
 
 

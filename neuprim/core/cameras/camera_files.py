@@ -36,17 +36,12 @@ _VIEWER_NOTE = (
 
 
 def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
-    """Read the cameras of a file or folder, whose format follows from its content.
+    """Read the cameras of JSON files (``frames``, or ``camera_path`` of nerfstudio's viewer), USD stages and COLMAP
+    models.
 
-    * JSON with ``frames``, or with ``camera_path`` as nerfstudio's viewer writes it;
-    * .usd, .usda, .usdc, .usdz (:mod:`~neuprim.core.cameras.usd`); ``FILE#/PRIM`` chooses one of several cameras;
-    * a COLMAP model: its folder, one of its files, or a project (:mod:`~neuprim.core.cameras.colmap`).
-
-    Raises DataError: names the file and the field that is missing or wrong; BackendUnavailable: the package that reads
-    the format is missing.
-
-    Args:
-        size: (width, height) where the file names none.
+    ``FILE#/PRIM`` chooses one camera of a stage; ``size`` is (width, height) where the file names none. Raises
+    DataError
+    for a missing or wrong field, and BackendUnavailable if the package that reads the format is missing.
     """
     text, hash_, prim = str(path).partition("#")
     path, prim = (Path(text), prim) if hash_ and not path.exists() else (path, "")
@@ -133,11 +128,7 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
 
 
 def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read a path of nerfstudio's viewer.
-
-    ``{"render_width", "render_height", "fps", "seconds", "camera_path": [{"camera_to_world": 16 numbers, "fov"}]}``:
-    ``fov`` is vertical, in degrees, and axes are OpenGL's.
-    """
+    """Read a path of nerfstudio's viewer, whose ``fov`` is vertical, in degrees; axes are OpenGL's."""
     if document.values.get("camera_type", "perspective") != "perspective":
         raise document.fail("camera_type", "perspective; others are not drawn")
     records = _camera_records(document, "camera_path")

@@ -88,14 +88,10 @@ def _record_with_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReade
 def read_camera(
     frame: JsonReader, file: JsonReader, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
 ) -> Camera:
-    """Read the pinhole of a frame.
+    """Read the pinhole of a frame; the ``file`` provides what the frame leaves out.
 
-    Raises DataError: missing or wrong fields, or fields that contradict each other or the image.
-
-    Args:
-        file: fields of the file, for what the frame leaves out.
-        viewmat: (4, 4) world to camera, OpenCV axes; None reads ``transform_matrix`` (camera to world, OpenGL axes).
-        say: receives lines for the user.
+    ``viewmat`` (4, 4) is world to camera, OpenCV axes; None reads ``transform_matrix``. ``say`` receives lines for the
+    user. Raises DataError for missing or wrong fields, or fields that contradict each other or the image.
     """
     of_file = _KeySource(file, _stated_image_size(file, target.size))
     of_frame = _KeySource(frame, _stated_image_size(frame, of_file.size))

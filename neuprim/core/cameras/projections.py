@@ -18,13 +18,10 @@ _UNIT = 1e-6  # how far from 1 a direction's length may be: float32 rounding pas
 class RayCamera:
     """A view whose rays all leave one point, each in its own direction, backwards (z < 0) too.
 
-    There is no camera-z plane that all rays cross, so distances take its place: ``RenderSettings.near`` is a distance
-    along the ray, depth images hold the distance of the chord middles, and primitives are sorted by the distance of
-    their centres from the camera. Images therefore differ from a pinhole's where a near plane cuts chords or where the
-    two orders disagree. Only the reference backend draws these cameras; gradients reach ``viewmat`` and ``directions``.
-
-    A zero vector marks a pixel that has no ray (outside a fisheye's image circle) and shows the background. Raises
-    DataError: a matrix that is no rigid transform, or directions of another shape or not of unit length.
+    Distances along the ray take the place of depths: for ``near``, depth images and the order of primitives. Images
+    therefore differ from a pinhole's where a near plane cuts chords. Only the reference backend draws these cameras.
+    A zero vector marks a pixel without a ray. Raises DataError for no rigid transform, or directions not of unit
+    length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes
@@ -57,11 +54,9 @@ class RayCamera:
 
     @classmethod
     def fisheye(cls, width: int, height: int, viewmat: Tensor, fov_degrees: float = 180.0) -> RayCamera:
-        """An equidistant fisheye: the angle to the axis is proportional to the distance from the image centre.
+        """Make an equidistant fisheye, whose ``fov_degrees``, at most 360, span the shorter side.
 
-        ``fov_degrees``, at most 360, spans the shorter side. Pixels towards the corners go on by the same law up to 180
-        degrees off the axis, straight backwards; beyond that they have no ray. Raises DataError: impossible size or
-        field of view.
+        Pixels beyond 180 degrees off the axis have no ray. Raises DataError for an impossible size or field of view.
         """
         _check_image_size("fisheye", width, height)
         if not 0.0 < fov_degrees <= 360.0:
@@ -77,11 +72,7 @@ class RayCamera:
 
     @classmethod
     def equirectangular(cls, width: int, height: int, viewmat: Tensor) -> RayCamera:
-        """A full panorama: columns are longitudes -180..180 degrees, rows latitudes from 90 (up, -y) to -90 degrees.
-
-        The image centre looks along +z, its right half to +x. Pixels are square at the equator if ``width`` is twice
-        ``height``. Raises DataError for an impossible size.
-        """
+        """Make a full panorama: columns are longitudes -180..180 degrees, rows latitudes from 90 (up, -y) to -90."""
         _check_image_size("equirectangular", width, height)
         y, x = _pixel_centre_grid(width, height)
         longitude, latitude = (x / width - 0.5) * (2 * math.pi), (0.5 - y / height) * math.pi

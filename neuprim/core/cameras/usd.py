@@ -40,16 +40,11 @@ def is_usd(path: Path) -> bool:
 
 
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
-    """The camera of a stage, at every whole time code of its range where it moves.
+    """Read the camera of a stage (``prim``, where there are several), at every whole time code where it moves.
 
-    Axes and units are those of the stage. The image shows the whole aperture: where its shape differs, it shows more on
-    two sides ("expandAperture" of UsdRender). Lens distortion, depth of field and exposure are not read. Raises
-    BackendUnavailable: the package is missing; DataError: a file that cannot be read, no or several cameras, an
-    orthographic, sheared or mirrored one, no size.
-
-    Args:
-        prim: path of the camera in a stage with several.
-        size: (width, height) in pixels; None for that of the stage's render settings.
+    Axes and units are the stage's; ``size`` is in pixels, None for the stage's own. The image shows the whole aperture
+    ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic or sheared cameras, or no
+    size.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")

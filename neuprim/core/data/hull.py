@@ -51,13 +51,8 @@ def hull_surface(
 ) -> tuple[Tensor, float]:
     """Return centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
 
-    Args:
-        resolution: voxels along the longest side of the hull.
-        seen_views: share of the views that must look at a voxel.
-        wrong_views: share of the views that may show no matter there.
-        matter: alpha above which a pixel shows matter.
-
-    Raises EmptyHull if no voxel is left.
+    ``resolution`` is in voxels along the hull's longest side. At least the share ``seen_views`` of the views looks at a
+    voxel, and at most ``wrong_views`` show no ``matter`` (alpha) there. Raises EmptyHull if no voxel is left.
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]

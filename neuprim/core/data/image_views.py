@@ -120,11 +120,8 @@ def _premultiply_pixels(rgba: Tensor) -> tuple[Tensor, Tensor]:
 class ImageViews(ViewSet):
     """One split of image files, cached as uint8 (PNG, JPEG) or half (OpenEXR) up to ``cache_bytes``. Thread-safe.
 
-    Args:
-        frames: of one split; sizes may differ.
-        downsample: integer factor; remainders at the right and bottom edges are cut off.
-        to_linear: convert sRGB files to linear light before premultiplying and averaging.
-
+    Images are reduced by ``downsample``, cutting remainders off; ``to_linear`` converts sRGB files to linear light
+    first.
     Raises ConfigError if an image is smaller than the factor.
     """
 

@@ -31,17 +31,12 @@ _COARSE = 1e-3  # of the size of the cloud: what coordinates may be rounded to w
 
 
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
-    """The vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
+    """Read the vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
-    Properties ``x y z`` are required. Colours come from ``f_dc_0..2`` or from ``red green blue`` (integers, or floats
-    0..1), both taken for sRGB; points without are mid-grey. ``scale_0..2`` (logarithms of standard deviations) with
-    ``rot_0..3`` (wxyz) make Gaussians of them, and ``opacity`` (a logit, infinite for 0 and 1) says how opaque they
-    are. ``scale_0..1`` alone are the discs of 2D Gaussian splatting, ``scale_0`` alone are balls. All else is ignored,
-    view-dependent colour too. Colours get the data set's ``channels`` and ``color_space`` ("srgb" or "linear").
-
-    A vertex that stands for no point is left out, and all such are counted in one warning: a NaN among what is read, a
-    size or rotation that is none, a place far from all others. Raises DataError: a damaged or compressed file, or one
-    without usable points.
+    Colours (``f_dc_0..2``, or ``red green blue``) are taken for sRGB, and become ``channels`` in ``color_space``.
+    ``scale_0..2`` with ``rot_0..3`` (wxyz) and ``opacity`` (a logit) make Gaussians; two scales are discs, one a ball.
+    Vertices that stand for no point are left out with a warning. Raises DataError for a damaged or compressed file,
+    or one without usable points.
     """
     if path.suffix.lower() in COMPRESSED:
         raise _compressed_points_error(path, f"{path.suffix} is a compressed format of Gaussians")

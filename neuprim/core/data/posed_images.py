@@ -32,22 +32,15 @@ SplitName = Annotated[str, nonempty_text("the name in transforms_NAME.json")]
 
 @dataclass(frozen=True)
 class FolderSettings:
-    """Settings that all loaders of folders with posed images share.
+    """Settings that all loaders of folders with posed images share."""
 
-    Attributes:
-        path: folder of the data set, ``~`` allowed.
-        background: "auto" (white for data with alpha, else black), "white", "black", or "random" (random while
-            training, white for evaluation).
-        downsample: integer factor, area filter on premultiplied values.
-        preload: decode all images at once, so that damaged files are found before training.
-        strict: refuse a damaged view; otherwise it is left out with a warning.
-    """
-
-    path: Annotated[Path, nonempty_text("the data set's folder")]
+    path: Annotated[Path, nonempty_text("the data set's folder")]  # folder of the data set, ``~`` allowed
+    # "auto" (white for data with alpha, else black), "white", "black", or "random" (random while training, white for
+    # evaluation)
     background: Background = "auto"
-    downsample: Annotated[int, Range(at_least=1)] = 1
-    preload: bool = True
-    strict: bool = False
+    downsample: Annotated[int, Range(at_least=1)] = 1  # integer factor, area filter on premultiplied values
+    preload: bool = True  # decode all images at once, so that damaged files are found before training
+    strict: bool = False  # refuse a damaged view; otherwise it is left out with a warning
 
     def __post_init__(self) -> None:
         validate_fields(self, "scene")

@@ -72,13 +72,9 @@ def read_transforms_frames(
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """Read the good frames whose images exist, with their records, in the order of ``records``.
 
-    Raises DataError: missing images or masks, wrong, missing, contradictory or unsupported fields, most views bad, or
-    any bad view with ``settings.strict``.
-
-    Args:
-        folder: root of the paths of images and masks.
-        document: the whole file, which provides what frames leave out.
-        skip_missing: leave frames without an image out, unless that leaves none.
+    ``document`` is the whole file, which provides what frames leave out; paths start at ``folder``. ``skip_missing``
+    leaves frames without an image out, unless that leaves none. Raises DataError for missing images or masks, wrong,
+    contradictory or unsupported fields, most views bad, or any bad view with ``settings.strict``.
     """
     for record in (document, *records):
         refuse_unsupported_keys(record)

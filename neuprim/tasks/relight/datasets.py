@@ -1,23 +1,11 @@
 """Load relighting data: one light at a time in the layout of GS³ and NRHints, and the generated ``lit_solids``.
 
-In the file or in a frame, which wins:
-
-* ``camera_intrinsics``: [cx, cy, fx, fy] in pixels, in this order; or ``camera_angle_x``, the horizontal field of view
-  in radians; or any other keys of :mod:`neuprim.core.cameras.intrinsics`.
-* ``pl_intensity``: three numbers or one; default 1. (GS³ does not read it.)
-* ``camera_near``, ``camera_far``: default 3 and 10 as in NRHints. Checked, but nothing depends on them.
-
-Per frame:
-
-* ``img_path``: the image with its suffix. GS³ saves paths of the machine it ran on, so the longest tail of the path
-  that exists in the data set's folder counts.
-* ``file_path``, where no ``img_path`` exists, followed by ``file_ext`` or any known suffix.
-* ``pl_pos``: the point light, world; required.
-* ``transform_matrix``: camera to world, OpenGL axes.
-* ``R_opt`` (3, 3), ``T_opt`` (3,): an optimised pose that GS³ writes and reads *instead of* ``transform_matrix``: the
-  world-to-camera matrix with OpenCV axes is [R_opt^T | T_opt].
-
-PNG and JPEG hold sRGB with straight alpha and become linear light; OpenEXR is linear and premultiplied.
+Of ``transforms_SPLIT.json`` are read, in a frame or else in the file: the intrinsics of
+:mod:`neuprim.core.cameras.intrinsics`, ``pl_intensity`` (three numbers or one, default 1), and ``camera_near`` and
+``camera_far``, which are only checked. Per frame: ``pl_pos``, the light's position; ``img_path``, of which the longest
+tail that exists counts, as GS³ saves paths of its machine, else ``file_path`` with ``file_ext``; and a pose, where
+[R_opt^T | T_opt], world to camera with OpenCV axes, wins over ``transform_matrix``. PNG and JPEG hold sRGB with
+straight alpha and become linear light; OpenEXR is linear and premultiplied.
 """
 
 from __future__ import annotations
@@ -62,23 +50,19 @@ _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_inte
 
 @dataclass(frozen=True)
 class OlatSettings(FolderSettings):
-    """Settings of ``scene=olat``.
-
-    Attributes:
-        train_split, test_split: names in transforms_NAME.json.
-        hold_out: n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split.
-        falloff: "inverse_square" where the light weakens with the square of its distance.
-        exposure: images are divided by this; "auto": by the 99.5th percentile of the training images.
-        ignore_corrections: poses are transform_matrix, even where a frame has the optimised R_opt and T_opt.
-    """
+    """Settings of ``scene=olat``."""
 
     background: Background = "black"
+    # train_split, test_split: names in transforms_NAME.json
     train_split: SplitName = "train"
     test_split: SplitName = "test"
+    # n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split
     hold_out: HoldOut = 0
+    # "inverse_square" where the light weakens with the square of its distance
     falloff: Literal["none", "inverse_square"] = "none"
+    # images are divided by this; "auto": by the 99.5th percentile of the training images
     exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
-    ignore_corrections: bool = False
+    ignore_corrections: bool = False  # poses are transform_matrix, even where a frame has the optimised R_opt and T_opt
 
 
 def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:

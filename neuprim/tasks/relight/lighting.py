@@ -33,24 +33,20 @@ _MAX_DIRECTIONS = 256  # of training lights in a model's header
 
 @dataclass(frozen=True)
 class Lighting:
-    """Optional facts about a relighting dataset besides images, cameras and lights: its ``extra``.
+    """Optional facts about a relighting dataset besides images, cameras and lights: its ``extra``."""
 
-    Attributes:
-        falloff: "inverse_square" if images darken with the square of the light's distance, so that a renderer divides
-            by it; "none" if intensities are given as they arrive, or unknown.
-        classes: index of a test view -> (H, W) uint8 pixel classes, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`;
-            errors are then reported per class.
-        parts: prefixes of names of test views that get scores of their own, e.g. those with a new light.
-        baselines: name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image
-            without a model; a black one is always included.
-        clips: films besides the test views.
-    """
-
+    # "inverse_square" if images darken with the square of the light's distance, so that a renderer divides by it;
+    # "none" if intensities are given as they arrive, or unknown
     falloff: Falloff = "none"
+    # index of a test view -> (H, W) uint8 pixel classes, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`; errors are
+    # then reported per class
     classes: Callable[[int], Tensor] | None = None
+    # prefixes of names of test views that get scores of their own, e.g. those with a new light
     parts: tuple[str, ...] = ()
+    # name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image without a
+    # model; a black one is always included
     baselines: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
-    clips: tuple[Clip, ...] = ()
+    clips: tuple[Clip, ...] = ()  # films besides the test views
 
 
 def dataset_lighting(dataset: Dataset) -> Lighting:
@@ -163,18 +159,10 @@ def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: flo
 def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
     """Approximate an environment by point lights like those of the training; a black one gives one of intensity 0.
 
-    Each direction becomes a point light at the training lights' mean distance r from the scene's centre, of the
-    intensity that gives the centre the environment's irradiance E = radiance x solid angle:
-
-        falloff inverse_square:  I = exposure E r^2    the model draws I/distance^2 over the exposure
-        falloff none:            I = exposure E / pi   an intensity of 1 gives a white matt surface the value 1
-
-    In both, a uniform environment of radiance 1 gives an unshaded white matt surface the value 1. Light from a finite
-    distance is not parallel: away from the centre it differs from that of a distant environment by about 2 offset/r.
-    Raises DataError: facts that are missing or damaged.
-
-    Args:
-        facts: of the dataset, from the model's header.
+    Each direction becomes a light at the training lights' mean distance r, of the intensity that gives the centre the
+    environment's irradiance E: exposure E r^2 with falloff inverse_square (the model draws I/distance^2 over the
+    exposure), else exposure E / pi. Away from the centre light differs from parallel light by about 2 offset/r.
+    ``facts`` are the dataset's, of the model's header; raises DataError if they are damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
     center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))

@@ -60,15 +60,12 @@ from neuprim.scenes.solids import SolidsSettings, generate_solids
 
 @dataclass(frozen=True)
 class BlenderSettings(FolderSettings):
-    """Settings of ``scene=blender``.
+    """Settings of ``scene=blender``."""
 
-    Attributes:
-        train_split, test_split: NAME in transforms_NAME.json.
-        hold_out: n: every n-th training view is the test split, and the real one stays unread; 0 for the real one.
-    """
-
+    # train_split, test_split: NAME in transforms_NAME.json
     train_split: SplitName = "train"
     test_split: SplitName = "test"
+    # n: every n-th training view is the test split, and the real one stays unread; 0 for the real one
     hold_out: HoldOut = 0
 
 
@@ -123,19 +120,14 @@ def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Datas
 
 @dataclass(frozen=True)
 class ColmapSettings(FolderSettings):
-    """Settings of ``scene=colmap``.
+    """Settings of ``scene=colmap``."""
 
-    Attributes:
-        images: folder of the images; of reduced copies (``images_4``) the cameras are scaled to the files.
-        model: folder of the reconstruction; "auto" for the model in ``sparse`` with most posed images.
-        test_every: every n-th image by name, from the first, is a test view.
-        skip_missing: leave out images that are missing; otherwise they are an error.
-    """
-
+    # folder of the images; of reduced copies (``images_4``) the cameras are scaled to the files
     images: Annotated[str, nonempty_text("the image folder's name, e.g. images_4")] = "images"
+    # folder of the reconstruction; "auto" for the model in ``sparse`` with most posed images
     model: Annotated[str, nonempty_text("the model's folder, or auto")] = "auto"
-    test_every: EveryNth = 8
-    skip_missing: bool = False
+    test_every: EveryNth = 8  # every n-th image by name, from the first, is a test view
+    skip_missing: bool = False  # leave out images that are missing; otherwise they are an error
 
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:

@@ -48,19 +48,15 @@ LIGHT = Daylight(
 
 @dataclass(frozen=True)
 class MeshSettings(SolidsSettings):
-    """Settings of ``scene=mesh`` beyond those of ``solids``.
+    """Settings of ``scene=mesh`` beyond those of ``solids``."""
 
-    Attributes:
-        path: the model, .glb, .gltf, .obj, .ply or .stl.
-        up: axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL.
-        shading: "daylight" (sun with shadows and a soft sky) or "flat" (unlit colours).
-        skip_missing: leave out missing or refused textures and material files instead of raising.
-    """
-
+    # the model, .glb, .gltf, .obj, .ply or .stl
     path: Annotated[Path, nonempty_text("the model's file")] = field(kw_only=True)
+    # axis of the file that points up; "auto" is y for glTF and OBJ, z for PLY and STL
     up: Literal["auto", "y", "z"] = "auto"
+    # "daylight" (sun with shadows and a soft sky) or "flat" (unlit colours)
     shading: Literal["daylight", "flat"] = "daylight"
-    skip_missing: bool = False
+    skip_missing: bool = False  # leave out missing or refused textures and material files instead of raising
 
 
 def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:

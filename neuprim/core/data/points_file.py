@@ -75,8 +75,13 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     rgb = _convert_color_space(torch.from_numpy(colors[kept]).float(), LINEAR in found.comments, color_space)
     if channels != 3:
         rgb = rgb.mean(1, keepdim=True).expand(-1, channels)
-    deviations = None if scales is None else torch.from_numpy(_thicken_flat_gaussians(np.exp(scales[kept]))).float()
-    rotations = None if scales is None else torch.tensor([1.0, 0, 0, 0]).repeat(int(kept.sum()), 1)
+    deviations = rotations = None
+    if scales is not None:
+        sizes = np.exp(scales[kept])
+        flat = sizes < np.exp(-_LARGEST_LOG)
+        thickness = _FLATNESS * np.where(flat, np.inf, sizes).min(1, keepdims=True)
+        deviations = torch.from_numpy(np.where(flat, thickness, sizes)).float()
+        rotations = torch.tensor([1.0, 0, 0, 0]).repeat(len(sizes), 1)
     if scales is not None and quats is not None:
         rotations = torch.from_numpy(quats[kept] / np.linalg.norm(quats[kept], axis=1, keepdims=True)).float()
     alphas = None if opacity is None else torch.sigmoid(torch.from_numpy(opacity[kept, 0]).float())
@@ -109,13 +114,6 @@ def _gaussian_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
     if len(there) == 1:
         return np.repeat(scales, 3, axis=1)
     return np.pad(scales, ((0, 0), (0, 3 - len(there))), constant_values=-np.inf)
-
-
-def _thicken_flat_gaussians(deviations: np.ndarray) -> np.ndarray:
-    """Give axes without size a small thickness."""
-    flat = deviations < np.exp(-_LARGEST_LOG)
-    least = np.where(flat, np.inf, deviations).min(1, keepdims=True)
-    return np.where(flat, _FLATNESS * least, deviations)
 
 
 def _vertex_colors(found: PlyVertices, path: Path) -> np.ndarray:

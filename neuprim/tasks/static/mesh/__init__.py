@@ -35,15 +35,9 @@ MODEL_READERS: dict[str, Callable[[ModelFolder], Model]] = {".glb": read_gltf, "
 MODEL_READERS |= {".ply": read_ply_mesh, ".stl": read_stl}
 
 
-def _dimmed_daylight(colour: tuple[float, float, float]) -> tuple[float, float, float]:
-    r, g, b = (0.8 * value for value in colour)
-    return r, g, b
-
-
 # the daylight of the solids, as bright as white in the sun can be shown
-LIGHT = Daylight(
-    DAYLIGHT.direction, *(_dimmed_daylight(colour) for colour in (DAYLIGHT.sun, DAYLIGHT.sky, DAYLIGHT.ground))
-)
+_COLOURS = (DAYLIGHT.sun, DAYLIGHT.sky, DAYLIGHT.ground)
+LIGHT = Daylight(DAYLIGHT.direction, *((0.8 * r, 0.8 * g, 0.8 * b) for r, g, b in _COLOURS))
 
 
 @dataclass(frozen=True)

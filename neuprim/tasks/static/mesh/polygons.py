@@ -43,12 +43,10 @@ def triangulate_polygons(
         left = np.arange(len(rows))
         for start in range(min(size, _FANS)):
             fan = _triangle_fan(size, start)
-            areas = _signed_triangle_areas(points[left], normal[left], fan)
-            line = (
-                np.linalg.norm(_triangle_normals(points[left], fan), axis=2).max(axis=1) <= _FLAT
-                if start == 0
-                else np.False_
-            )
+            a, b, c = (points[left][:, fan[:, i]] for i in range(3))
+            across = np.cross(b - a, c - a)
+            areas = np.einsum("mtc,mc->mt", across, normal[left])  # twice; negative where triangles turn the other way
+            line = np.linalg.norm(across, axis=2).max(axis=1) <= _FLAT if start == 0 else np.False_
             good = ((areas >= -_FLAT).all(axis=1) & (length[left, 0] > _FLAT)) | line
             # triangles without area are no faces of the file
             shown = good[:, None] & ((areas > _FLAT) | np.reshape(line, (-1, 1)))
@@ -81,16 +79,6 @@ def _triangle_fan(size: int, start: int) -> NDArray[np.intp]:
     """(size - 2, 3) corners of the triangles around the corner ``start``."""
     around = (start + np.arange(1, size)) % size
     return np.stack([np.full(size - 2, start), around[:-1], around[1:]], axis=1)
-
-
-def _triangle_normals(points: NDArray, triangles: NDArray) -> NDArray[np.float64]:
-    a, b, c = (points[:, triangles[:, i]] for i in range(3))
-    return np.cross(b - a, c - a)
-
-
-def _signed_triangle_areas(points: NDArray, normal: NDArray, triangles: NDArray) -> NDArray[np.float64]:
-    """(M, T) twice the areas of triangles, seen along the polygons' normals; negative where they turn the other way."""
-    return np.einsum("mtc,mc->mt", _triangle_normals(points, triangles), normal)
 
 
 def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:

@@ -13,6 +13,8 @@ import pytest
 import torch
 from PIL import Image
 
+from neuprim.core.cameras import Camera
+from neuprim.core.data.distortion import Radial, undistortion_grid
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets import load_nerfstudio as load
 
@@ -111,6 +113,11 @@ def test_a_lens_that_folds_over_does_not_mirror_the_middle_into_the_corners(capt
     y, x = np.indices((H, W)) + 0.5
     radius = np.hypot((x - PINHOLE["cx"]) / PINHOLE["fl_x"], (y - PINHOLE["cy"]) / PINHOLE["fl_y"])
     assert not mask.numpy()[radius > 0.46].any() and mask.numpy()[radius < 0.40].all()
+
+
+def test_what_does_not_fold_over_lies_around_a_principal_point_off_the_middle() -> None:
+    _, valid = undistortion_grid(Camera(torch.eye(4), 40.0, 40.0, 70.0, 20.0, 80, 40), Radial(k1=-1.8))
+    assert valid[20, 70] and not valid[20, 20]
 
 
 def test_per_frame_intrinsics_sizes_and_lenses(capture: Any, scenes: Any, context: Any) -> None:

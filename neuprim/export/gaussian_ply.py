@@ -40,20 +40,11 @@ from neuprim.export.shared import Harmonics, choose_comparison_views, find_rgb_c
 
 SIZES = ("moments", "footprint", "profile")
 """What the size of a Gaussian may be fitted to."""
-
-
-_SIDE = 12
-"""Points of the quadrature along an axis of the unit ball."""
+_SIDE = 12  # points of the quadrature along an axis of the unit ball
 _CHUNK = 512
-_FACTORS = [1.06**i for i in range(-24, 25)]
-"""Factors on the covariance that are tried, in steps of three percent in size."""
-_NEAR, _BLUR, _ALPHA_MAX, _ALPHA_MIN, _TRANSMITTANCE_MIN = (
-    0.2,
-    0.3,
-    0.99,
-    1.0 / 255.0,
-    1e-4,
-)  # of the authors' rasteriser
+_FACTORS = [1.06**i for i in range(-24, 25)]  # on the covariance, in steps of three percent in size
+# Of the authors' rasteriser:
+_NEAR, _BLUR, _ALPHA_MAX, _ALPHA_MIN, _TRANSMITTANCE_MIN = 0.2, 0.3, 0.99, 1.0 / 255.0, 1e-4
 
 OPTIONS = {
     "size": (
@@ -71,30 +62,28 @@ LAYOUT = (
     *("opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1", "rot_2", "rot_3"),
 )
 
-_LOST = 1e-4
-"""Of the size of the cloud of centres: what float32 may round them by."""
+_MAX_ROUNDING = 1e-4  # of centres in float32, as a share of the size of their cloud
 
 
-def _write(job: ExportJob) -> ExportReport:
+def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
     (conditions,) = job.frames()
     channels, rgb = job.run.channels, find_rgb_channels(job.run)
     job.progress("fitting Gaussians", 0.0)
     fits = {name: fit_gaussians(job.run, conditions, name) for name in SIZES if size in ("auto", name)}
     if not all(len(g.means) for g in fits.values()):
-        raise ConfigError(
-            f"{job.run.directory}: no primitive absorbs anything under these conditions; nothing to export"
-        )
+        reason = "no primitive absorbs anything under these conditions; nothing to export"
+        raise ConfigError(f"{job.run.directory}: {reason}")
     colours = fit_harmonics(job.run, conditions).select_channels(rgb)
     images, seen = _draw_model_images(job, which, conditions, rgb)
-    scores = {name: _measure_psnrs(job, fit, colours, images, rgb, name) for name, fit in fits.items()}
+    background = _background_colour(job)[list(rgb)]
+    scores = {name: _measure_gaussian_psnrs(job, fit, colours, images, background) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
     rows = _vertex_rows(gaussians, colours, job.run.world)
     space = channels.color_space
-    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"] + [LINEAR] * (
-        space == "linear"
-    )
+    comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
+    comments += [LINEAR] * (space == "linear")
     write_ply(job.out, rows, comments)
     notes = [
         f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against "
@@ -132,20 +121,10 @@ def _vertex_rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.n
     rest = colours.rest[gaussians.rows].transpose(1, 2).reshape(-1, 45).numpy()
     logit = np.log(opacity) - np.log1p(-opacity)
     zero = np.zeros((len(opacity), 3))
-    table = np.concatenate(
-        [
-            gaussians.means.numpy(),
-            zero,
-            colours.dc[gaussians.rows].numpy(),
-            rest,
-            logit[:, None],
-            np.log(scales),
-            quats,
-        ],
-        axis=1,
-    )
+    dc = colours.dc[gaussians.rows].numpy()
+    table = np.concatenate([gaussians.means, zero, dc, rest, logit[:, None], np.log(scales), quats], axis=1)
     lost = np.abs(table[:, :3].astype(np.float32) - table[:, :3]).max()
-    place = "<f8" if lost > _LOST * np.ptp(table[:, :3], axis=0).max() else "<f4"
+    place = "<f8" if lost > _MAX_ROUNDING * np.ptp(table[:, :3], axis=0).max() else "<f4"
     rows = np.empty(len(table), [(name, place if name in ("x", "y", "z") else "<f4") for name in LAYOUT])
     for i, name in enumerate(LAYOUT):
         rows[name] = table[:, i]
@@ -158,32 +137,26 @@ def _draw_model_images(
     """Draw the model from the comparison views, red, green and blue, and say which views these are."""
     run = job.run
     views, what = choose_comparison_views(job, which, conditions)
-    background, images = _background(job), []
+    background, images = _background_colour(job), []
     for i, view in enumerate(views):
         job.progress("drawing the model", i / len(views))
         with torch.no_grad():
-            images.append(
-                (view, render(run.model, view.camera, view.conditions, run.settings, background).rgb[..., list(rgb)])
-            )
+            image = render(run.model, view.camera, view.conditions, run.settings, background).rgb
+        images.append((view, image[..., list(rgb)]))
     return images, what
 
 
-def _measure_psnrs(
-    job: ExportJob,
-    gaussians: Gaussians,
-    colours: Harmonics,
-    images: list[tuple[View, Tensor]],
-    rgb: Sequence[int],
-    name: str,
+def _measure_gaussian_psnrs(
+    job: ExportJob, gaussians: Gaussians, colours: Harmonics, images: list[tuple[View, Tensor]], background: Tensor
 ) -> list[float]:
-    background, found = _background(job)[list(rgb)], []
+    found = []
     for i, (view, truth) in enumerate(images):
-        job.progress(f"drawing the Gaussians (size={name})", i / len(images))
+        job.progress("drawing the Gaussians", i / len(images))
         found.append(psnr(draw_gaussians(gaussians, colours, view.camera, background), truth))
     return found
 
 
-def _background(job: ExportJob) -> Tensor:
+def _background_colour(job: ExportJob) -> Tensor:
     return torch.tensor([float(x) for x in job.run.header.get("background", [0.0] * job.run.model.colour.channels)])
 
 
@@ -234,19 +207,20 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
     with torch.no_grad():
         active = model.active(conditions)
         own, still, moved = active.own, active.stored, active.geometry
-        parts = [
-            _fit(
-                model.density.density, {n: v[part] for n, v in own.items()}, still[part], moved[part], conditions, size
-            )
-            for part in (slice(i, i + _CHUNK) for i in range(0, still.count, _CHUNK))
-        ]
+        parts = []
+        for i in range(0, still.count, _CHUNK):
+            part = slice(i, i + _CHUNK)
+            params = {name: value[part] for name, value in own.items()}
+            parts.append(_fit_gaussian_chunk(model.density.density, params, still[part], moved[part], conditions, size))
     empty = (torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0), torch.zeros(0, dtype=torch.bool))
     means, covariances, opacities, kept = (torch.cat(column) for column in zip(empty, *parts, strict=True))
     found = kept.nonzero()[:, 0]
     return Gaussians(means[found].double(), covariances[found].double(), opacities[found].double(), found)
 
 
-def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions, size: str) -> tuple[Tensor, ...]:  # type: ignore[no-untyped-def]
+def _fit_gaussian_chunk(
+    density, own, still: Geometry, moved: Geometry, conditions: Conditions, size: str
+) -> tuple[Tensor, ...]:  # type: ignore[no-untyped-def]
     n, step = still.count, 2.0 / _SIDE
     ticks = (torch.arange(_SIDE, dtype=torch.float64) + 0.5) * step - 1
     ball = torch.cartesian_prod(ticks, ticks, ticks)
@@ -255,9 +229,8 @@ def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions,
     points = moved.means.double()[:, None] + torch.einsum("nij,pj->npi", R * scales[:, None, :], ball[inside])
     prim = torch.arange(n).repeat_interleave(int(inside.sum()))
     rho = torch.zeros(n, len(ball), dtype=torch.float64)
-    rho[:, inside] = (
-        density(own, still, prim, points.reshape(-1, 3).float(), conditions).double().reshape(n, -1).clamp_min(0)
-    )
+    sigma = density(own, still, prim, points.reshape(-1, 3).float(), conditions).double()
+    rho[:, inside] = sigma.reshape(n, -1).clamp_min(0)
     total = rho.sum(1)
     kept = total * step**3 * scales.amin(1) > 1e-9  # an optical depth that no image shows
     weight = rho / total.clamp_min(1e-300)[:, None]
@@ -279,26 +252,20 @@ def _fit(density, own, still: Geometry, moved: Geometry, conditions: Conditions,
     if size == "footprint":
         spread = spread * (torch.stack(areas) / (opacity * torch.stack(bells))).mean(0)[:, None, None]
     elif size == "profile":
-        wider, opacity = _closest(screens, torch.stack(areas), torch.stack(bells), ticks)
+        wider, opacity = _fit_profile(screens, torch.stack(areas), torch.stack(bells), ticks)
         spread = spread * wider[:, None, None]
     world = R * scales[:, None, :]
-    return (
-        moved.means.double() + (world @ mean[:, :, None])[..., 0],
-        world @ spread @ world.transpose(1, 2),
-        opacity,
-        kept,
-    )
+    means = moved.means.double() + (world @ mean[:, :, None])[..., 0]
+    return means, world @ spread @ world.transpose(1, 2), opacity, kept
 
 
-def _closest(
+def _fit_profile(
     screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """(n,) factors on the covariance and (n,) opacities of the bells closest to what three screens show, (alpha,
-    covariance, mean, area) each.
+    """Return (n,) factors on the covariance and (n,) opacities of the bells closest to three screens.
 
-    For each of some factors, the opacity is that with the same integral of alpha over the screens, at most 0.99; taken
-    is the factor with the least squares of what is left, over the whole of the screens: the part of a bell that is
-    outside the primitive's own is known in closed form.
+    A screen is (alpha, covariance, mean, area). For each factor, the opacity keeps the integral of alpha, at most 0.99.
+    The factor with the least squared error wins; a bell's part outside of the screen is known in closed form.
     """
     step = ticks[1] - ticks[0]
     weights = torch.stack([screen[3] for screen in screens])
@@ -337,21 +304,15 @@ def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, bac
     limits = 1.3 * 0.5 * camera.width / camera.fx, 1.3 * 0.5 * camera.height / camera.fy
     x, y = ((t[:, a] / z).clamp(-limits[a], limits[a]) * z for a in (0, 1))
     J = torch.zeros(len(t), 2, 3, dtype=torch.float64)
-    J[:, 0, 0], J[:, 0, 2], J[:, 1, 1], J[:, 1, 2] = (
-        camera.fx / z,
-        -camera.fx * x / z**2,
-        camera.fy / z,
-        -camera.fy * y / z**2,
-    )
+    J[:, 0, 0], J[:, 0, 2] = camera.fx / z, -camera.fx * x / z**2
+    J[:, 1, 1], J[:, 1, 2] = camera.fy / z, -camera.fy * y / z**2
     flat = J @ W @ cov @ W.T @ J.transpose(1, 2) + _BLUR * torch.eye(2, dtype=torch.float64)
     centers = torch.stack([camera.fx * t[:, 0] / z + camera.cx, camera.fy * t[:, 1] / z + camera.cy], -1)
     away = gaussians.means[order] - camera.position.double()
     colors = colours.evaluate(gaussians.rows[order], away / away.norm(dim=-1, keepdim=True)).numpy()
     inverse, opacity = torch.linalg.inv(flat).numpy(), gaussians.opacities[order].numpy()
-    reach = (
-        np.sqrt(2 * np.log(np.maximum(opacity / _ALPHA_MIN, 1.0)))[:, None]
-        * flat.diagonal(dim1=1, dim2=2).sqrt().numpy()
-    )
+    deviations = flat.diagonal(dim1=1, dim2=2).sqrt().numpy()
+    reach = np.sqrt(2 * np.log(np.maximum(opacity / _ALPHA_MIN, 1.0)))[:, None] * deviations
     middle = centers.numpy()
     first = np.clip(np.floor(middle - reach), 0, [camera.width, camera.height]).astype(int)
     last = np.clip(np.ceil(middle + reach), 0, [camera.width, camera.height]).astype(int)
@@ -377,7 +338,7 @@ EXPORTER = Exporter(
     API_VERSION,
     "gaussian-ply",
     "one fitted Gaussian per primitive, in the layout of 3D Gaussian splatting; lossy",
-    _write,
+    _write_gaussian_ply,
     OPTIONS,
     conditions=True,
     default="gaussians.ply",

@@ -63,29 +63,20 @@ _TO_GLTF = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """Scene (z up) to glTF (y up): x, z, -y."""
 
 
-def _write(job: ExportJob) -> ExportReport:
+def _write_mesh(job: ExportJob) -> ExportReport:
     path = job.out
     (conditions,) = job.frames()
     channels = job.run.channels
-    rgb = (
-        None
-        if channels.own is not None
-        else find_rgb_channels(job.run, f", and task {job.run.task.name!r} has no display that makes these")
-    )
+    hint = f", and task {job.run.task.name!r} has no display that makes these"
+    rgb = None if channels.own is not None else find_rgb_channels(job.run, hint)
     contour = _load_contouring()
-    smooth, keep, up = (
-        job.number("smooth", 0, 4) or 0.0,
-        job.number("keep", 0, 1) or 0.0,
-        job.choice("up", "auto", "z", "y"),
-    )
-    turn = job.run.world.rotation
-    if up == "auto":
-        up = (
-            "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
-        )  # of the world's axes, the one that is the scene's z
+    smooth, keep = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0
+    up, turn = job.choice("up", "auto", "z", "y"), job.run.world.rotation
+    if up == "auto":  # of the world's axes, the one that is the scene's z
+        up = "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
     seen = fit_harmonics(job.run, conditions)
     job.progress("sampling the density", 0.0)
-    sigma, scene_from_index = _sample(job, conditions, job.count("grid", 8, 1024) or 192)
+    sigma, scene_from_index = _sample_density(job, conditions, job.count("grid", 8, 1024) or 192)
     step = float(scene_from_index[0, 0])
     given = job.number("level", 1e-9, 1e9)
     level = find_surface_level(sigma, step) if given is None else given
@@ -94,10 +85,8 @@ def _write(job: ExportJob) -> ExportReport:
     job.progress("contouring", 0.3)
     points, faces = contour(field, level)
     if not len(faces):
-        raise ConfigError(
-            f"level={level:.4g}: no surface; the densest of the sampled points has {float(field.max()):.4g} per "
-            "scene unit"
-        )
+        densest = f"the densest of the sampled points has {float(field.max()):.4g} per scene unit"
+        raise ConfigError(f"level={level:.4g}: no surface; {densest}")
     import trimesh
 
     mesh = trimesh.Trimesh(points @ scene_from_index[:3, :3].T + scene_from_index[:3, 3], faces, process=False)
@@ -105,16 +94,14 @@ def _write(job: ExportJob) -> ExportReport:
     if mesh.volume < 0:
         mesh.invert()
     job.progress("colouring", 0.5)
-    colours = torch.from_numpy(
-        _vertex_colours(job, conditions, seen, np.array(mesh.vertices), np.array(mesh.vertex_normals))
-    ).float()
+    vertices, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
+    colours = torch.from_numpy(_vertex_colours(job, conditions, seen, vertices, normals)).float()
     colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
     iou = _compare_silhouettes(job, conditions, mesh)
-    _save(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
+    _save_mesh(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
-    notes.append(
-        "colours: of the primitives around each vertex, weighted by density, seen along the normal from outside"
-    )
+    seen_from = "weighted by density, seen along the normal from outside"
+    notes.append(f"colours: of the primitives around each vertex, {seen_from}")
     if channels.display_text:
         notes.append(f"colours: {channels.display_text}")
     if path.suffix.lower() == ".glb" and up == "z":
@@ -130,9 +117,8 @@ def _load_contouring() -> Any:
     try:
         import pyvista
     except ImportError as error:
-        raise BackendUnavailable(
-            f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'"
-        ) from error
+        needed = f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'"
+        raise BackendUnavailable(needed) from error
 
     def contour(values: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
         image = pyvista.ImageData(dimensions=values.shape)
@@ -145,7 +131,7 @@ def _load_contouring() -> Any:
     return contour
 
 
-def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _sample_density(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample the extinction on a lattice with an empty border; return it and (4, 4) scene_from_index."""
     low, high = (v.numpy() for v in ellipsoid_box(job, [conditions]))
     step = float((high - low).max()) / count
@@ -155,10 +141,8 @@ def _sample(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndar
     matrix = np.diag([step, step, step, 1.0])
     matrix[:3, 3] = low - 3 * step
     size, settings = (shape[0], shape[1], shape[2]), job.run.settings
-    sigma = density_grid(
-        job.run.model, conditions, torch.from_numpy(matrix), size, settings.threads, computing_device(settings)
-    )
-    return sigma.numpy(), matrix
+    place, device = (torch.from_numpy(matrix), size), computing_device(settings)
+    return density_grid(job.run.model, conditions, *place, settings.threads, device).numpy(), matrix
 
 
 def find_surface_level(sigma: np.ndarray, step: float) -> float:
@@ -206,10 +190,8 @@ def _vertex_colours(
         active = job.run.model.active(conditions)
         moved = active.geometry
         whiten = moved.rotations.double().transpose(1, 2) / moved.scales.double()[:, :, None]
-        total, weight = (
-            torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64),
-            torch.zeros(len(points), dtype=torch.float64),
-        )
+        total = torch.zeros(len(points), colours.dc.shape[1], dtype=torch.float64)
+        weight = torch.zeros(len(points), dtype=torch.float64)
         tree = cKDTree(points)
         around = tree.query_ball_point(moved.means.double().numpy(), moved.scales.double().amax(1).numpy())
         counts = np.array([len(a) for a in around])
@@ -229,11 +211,10 @@ def _vertex_colours(
             nearest = torch.from_numpy(cKDTree(moved.means.double().numpy()).query(points[bare.numpy()])[1])
             total[bare] = colours.evaluate(nearest, -torch.from_numpy(normals)[bare])
             weight[bare] = 1.0
-    result: np.ndarray = (total / weight[:, None]).numpy()
-    return result
+    return np.asarray((total / weight[:, None]).numpy())
 
 
-def _save(mesh: Any, colours: Tensor, space: str, path: Path, up: str, world: World) -> None:
+def _save_mesh(mesh: Any, colours: Tensor, space: str, path: Path, up: str, world: World) -> None:
     import trimesh
 
     suffix, values = path.suffix.lower(), colours.clamp(0, 1)
@@ -273,10 +254,9 @@ def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
     rows = np.frombuffer(body, [("place", "<f4", 3), ("rest", rest)], len(points))
     wide = np.empty(len(points), [("place", "<f8", 3), ("rest", rest)])
     wide["place"], wide["rest"] = points, rows["rest"]
-    return head.replace(
-        b"property float x\nproperty float y\nproperty float z",
-        b"property double x\nproperty double y\nproperty double z",
-    ) + (b"end_header\n" + wide.tobytes() + body[rows.nbytes :])
+    for axis in (b"x", b"y", b"z"):
+        head = head.replace(b"property float %b\n" % axis, b"property double %b\n" % axis)
+    return head + b"end_header\n" + wide.tobytes() + body[rows.nbytes :]
 
 
 # ---------------------------------------------------------------- error
@@ -295,9 +275,8 @@ def _compare_silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> f
         rays = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1).reshape(-1, 3)
         rays = rays @ camera.viewmat[:3, :3].double().numpy()
         origin: Tensor = camera.position.double()
-        hit = mesh.ray.intersects_any(
-            np.broadcast_to(origin.numpy(), rays.shape), rays / np.linalg.norm(rays, axis=1, keepdims=True)
-        )
+        directions = rays / np.linalg.norm(rays, axis=1, keepdims=True)
+        hit = mesh.ray.intersects_any(np.broadcast_to(origin.numpy(), rays.shape), directions)
         solid = alpha.reshape(-1) > 0.5
         both, either = both + int((hit & solid).sum()), either + int((hit | solid).sum())
     return both / either if either else 0.0
@@ -307,7 +286,7 @@ EXPORTER = Exporter(
     API_VERSION,
     "mesh",
     "an isosurface of the density with vertex colours: .glb, .ply or .obj; lossy",
-    _write,
+    _write_mesh,
     OPTIONS,
     conditions=True,
     default="mesh.glb",

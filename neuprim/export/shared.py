@@ -48,9 +48,8 @@ class Harmonics:
             return self
         directions = fibonacci_sphere(_DIRECTIONS)
         after, before = (sh.basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
-        return Harmonics(
-            self.dc, torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest), self.residual
-        )
+        rest = torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest)
+        return Harmonics(self.dc, rest, self.residual)
 
     def select_channels(self, channels: tuple[int, ...]) -> Harmonics:
         """Return the same with these channels only, in this order."""
@@ -66,11 +65,9 @@ def find_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]
     """
     channels = run.channels
     if channels.rgb is None:
-        raise ConfigError(
-            f"{run.directory}: {channels.count} channels, {channels.name_list}; this format has red, green and "
-            f"blue{hint}; "
-            "--format ply and npz hold all channels"
-        )
+        found = f"{run.directory}: {channels.count} channels, {channels.name_list}"
+        expected = f"this format has red, green and blue{hint}; --format ply and npz hold all channels"
+        raise ConfigError(f"{found}; {expected}")
     return channels.rgb
 
 
@@ -106,9 +103,8 @@ def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> 
     camera = Camera(look_at(middle - 1e4 * reach * direction, middle, up), 1e4, 1e4, 32, 32, 64, 64)
     lowered = run.model.lower(camera, conditions, run.settings)
     if not lowered.colour.per_primitive:
-        raise ConfigError(
-            f"{run.directory}: colours of the form {type(lowered.colour).__name__} have no value per primitive"
-        )
+        form = type(lowered.colour).__name__
+        raise ConfigError(f"{run.directory}: colours of the form {form} have no value per primitive")
     return lowered.center_colors(camera.position).double()
 
 

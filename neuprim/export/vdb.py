@@ -69,10 +69,10 @@ class _GridFrame:
     source: int | None = None
 
 
-def _write(job: ExportJob) -> ExportReport:
+def _write_vdb_frames(job: ExportJob) -> ExportReport:
     source, placement, notes = _find_source(job, job.flag("source"))
-    frames = _frames(job, placement)
-    paths = _paths(job, frames)
+    frames = _list_grid_frames(job, placement)
+    paths = _name_vdb_files(job, frames)
     units = job.choice("units", "auto", "source", "world", "scene")
     if units == "auto":
         units = "source" if placement else "world"
@@ -86,34 +86,33 @@ def _write(job: ExportJob) -> ExportReport:
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
     name = str(job.options["name"])
     own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
-    fallback = _transform(
-        job, box, scene_from_world, np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
-    )
-    sampler = _Sampler(job, _component(job, placement), scene_from_world, name, factor, threshold)
-    cut = _Cut(0, 0)
+    origin = np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
+    fallback = _voxel_transform(job, box, scene_from_world, origin)
+    sampler = _DensitySampler(job, _component(job, placement), scene_from_world, name, factor, threshold)
+    cut = _CutVoxels(0, 0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
         job.progress("writing frames", i / len(frames))
-        transform = (
-            source.grid_transform(frame.source) if own and source is not None and frame.source is not None else None
-        )
+        transform = None
+        if own and source is not None and frame.source is not None:
+            transform = source.grid_transform(frame.source)
         transform = fallback if transform is None else transform
         grid = sampler.sample_grid(frame.conditions, transform)
         if placement is not None and placement.extents:
-            grid, more_cut = _clamp_to_extent(grid, _extent(placement, frame), placement.sigma_per_unit * factor)
-            cut = _Cut(*(a + b for a, b in zip(cut, more_cut, strict=True)))
+            extents = placement.extents  # of a time between frames: around all
+            extent = GridExtent.around(extents) if frame.source is None else extents[frame.source]
+            grid, more_cut = _clamp_to_extent(grid, extent, placement.sigma_per_unit * factor)
+            cut = _CutVoxels(*(a + b for a, b in zip(cut, more_cut, strict=True)))
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
         if source is not None and frame.source is not None:
-            errors |= _errors(job, source, frame, path, scene_from_world, factor)
-    notes += _describe(placement, units, factor, name)
-    if cut != _Cut(0, 0):
-        notes.append(
-            f"{cut.above} voxels were above the source's largest value and are set to it; "
-            f"{cut.outside} outside its bounds are left out"
-        )
+            errors |= _measure_vdb_errors(job, source, frame, path, scene_from_world, factor)
+    notes += _describe_grid(placement, units, factor, name)
+    if any(cut):
+        above = f"{cut.above} voxels were above the source's largest value and are set to it"
+        notes.append(f"{above}; {cut.outside} outside its bounds are left out")
     world = "the source's world" if placement else "the coordinates of the run's data"
     where = "the source's own voxels and world" if own else f"cubic voxels in {world}"
     notes.append(f"on {where}; values below {threshold:.3g} are left out")
@@ -126,7 +125,7 @@ def _write(job: ExportJob) -> ExportReport:
     return ExportReport(tuple(paths), False, errors, tuple(notes))
 
 
-def _describe(placement: Placement | None, units: str, factor: float, name: str) -> list[str]:
+def _describe_grid(placement: Placement | None, units: str, factor: float, name: str) -> list[str]:
     """Say what the values of the written grid mean."""
     unit = f"extinction per {units} unit"
     if units == "source" and placement is not None:
@@ -138,7 +137,7 @@ def _describe(placement: Placement | None, units: str, factor: float, name: str)
     return notes
 
 
-class _Cut(NamedTuple):
+class _CutVoxels(NamedTuple):
     """How many voxels were above the source's largest value, and outside its bounds."""
 
     above: int
@@ -156,39 +155,31 @@ def _component(job: ExportJob, placement: Placement | None) -> Primitives:
         return model
     if placement.component not in model.density.components(model.params):
         raise ConfigError(
-            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no "
-            "share of it in its extinction, so "
-            "its density is not known; train again with voxels (train.supervision=both, scene.optics.extinction "
-            "above 0)"
+            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no share of "
+            "it in its extinction, so its density is not known; train again with voxels (train.supervision=both, "
+            "scene.optics.extinction above 0)"
         )
     return model.component(placement.component)
 
 
-def _extent(placement: Placement, frame: _GridFrame) -> GridExtent:
-    """Return the extent of the source's frame, or of all frames for a time between them."""
-    return GridExtent.around(placement.extents) if frame.source is None else placement.extents[frame.source]
-
-
-def _clamp_to_extent(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[Grid, _Cut]:
+def _clamp_to_extent(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[Grid, _CutVoxels]:
     """Clamp a grid to an extent: no value above its largest, none outside its box; and count what that changed.
 
     Args:
         per_unit: what a source value of 1 is in the grid.
     """
     if not len(grid.origins):
-        return grid, _Cut(0, 0)
+        return grid, _CutVoxels(0, 0)
     offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
     centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
-    inside = (
-        np.zeros(grid.masks.shape, bool)
-        if extent.box is None
-        else ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
-    )
+    inside = np.zeros(grid.masks.shape, bool)
+    if extent.box is not None:
+        inside = ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
     kept, largest = grid.masks & inside, np.float32(extent.largest * per_unit)
     above = kept & (grid.values > largest)
     values = np.where(kept, np.minimum(grid.values, largest), np.float32(0))
     some = kept.any((1, 2, 3))
-    cut = _Cut(int(above.sum()), int((grid.masks & ~inside).sum()))
+    cut = _CutVoxels(int(above.sum()), int((grid.masks & ~inside).sum()))
     return replace(grid, origins=grid.origins[some], values=values[some], masks=kept[some]), cut
 
 
@@ -209,42 +200,37 @@ def _find_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Pla
     if isinstance(record, dict) and "grid" in record:
         kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
     if source is not None and kept is not None and not kept.matches(source.placement):
-        notes.append(
-            "the source's files are not those that the model was fitted to, so neither their voxels nor errors "
-            "against them"
-        )
+        reason = "the source's files are not those that the model was fitted to"
+        notes.append(f"{reason}, so neither their voxels nor errors against them")
         source = None
     return source, kept if source is None else source.placement, notes
 
 
-def _frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
+def _list_grid_frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
     """List the frames that the user names, else those of the run; a model without conditions has one."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
         frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
         return [_GridFrame(f.number, f.conditions, _source_frame(f.conditions, placement)) for f in frames]
-    return [_GridFrame(n, _conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
+    return [_GridFrame(n, _frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
 
 
-def _conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
+def _frame_conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
     return {name: torch.tensor(values[frame]) for name, values in placement.times.items()}
 
 
 def _source_frame(conditions: Conditions, placement: Placement | None) -> int | None:
     """Find the frame of the source with these conditions."""
-    if placement is None:
-        return None
-    for i in range(len(placement.numbers)):
-        known = _conditions(placement, i)
-        if known.keys() == conditions.keys() and all(
-            torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items()
-        ):
+    for i in range(0 if placement is None else len(placement.numbers)):
+        known = _frame_conditions(placement, i)
+        same = (torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items())
+        if known.keys() == conditions.keys() and all(same):
             return i
     return None
 
 
-def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
+def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     """Name the files: one, or one per frame in a folder."""
     suffix = job.out.suffix.lower()
     if suffix == ".vdb":
@@ -259,7 +245,7 @@ def _paths(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     return [job.out / f"density_{f.number:0{width}d}.vdb" for f in frames]
 
 
-def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def _voxel_transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
     """Return the (4, 4) matrix from index to world of the user's voxels, with the index origin at ``origin`` (3,)."""
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
@@ -271,7 +257,7 @@ def _transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, or
 # ---------------------------------------------------------------- sampling
 
 
-class _Sampler(NamedTuple):
+class _DensitySampler(NamedTuple):
     """Samples a model's extinction x ``factor`` on voxels; values below ``threshold`` are background."""
 
     job: ExportJob
@@ -303,10 +289,8 @@ class _Sampler(NamedTuple):
         first = np.floor(index.min(0)).astype(np.int64) & ~7
         size = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8 - first
         if math.prod(size.tolist()) > _MOST_VOXELS:
-            voxels = " x ".join(map(str, size))
-            raise ConfigError(
-                f"{voxels} voxels around the model; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)"
-            )
+            voxels = f"{' x '.join(map(str, size))} voxels around the model"
+            raise ConfigError(f"{voxels}; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)")
         parts = [g for g in self._sample_blocks(conditions, scene_from_index, first, size) if len(g.origins)]
         leaves = (
             np.concatenate([np.zeros((0, 3), np.int32), *(g.origins for g in parts)]),
@@ -336,7 +320,7 @@ class _Sampler(NamedTuple):
                 yield Grid.from_dense(self.name, values, lower=corner.tolist())
 
 
-def _errors(
+def _measure_vdb_errors(
     job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
 ) -> dict[str, float]:
     """Compare the model and the written file with the source, on the source's own voxels."""
@@ -370,7 +354,7 @@ EXPORTER = Exporter(
     API_VERSION,
     "vdb",
     "the density as OpenVDB, one file per frame; lossy (sampled)",
-    _write,
+    _write_vdb_frames,
     OPTIONS,
     conditions=True,
     default="vdb",

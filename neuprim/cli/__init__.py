@@ -40,7 +40,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         with warnings_as_lines():
-            return _dispatch(words)
+            return _run_command_line(words)
     except KeyboardInterrupt as stop:
         print(f"neuprim: interrupted{stop}", file=sys.stderr)
         return 130
@@ -59,7 +59,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return stop.code if isinstance(stop.code, int) else 0
 
 
-def _dispatch(words: list[str]) -> int:
+def _run_command_line(words: list[str]) -> int:
     parser = Parser(prog="neuprim", description="Radiance fields made of splattable neural primitives.")
     parser.add_argument("--version", action="version", version=f"neuprim {__version__}")
     commands = parser.add_subparsers(metavar="COMMAND", required=True)

@@ -140,11 +140,11 @@ def take_conditions(arguments: argparse.Namespace, rest: list[str], parser: argp
     arguments.conditions, arguments.run = {}, arguments.run_dir
     if not rest:
         return []
-    from neuprim.core.conditions import split_words
+    from neuprim.core.conditions import split_conditions
     from neuprim.runs.open import load_run
 
     arguments.run = load_run(arguments.run_dir)
-    arguments.conditions, unknown = split_words(rest, arguments.run.task.conditions)
+    arguments.conditions, unknown = split_conditions(rest, arguments.run.task.conditions)
     if unknown:
         raise refuse_argument(unknown[0], parser, arguments.run.task)
     return []

@@ -77,10 +77,10 @@ def _describe_plugin_note(report: PluginReport[Any]) -> str:
 
 def _describe_task_choices(spec: TaskSpec, scenes: list[PluginReport[SceneExtension]]) -> list[str]:
     from neuprim.config import check_groups, presets, task_choices
-    from neuprim.config.task_files import LEVELS, read_levels
+    from neuprim.config.task_files import LEVELS, read_effort_levels
 
     check_groups(spec)
-    default, levels = task_choices(spec), read_levels(spec, presets(spec))
+    default, levels = task_choices(spec), read_effort_levels(spec, presets(spec))
     rows = [(s.name, f"{s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
     rows += [_describe_scene(spec, report) for report in scenes if report.info.name.startswith(f"{spec.name}.")]
     width = max(len(name) for name, _ in rows)

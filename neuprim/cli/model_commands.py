@@ -48,12 +48,12 @@ def _take_export_options(arguments: argparse.Namespace, rest: list[str], parser:
     """Keep options and conditions for the exporter; refuse flags that are no condition of the run's task."""
     arguments.run = arguments.run_dir
     if any(word.startswith("-") for word in rest):
-        from neuprim.core.conditions import split_words
+        from neuprim.core.conditions import split_conditions
         from neuprim.runs.open import load_run
 
         arguments.run = load_run(arguments.run_dir)
         task = arguments.run.task
-        _, others = split_words(rest, task.conditions, bare=False)
+        _, others = split_conditions(rest, task.conditions, bare=False)
         for word in others:
             if word.startswith("-"):
                 raise refuse_argument(word, parser, task)

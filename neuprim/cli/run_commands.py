@@ -80,7 +80,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, read_stored_config
     from neuprim.config.command_settings import LauncherSettings, take_launcher, take_target, take_viewer
-    from neuprim.config.overrides import CommandLine, drop_place
+    from neuprim.config.overrides import CommandLine, drop_output_overrides
     from neuprim.core.train.distributed.process_group import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
@@ -97,7 +97,7 @@ def _run(args: argparse.Namespace) -> int:
             raise ConfigError(f"viewer=true: shows one run; expected no {name} beside it")
     if wanted is not None and args.multirun:
         raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
-    if args.multirun and not drop_place(overrides):
+    if args.multirun and not drop_output_overrides(overrides):
         from neuprim.runs.sweep import read_sweep_overrides
 
         overrides = read_sweep_overrides(overrides)
@@ -111,7 +111,7 @@ def _run(args: argparse.Namespace) -> int:
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
     if wanted is not None:
-        return _fit_target(configs[0], *wanted, launcher, typed)
+        return _search_target(configs[0], *wanted, launcher, typed)
     if viewer is not None:
         refuse_chunks(configs[0], "viewer=true shows one training")
     if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
@@ -147,7 +147,7 @@ def run_one(
         raise KeyboardInterrupt(describe_interruption(config.output_dir, typed)) from None
 
 
-def _fit_target(
+def _search_target(
     config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: CommandLine
 ) -> int:
     """Search for a model that reaches a target; print what was achieved and the run's directory."""

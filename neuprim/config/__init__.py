@@ -1,7 +1,7 @@
 """A run's configuration: Hydra's key=value words and the tasks' YAML files in, one validated :class:`RunConfig` out."""
 
 from neuprim.config.compose import compose, compose_all, preset_settings
-from neuprim.config.job import Job, find_run_plugins, made_now, scene_of, task_of
+from neuprim.config.job import Job, current_provenance, find_run_plugins, find_run_scene, load_run_task
 from neuprim.config.overrides import expand_sweep
 from neuprim.config.run_config import RunConfig, RunSettings
 from neuprim.config.stored_run import read_stored_config
@@ -16,12 +16,12 @@ __all__ = [
     "compose",
     "compose_all",
     "expand_sweep",
-    "made_now",
+    "current_provenance",
     "preset_settings",
     "presets",
     "read_stored_config",
-    "scene_of",
+    "find_run_scene",
     "find_run_plugins",
     "task_choices",
-    "task_of",
+    "load_run_task",
 ]

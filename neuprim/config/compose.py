@@ -17,7 +17,7 @@ from neuprim.config.job import refuse_missing_plugins
 from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
 from neuprim.config.overrides import (
     Assignment,
-    drop_place,
+    drop_output_overrides,
     expand_sweep,
     key_of,
     parse,
@@ -28,19 +28,19 @@ from neuprim.config.overrides import (
 from neuprim.config.run_config import RunConfig, RunSettings, flatten
 from neuprim.config.setting_checks import (
     CHOICES,
-    check_key,
-    check_names,
-    complete_options,
-    options_of,
+    check_parameter_names,
+    check_setting_key,
+    complete_task_options,
     refuse_unused,
+    task_and_loss_options,
     unused_settings,
 )
 from neuprim.config.stored_run import (
-    check_stored,
     find_resumed_run,
     refuse_contradictions,
+    refuse_untrusted_settings,
+    restore_references,
     resumed_choices,
-    show_references,
     stored_choices,
     stored_settings,
 )
@@ -51,11 +51,11 @@ from neuprim.config.task_files import (
     Level,
     check_groups,
     check_scene,
-    choose_level,
+    choose_effort_level,
+    omegaconf_to_plain,
     presets,
-    read_group,
+    read_config_group,
     task_choices,
-    to_plain,
 )
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
@@ -100,7 +100,7 @@ class _Selection:
 
 
 @dataclass(frozen=True)
-class _Base:
+class _BaseConfig:
     """Everything below a user's settings, with ``${...}`` as it is, and the scene's settings that are paths."""
 
     tree: dict[str, Any]
@@ -124,7 +124,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     begun = find_resumed_run(typed, choices, stored is not None)
     earlier = [config for config in (begun, stored) if config is not None]
     for config in earlier:
-        check_stored(config, typed)
+        refuse_untrusted_settings(config, typed)
     # Where torchrun's ranks get the overrides that describe a run, these say how many views each rank has.
     new_launch = begun is not None and read_torchrun_rank() is not None and bool(choices["task"] or choices["scene"])
     if begun is not None:
@@ -133,7 +133,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
         choices = stored_choices(stored, choices)
     values = [a for a in assignments if a.key not in CHOICES]
     try:
-        config, paths = _make_config(_select(choices), values, earlier, check_output, new_launch)
+        config, paths = _make_run_config(_select_task_and_scene(choices), values, earlier, check_output, new_launch)
     except UnknownPlugin:
         if begun is not None:
             refuse_missing_plugins(begun)  # naming the package says more
@@ -155,7 +155,7 @@ def compose_all(
     place = {a.key: a for a in parse([text for text in overrides if key_of(text) in ("output_dir", "resume")])}
     resume = "resume" in place and place["resume"].value is True
     asked = place["output_dir"].text if "output_dir" in place and place["output_dir"].value is not None else None
-    first = compose([*drop_place(combinations[0]), *([] if asked is None else [asked])], False, stored)
+    first = compose([*drop_output_overrides(combinations[0]), *([] if asked is None else [asked])], False, stored)
     typed = parse(combinations[0])
     names = [("task", first.task), ("scene", first.scene_name)]
     fixed = [run_name(_read_choice(typed, key) or name, "") for key, name in names if not swept & {key, "task"}]
@@ -163,9 +163,9 @@ def compose_all(
     folder = output_directory(explicit, "-".join([*fixed, "sweep"]), resume, check_output)
     made = []
     for texts, name in zip(combinations, sweep_names(overrides, combinations), strict=True):
-        own = drop_place(texts)
+        own = drop_output_overrides(texts)
         directory = folder / name
-        goes_on = resume and _goes_on(directory, own, (folder / "sweep.json").is_file())
+        goes_on = resume and _continues_own_run(directory, own, (folder / "sweep.json").is_file())
         output_dir = quote_override("output_dir", str(directory))
         config = compose([*own, output_dir, *(["resume=true"] if goes_on else [])], False, stored)
         typed_now = [text for text in config.overrides if text not in (output_dir, "resume=true")]
@@ -174,11 +174,11 @@ def compose_all(
     return made
 
 
-def _goes_on(directory: Path, own: Sequence[str], recorded: bool) -> bool:
+def _continues_own_run(directory: Path, own: Sequence[str], recorded: bool) -> bool:
     """Whether a run of a sweep goes on from its own configuration; the sweep's record refuses other overrides."""
     if not (directory / "config.yaml").is_file():
         return False
-    return not recorded or drop_place(RunConfig.from_yaml(directory).overrides) == list(own)
+    return not recorded or drop_output_overrides(RunConfig.from_yaml(directory).overrides) == list(own)
 
 
 def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None = None) -> RunSettings:
@@ -190,8 +190,8 @@ def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None
     check_groups(spec)
     base = _read_base(spec, scene, spec.config_package, preset, {})
     for assignment in level.settings if level is not None else ():
-        check_key(assignment, base.tree["scene"], scene)
-    return _validate_settings(_resolve(base, {}, level))
+        check_setting_key(assignment, base.tree["scene"], scene)
+    return _validate_settings(_resolve_config(base, {}, level))
 
 
 def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
@@ -206,13 +206,13 @@ def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
     return str(value)
 
 
-def _select(choices: Mapping[str, str | None]) -> _Selection:
+def _select_task_and_scene(choices: Mapping[str, str | None]) -> _Selection:
     """Load the task, and find its scene, preset and level."""
     task_name = choices["task"] or DEFAULT_TASK
     info, spec = TASKS.load_with_info(task_name)
     check_groups(spec)
     defaults, names = task_choices(spec), presets(spec)
-    level = choose_level(spec, choices[EFFORT], choices["preset"], names)
+    level = choose_effort_level(spec, choices[EFFORT], choices["preset"], names)
     preset = choices["preset"] or (defaults.preset if level is None else level.preset)
     scene_name = choices["scene"] or defaults.scene
     scene = find_scene(spec, scene_name)
@@ -223,7 +223,7 @@ def _select(choices: Mapping[str, str | None]) -> _Selection:
     return _Selection(info, spec, scene, preset, defaults.preset, level, name, defaults.options)
 
 
-def _make_config(
+def _make_run_config(
     chosen: _Selection,
     values: Sequence[Assignment],
     earlier: Sequence[RunConfig],
@@ -235,7 +235,7 @@ def _make_config(
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
     declared = base.tree["scene"]
     for assignment in (*(() if chosen.level is None else chosen.level.settings), *values):
-        check_key(assignment, declared, scene.spec.name)
+        check_setting_key(assignment, declared, scene.spec.name)
     below: dict[str, Any] = {}
     for config in earlier:
         same_scene = scene.spec.name == split_plugin_name(config.scene_name)[1]
@@ -244,17 +244,17 @@ def _make_config(
             refuse_unknown(config.scene, declared, "scene")
     if new_launch:
         below["train"]["views_per_step"] = base.tree["train"]["views_per_step"]
-    plain = _resolve(base, {})
-    full = _resolve(base, below, chosen.level, values)
+    plain = _resolve_config(base, {})
+    full = _resolve_config(base, below, chosen.level, values)
     settings = _validate_settings(full)
     loss_info, loss = (None, None) if settings.train.loss is None else LOSSES.load_with_info(settings.train.loss)
     refuse_unused(flatten({a.key: a.value for a in values}), spec, loss)
-    available = options_of(spec, loss)
+    available = task_and_loss_options(spec, loss)
     owner = f"task {spec.name!r}" + (f" with loss {loss.name!r}" if loss is not None and loss.options else "")
     for tree in (plain, full):
-        tree["task"]["options"] = complete_options(available, tree["task"]["options"], owner)
+        tree["task"]["options"] = complete_task_options(available, tree["task"]["options"], owner)
     options = full["task"]["options"]
-    check_names(spec, settings)
+    check_parameter_names(spec, settings)
     source = find_plugin_source(TASKS, qualified_plugin_name(chosen.task_info.distribution, spec.name))
     with attribute_errors(source, "check"):
         spec.check(build_settings(spec, settings.model, options))
@@ -270,7 +270,10 @@ def _make_config(
         output_dir=output_directory(settings.output_dir, chosen.name, settings.resume, check_output),
         options=options,
         unused=unused_settings(spec, loss),
-        non_default=preset | _find_differences(_flatten(plain, _validate_settings(plain)), _flatten(full, settings)),
+        non_default=preset
+        | _find_non_default_settings(
+            _flatten_run_settings(plain, _validate_settings(plain)), _flatten_run_settings(full, settings)
+        ),
         made_by=Provenance.of_installed(chosen.task_info, scene, loss_info),
         **{name: getattr(settings, name) for name in ("model", "train", "renderer", "metrics", "seed", "resume")},
     )
@@ -280,17 +283,20 @@ def _make_config(
 def _merge_overrides(earlier: RunConfig, overrides: Sequence[str]) -> list[str]:
     """Return what was typed for a run by now: of overrides with one key, the later."""
     again = {key_of(text) for text in overrides}
-    return [*(text for text in drop_place(earlier.overrides) if key_of(text) not in again), *overrides]
+    return [*(text for text in drop_output_overrides(earlier.overrides) if key_of(text) not in again), *overrides]
 
 
 # ---------------------------------------------------------------- merging
 
 
-def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: dict[str, Any]) -> _Base:
+def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: dict[str, Any]) -> _BaseConfig:
     """Merge defaults, preset and scene, whose file is in ``package``."""
     from omegaconf import OmegaConf
 
-    scene_node, preset_node = read_group(spec, "scene", scene, package), read_group(spec, "preset", preset)
+    scene_node, preset_node = (
+        read_config_group(spec, "scene", scene, package),
+        read_config_group(spec, "preset", preset),
+    )
     place = f"preset/{spec.name}/{preset}.yaml"
     for key in preset_node:
         if key not in PRESET_GROUPS:
@@ -301,9 +307,11 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
             f"scene/{spec.name}/{scene}.yaml: {_PATHS} must list keys of the file, and name is no setting"
         )
     merged = OmegaConf.merge(dataclasses.asdict(RunSettings()), preset_node)
-    base = _Base({**to_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}, paths)
+    base = _BaseConfig(
+        {**omegaconf_to_plain(merged, resolve=False), "scene": scene_node, "task": {"options": options}}, paths
+    )
     try:
-        loss = _validate_settings(_resolve(base, {})).train.loss
+        loss = _validate_settings(_resolve_config(base, {})).train.loss
         # while another loss is chosen, a preset may also set what the task's own reads
         unused = unused_settings(spec, None if loss is None else LOSSES.load(loss))
         refuse_unused([name for name in flatten(preset_node) if name in unused], spec, None)
@@ -312,8 +320,8 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
     return base
 
 
-def _resolve(
-    base: _Base, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
+def _resolve_config(
+    base: _BaseConfig, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
 ) -> dict[str, Any]:
     """Return the resolved configuration; values of ``earlier`` runs replace those of the base."""
     from omegaconf import OmegaConf
@@ -322,7 +330,10 @@ def _resolve(
     tree = OmegaConf.create(base.tree)
     for key, value in earlier.items():
         OmegaConf.update(tree, key, value, merge=False, force_add=True)
-    form, strategy = _typed_value(values, "model.density", "form"), _typed_value(values, "train.population", "strategy")
+    form, strategy = (
+        _find_typed_value(values, "model.density", "form"),
+        _find_typed_value(values, "train.population", "strategy"),
+    )
     if form is not None and tree.model.density.get("form", None if earlier else form) != form:
         OmegaConf.update(tree, "model.density", {}, merge=False)  # settings of another form mean nothing to it
     other_strategy = strategy is not None and tree.train.population.strategy != strategy
@@ -331,18 +342,18 @@ def _resolve(
             OmegaConf.update(tree, a.key, a.value, force_add=True)
         except (OmegaConfBaseException, ValueError, TypeError, AssertionError) as error:
             raise ConfigError(f"{a.text}: {' '.join(str(error).split())}") from error
-    seconds, steps = _typed_value(values, "train", "max_seconds"), _typed_value(values, "train", "iterations")
+    seconds, steps = _find_typed_value(values, "train", "max_seconds"), _find_typed_value(values, "train", "iterations")
     if seconds is not None and steps is None:
         OmegaConf.update(tree, "train.iterations", None)  # a budget in seconds is used up, however fast the machine
     if steps is not None and seconds is None and earlier:
         OmegaConf.update(tree, "train.max_seconds", None)  # the other budget was the earlier run's
-    if other_strategy and _typed_value(values, "train.population", "grow_from") is None:
+    if other_strategy and _find_typed_value(values, "train.population", "grow_from") is None:
         OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's value is for its own strategy
-    plain: dict[str, Any] = show_references(to_plain(tree))
+    plain: dict[str, Any] = restore_references(omegaconf_to_plain(tree))
     return plain
 
 
-def _typed_value(values: Sequence[Assignment], group: str, name: str) -> Any:
+def _find_typed_value(values: Sequence[Assignment], group: str, name: str) -> Any:
     """Return what was typed last for a setting of a group, alone or within the group."""
     found = None
     for a in values:
@@ -376,13 +387,13 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
     return result
 
 
-def _flatten(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
+def _flatten_run_settings(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
     """Return flat dotted values, with the settings in their own types, so that 1 and 1.0 are the same rate."""
     values = {**dataclasses.asdict(settings), "scene": tree["scene"], "task": tree["task"]}
     return flatten({key: value for key, value in values.items() if key not in ("output_dir", "resume")})
 
 
-def _find_differences(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _find_non_default_settings(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Return key -> (default, value) of the flat settings that differ."""
     before = {key: None if value == _REQUIRED else value for key, value in default.items()}
     pairs = {key: (before.get(key), actual.get(key)) for key in {**default, **actual}}

@@ -24,13 +24,13 @@ class Job:
 
     @classmethod
     def of(cls, config: RunConfig) -> Job:
-        """Load the task of a configuration. Raises as :func:`task_of`."""
-        return cls(config, task_of(config, config.source))
+        """Load the task of a configuration. Raises as :func:`load_run_task`."""
+        return cls(config, load_run_task(config, config.source))
 
     @property
     def scene(self) -> FoundScene:
         """The scene, of the task or of another package."""
-        return scene_of(self.config, self.task, self.config.source)
+        return find_run_scene(self.config, self.task, self.config.source)
 
     @property
     def plugins(self) -> RunPlugins:
@@ -38,7 +38,7 @@ class Job:
         return find_run_plugins(self.config)
 
 
-def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
+def load_run_task(config: RunConfig, file: Path | None = None) -> TaskSpec:
     """Load the task of a run's configuration from the package that made the run; warn of another version of it.
 
     Raises:
@@ -48,10 +48,10 @@ def task_of(config: RunConfig, file: Path | None = None) -> TaskSpec:
     return load_recorded_plugin(TASKS, config.made_by.task, file)[1]
 
 
-def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
+def find_run_scene(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
     """Find the scene of a run's configuration, the task's own or of the package that made the run.
 
-    Raises as :func:`task_of`.
+    Raises as :func:`load_run_task`.
     """
     if config.made_by.scene is None:
         own = [scene for scene in task.scenes if scene.name == config.scene_name]
@@ -60,11 +60,11 @@ def scene_of(config: RunConfig, task: TaskSpec, file: Path | None = None) -> Fou
     return FoundScene(extension.scene, extension.config_package, info)
 
 
-def made_now(config: RunConfig, task: TaskSpec) -> Provenance:
+def current_provenance(config: RunConfig, task: TaskSpec) -> Provenance:
     """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
     task_info = TASKS.find(config.made_by.task.qualified_name)
     loss = None if config.train.loss is None else LOSSES.find(config.train.loss)
-    return Provenance.of_installed(task_info, scene_of(config, task), loss)
+    return Provenance.of_installed(task_info, find_run_scene(config, task), loss)
 
 
 def find_run_plugins(config: RunConfig) -> RunPlugins:
@@ -76,6 +76,6 @@ def find_run_plugins(config: RunConfig) -> RunPlugins:
 
 def refuse_missing_plugins(config: RunConfig) -> None:
     """Raise ConfigError for a package that made a stored run and is not installed."""
-    scene_of(config, task_of(config, config.source), config.source)
+    find_run_scene(config, load_run_task(config, config.source), config.source)
     if config.made_by.loss is not None:
         load_recorded_plugin(LOSSES, config.made_by.loss, config.source)

@@ -45,7 +45,7 @@ class CommandLine:
     def resume_command(self, directory: Path) -> str:
         """Return the command that continues what these began: a run in ``directory``, or the sweep it is a part of."""
         sweep = bool(swept_keys(self.overrides))
-        overrides = drop_place(self.overrides)
+        overrides = drop_output_overrides(self.overrides)
         if not overrides and self.file is None and not (directory / "config.yaml").is_file():
             overrides = ["task=static"]  # the default, which a bare resume=true does not begin
         flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
@@ -151,7 +151,7 @@ def key_of(override: str) -> str:
     return override.partition("=")[0].strip().lstrip("+")
 
 
-def drop_place(overrides: Iterable[str]) -> list[str]:
+def drop_output_overrides(overrides: Iterable[str]) -> list[str]:
     """Return the overrides that say what is made, without those that say where and whether it goes on."""
     return [text for text in overrides if key_of(text) not in NOT_SWEPT]
 

@@ -119,7 +119,7 @@ class RunConfig:
             file = file / "config.yaml"
         elif file.name != "config.yaml" and not file.exists():
             raise CheckpointError(f"{path}: no such run directory")
-        data = _read_mapping(file)
+        data = _read_config_yaml(file)
         try:
             return dataclasses.replace(cls.from_dict(data), source=file)
         except ConfigError as error:
@@ -190,7 +190,7 @@ class _PlainDumper(yaml.SafeDumper):
         return True
 
 
-def _read_mapping(file: Path) -> Mapping[str, Any]:
+def _read_config_yaml(file: Path) -> Mapping[str, Any]:
     try:
         if file.stat().st_size > _MAX_BYTES:
             raise CheckpointError(f"{file}: larger than {_MAX_BYTES} bytes; not a run's configuration")

@@ -21,7 +21,7 @@ CHOICES = ("task", "scene", "preset", "effort")
 """Keys that choose files and levels."""
 
 
-def check_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str) -> None:
+def check_setting_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str) -> None:
     """Raise ConfigError for a key that names no setting, with the nearest that do.
 
     Args:
@@ -70,7 +70,7 @@ def _is_setting(path: list[str]) -> bool:
 # ---------------------------------------------------------------- task.options
 
 
-def options_of(spec: TaskSpec, loss: LossExtension | None) -> Mapping[str, Option]:
+def task_and_loss_options(spec: TaskSpec, loss: LossExtension | None) -> Mapping[str, Option]:
     """Return the options that may stand under ``task.options``: the task's own and those of the loss chosen."""
     if loss is None:
         return spec.options
@@ -82,7 +82,7 @@ def options_of(spec: TaskSpec, loss: LossExtension | None) -> Mapping[str, Optio
     return {**spec.options, **loss.options}
 
 
-def complete_options(
+def complete_task_options(
     declared: Mapping[str, Option], given: Any, owner: str, where: str = "task.options"
 ) -> dict[str, Any]:
     """Return every declared option, as given or its default; ``owner`` and ``where`` are for messages."""
@@ -120,7 +120,7 @@ def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | No
             raise ConfigError(f"{name}: {owner} does not use this setting{used}")
 
 
-def check_names(spec: TaskSpec, settings: RunSettings) -> None:
+def check_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
     """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far
     as the task lists its fields. The model itself may have fewer; what it lacks is refused when it is made."""
     if not spec.fields:

@@ -42,9 +42,9 @@ def read_stored_config(path: Path) -> RunConfig:
 
 def stored_choices(stored: RunConfig, typed: Choices) -> dict[str, str | None]:
     """Return task, scene and preset: the typed scene, else what the run of ``--config`` had."""
-    own = _choices_of(stored)
+    own = _stored_choices_of(stored)
     for key in ("task", "preset", "effort"):
-        if _differs(typed[key], own[key]):
+        if _choice_differs(typed[key], own[key]):
             has = "the level" if own[key] is None else f"{key} {own[key]}"
             raise ConfigError(
                 f"{key}={typed[key]}: the file of --config says every setting of {has}; expected no {key}= beside it"
@@ -55,7 +55,7 @@ def stored_choices(stored: RunConfig, typed: Choices) -> dict[str, str | None]:
 def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
     """Return the settings of a stored run by the keys that they replace whole; ``$`` is hidden from OmegaConf.
 
-    A file is data: only what users type or packages contain may refer to something (:func:`show_references`).
+    A file is data: only what users type or packages contain may refer to something (:func:`restore_references`).
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
@@ -65,7 +65,7 @@ def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
     return {key: _replace_text(value, "$", "$\0") for key, value in found.items()}
 
 
-def show_references(value: Any) -> Any:
+def restore_references(value: Any) -> Any:
     """Undo what :func:`stored_settings` does to ``$``. No YAML text has the character 0."""
     return _replace_text(value, "$\0", "$")
 
@@ -78,7 +78,7 @@ def _replace_text(value: Any, old: str, new: str) -> Any:
     return value.replace(old, new) if isinstance(value, str) else value
 
 
-def _choices_of(stored: RunConfig) -> dict[str, str | None]:
+def _stored_choices_of(stored: RunConfig) -> dict[str, str | None]:
     made = stored.made_by
 
     def name_of(name: str, maker: PluginVersion | None) -> str:
@@ -92,7 +92,7 @@ def _choices_of(stored: RunConfig) -> dict[str, str | None]:
     }
 
 
-def _differs(typed: str | None, own: str | None) -> bool:
+def _choice_differs(typed: str | None, own: str | None) -> bool:
     return typed is not None and split_plugin_name(typed)[1] != split_plugin_name(own or "")[1]
 
 
@@ -122,7 +122,7 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
         directory = output_directory(None, run_name(task, scene), True)
     bare = not has_file and typed.keys() <= {"resume", "output_dir"}
     if (directory / "config.yaml").is_file() and (bare or not (directory / _SEARCH).exists()):
-        refuse_links(directory)
+        refuse_run_links(directory)
         try:
             return RunConfig.from_yaml(directory)
         except ConfigError as error:  # as of a version with other settings
@@ -141,12 +141,12 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
 
 def resumed_choices(begun: RunConfig, typed: Choices) -> dict[str, str | None]:
     """Return task, scene and preset of a run that goes on, which may not change, and the level that was typed."""
-    own = _choices_of(begun)
+    own = _stored_choices_of(begun)
     for key in ("task", "scene", "preset"):
-        if _differs(typed[key], own[key]):
+        if _choice_differs(typed[key], own[key]):
             if key == "task":
                 TASKS.find(str(typed[key]))  # a typing error is no other task
-            raise _contradiction(begun, key, typed[key], own[key])
+            raise _resume_contradiction(begun, key, typed[key], own[key])
     return {key: typed[key] or own[key] for key in CHOICES}
 
 
@@ -159,10 +159,10 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
     before, after = _fixed_settings(begun), _fixed_settings(now)
     for key, value in before.items():
         if key not in free and key in after and after[key] != value:
-            raise _contradiction(begun, key, after[key], value)
+            raise _resume_contradiction(begun, key, after[key], value)
 
 
-def _contradiction(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
+def _resume_contradiction(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
     return ConfigError(
         f"{key}={format_value(typed)}: the run to resume was begun with {key}={format_value(was)} ({begun.source}); "
         f"expected that, no {key}, or another output_dir"
@@ -180,7 +180,7 @@ def _fixed_settings(config: RunConfig) -> dict[str, Any]:
 # ---------------------------------------------------------------- what a file may reach
 
 
-def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> None:
+def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None = None) -> None:
     """Raise ConfigError for what a configuration from a file would reach outside of its run, unless it is trusted.
 
     Args:
@@ -213,7 +213,7 @@ def check_stored(config: RunConfig, typed: Mapping[str, Any] | None = None) -> N
         )
 
 
-def refuse_links(run_dir: Path) -> None:
+def refuse_run_links(run_dir: Path) -> None:
     """Raise ConfigError for a folder in a run directory that is a link out of it, unless the user trusts it."""
     if trusted() or not run_dir.is_dir():
         return

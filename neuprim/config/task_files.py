@@ -22,7 +22,7 @@ from importlib.resources.abc import Traversable
 from typing import TYPE_CHECKING, Any
 
 from neuprim.config.overrides import Assignment, quote_override
-from neuprim.config.setting_checks import complete_options
+from neuprim.config.setting_checks import complete_task_options
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import format_value, refuse_unknown
 
@@ -57,14 +57,14 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
     """Read ``task/NAME.yaml``, which names only what the task has."""
     place = f"task/{spec.name}.yaml"
     who = f"task {spec.name!r}: {place}"
-    node = read_yaml(package_root(spec) / place, who)
+    node = read_task_yaml(find_config_package(spec) / place, who)
     try:
         refuse_unknown(node, ("scene", "preset", "options"), "")
         scene, preset = node.get("scene") or spec.scenes[0].name, node.get("preset") or DEFAULT_PRESET
         for key, value, names in (("scene", scene, [s.name for s in spec.scenes]), ("preset", preset, presets(spec))):
             if value not in names:
                 raise ConfigError(f"{key}={value}: no such {key}" + nearest(str(value), names))
-        options = complete_options(spec.options, node.get("options") or {}, "its TaskSpec", "options")
+        options = complete_task_options(spec.options, node.get("options") or {}, "its TaskSpec", "options")
     except ConfigError as error:
         raise ConfigError(f"{who}: {error}") from error
     return TaskChoices(scene, preset, options)
@@ -72,7 +72,7 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
 
 def presets(spec: TaskSpec) -> list[str]:
     """Return the names of a task's presets."""
-    folder = package_root(spec) / "preset" / spec.name
+    folder = find_config_package(spec) / "preset" / spec.name
     entries = folder.iterdir() if folder.is_dir() else ()
     return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
 
@@ -84,33 +84,33 @@ def check_groups(spec: TaskSpec) -> None:
         raise ConfigError(f"{who}: its TaskSpec has no scenes")
     places = [f"task/{spec.name}.yaml", *(f"scene/{spec.name}/{scene.name}.yaml" for scene in spec.scenes)]
     for place in places:
-        _require_file(spec.config_package, place, who)
+        _require_config_file(spec.config_package, place, who)
     if not presets(spec):
         raise ConfigError(f"{who}: {spec.config_package} has no preset/{spec.name}/*.yaml")
 
 
 def check_scene(spec: TaskSpec, scene: str, package: str) -> None:
     """Raise ConfigError when the package that adds ``scene`` to a task has no YAML file for it."""
-    _require_file(package, f"scene/{spec.name}/{scene}.yaml", f"scene {scene!r} of task {spec.name!r}")
+    _require_config_file(package, f"scene/{spec.name}/{scene}.yaml", f"scene {scene!r} of task {spec.name!r}")
 
 
-def _require_file(package: str, place: str, who: str) -> None:
-    if not (_open_package(package, who) / place).is_file():
+def _require_config_file(package: str, place: str, who: str) -> None:
+    if not (_open_config_package(package, who) / place).is_file():
         raise ConfigError(f"{who}: {package} has no {place}")
 
 
-def package_root(spec: TaskSpec) -> Traversable:
+def find_config_package(spec: TaskSpec) -> Traversable:
     """Return where a task's YAML files lie. Raise ConfigError when its package cannot be opened."""
-    return _open_package(spec.config_package, f"task {spec.name!r}")
+    return _open_config_package(spec.config_package, f"task {spec.name!r}")
 
 
-def read_group(spec: TaskSpec, group: str, name: str, package: str | None = None) -> dict[str, Any]:
+def read_config_group(spec: TaskSpec, group: str, name: str, package: str | None = None) -> dict[str, Any]:
     """Return the settings of a scene or preset over those of its ``defaults``; ``${...}`` stays as it is.
 
     Args:
         package: that holds the file; None for the task's own.
     """
-    root = package_root(spec) if package is None else _open_package(package, f"scene {name!r}")
+    root = find_config_package(spec) if package is None else _open_config_package(package, f"scene {name!r}")
     return _read_with_defaults(root, f"{group}/{spec.name}", name, f"task {spec.name!r}: ", ())
 
 
@@ -122,16 +122,16 @@ def _read_with_defaults(
     place = f"{folder}/{name}.yaml"
     if name in readers:
         raise ConfigError(f"{who}{place}: defaults: starts from itself")
-    own = read_yaml(root / folder / f"{name}.yaml", f"{who}{place}")
+    own = read_task_yaml(root / folder / f"{name}.yaml", f"{who}{place}")
     names = own.pop("defaults", ["_self_"])
     if not isinstance(names, list) or not all(isinstance(entry, str) for entry in names):
         raise ConfigError(f"{who}{place}: defaults={format_value(names)}: expected a list of names of files")
     names += [] if "_self_" in names else ["_self_"]
     parts = [own if n == "_self_" else _read_with_defaults(root, folder, n, who, (*readers, name)) for n in names]
-    return to_plain(OmegaConf.merge(*parts), resolve=False)
+    return omegaconf_to_plain(OmegaConf.merge(*parts), resolve=False)
 
 
-def read_yaml(file: Traversable, who: str) -> dict[str, Any]:
+def read_task_yaml(file: Traversable, who: str) -> dict[str, Any]:
     """Return a YAML file of a task's package as a mapping; an error begins with ``who``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -141,10 +141,10 @@ def read_yaml(file: Traversable, who: str) -> dict[str, Any]:
         node = OmegaConf.create(file.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, OmegaConfBaseException, YAMLError) as error:
         raise ConfigError(f"{who} cannot be read ({' '.join(str(error).split())})") from error
-    return to_plain(node, resolve=False, who=who)
+    return omegaconf_to_plain(node, resolve=False, who=who)
 
 
-def to_plain(node: Any, resolve: bool = True, who: str = "configuration") -> dict[str, Any]:
+def omegaconf_to_plain(node: Any, resolve: bool = True, who: str = "configuration") -> dict[str, Any]:
     """Return an OmegaConf mapping as plain values; an error begins with ``who``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
@@ -159,7 +159,7 @@ def to_plain(node: Any, resolve: bool = True, who: str = "configuration") -> dic
     return {str(key): value for key, value in plain.items()}
 
 
-def _open_package(name: str, who: str) -> Traversable:
+def _open_config_package(name: str, who: str) -> Traversable:
     try:
         return resources.files(name)
     except (Exception, SystemExit) as error:  # importing a package can fail in any way
@@ -170,13 +170,13 @@ def _open_package(name: str, who: str) -> Traversable:
 # ---------------------------------------------------------------- levels of effort
 
 
-def choose_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]) -> Level | None:
+def choose_effort_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]) -> Level | None:
     """Return the level that ``effort=N`` names, which must be of the ``preset`` that was typed, if any."""
     if chosen is None:
         return None
     if chosen not in map(str, LEVELS):
         raise ConfigError(f"{EFFORT}={chosen}: expected a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)")
-    levels = read_levels(spec, presets)
+    levels = read_effort_levels(spec, presets)
     typed = f"{EFFORT}={chosen}"
     if levels is None:
         instead = "set model.primitives=N and train.iterations=N instead"
@@ -188,21 +188,21 @@ def choose_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets
     return level
 
 
-def read_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
+def read_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
     """Return a task's levels by their numbers; None where it has none."""
     place = f"effort/{spec.name}.yaml"
-    file = package_root(spec) / place
+    file = find_config_package(spec) / place
     if not file.is_file():
         return None
     who = f"task {spec.name!r}: {place}"
-    node = read_yaml(file, who)
+    node = read_task_yaml(file, who)
     try:
-        return _read_levels(node, presets)
+        return _parse_effort_levels(node, presets)
     except ConfigError as error:
         raise ConfigError(f"{who}: {error}") from error
 
 
-def _read_levels(node: Mapping[str, Any], presets: Sequence[str]) -> dict[int, Level]:
+def _parse_effort_levels(node: Mapping[str, Any], presets: Sequence[str]) -> dict[int, Level]:
     refuse_unknown(node, ("preset", "levels"), "")
     preset, levels = node.get("preset"), node.get("levels")
     if preset not in presets:

@@ -160,7 +160,7 @@ def _leaf_parameters(model: Primitives) -> dict[str, Tensor]:
     return model.params
 
 
-def _objective(model: Primitives, view: View, seed: int) -> Tensor:
+def _image_objective(model: Primitives, view: View, seed: int) -> Tensor:
     """Return a smooth scalar that depends on everything visible."""
     out = render(model, view.camera, view.conditions, EXACT)
     weight = torch.rand(out.rgb.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) + 0.5
@@ -172,7 +172,7 @@ def check_gradients(t: TaskUnderTest) -> None:
     model = t.perturbed_model()
     params = _leaf_parameters(model)
     for i, view in enumerate(map(_double_view, t.views)):
-        _objective(model, view, i).backward()
+        _image_objective(model, view, i).backward()
     for name, value in params.items():
         if value.numel():
             where = f"{t.lower_method(name)}gradient of {name}"
@@ -182,7 +182,7 @@ def check_gradients(t: TaskUnderTest) -> None:
     for view in list(map(_double_view, t.views))[:2]:
         frozen = Primitives(model.density, _FixedShading(model, view.conditions), model.params)
         params = _leaf_parameters(frozen)
-        _objective(frozen, view, 0).backward()
+        _image_objective(frozen, view, 0).backward()
         for name, value in params.items():
             if value.numel():
                 grad = torch.zeros_like(value) if value.grad is None else value.grad
@@ -200,7 +200,7 @@ def _compare_with_differences(t: TaskUnderTest, model: Primitives, view: View, n
             changed.reshape(-1)[entry] += sign * step
             model.params = {**constants, name: changed}
             with torch.no_grad():
-                values.append(float(_objective(model, view, 0)))
+                values.append(float(_image_objective(model, view, 0)))
         model.params = leaves
         return (values[0] - values[1]) / (2 * step)
 

@@ -13,8 +13,8 @@ import torch
 from torch import Tensor
 
 from neuprim.config import check_groups, preset_settings, presets, task_choices
-from neuprim.config.setting_checks import complete_options
-from neuprim.config.task_files import Level, read_levels
+from neuprim.config.setting_checks import complete_task_options
+from neuprim.config.task_files import Level, read_effort_levels
 from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest, drawn_range, random_condition
 from neuprim.core import checkpoint
 from neuprim.core.channels import find_channels
@@ -57,7 +57,7 @@ def check_description(t: TaskUnderTest) -> None:
     choice = task_choices(t.task)
     known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
     chosen: list[tuple[str, str, Level | None]] = [(f"preset {preset}", preset, None) for preset in presets(t.task)]
-    levels = read_levels(t.task, presets(t.task)) or {}
+    levels = read_effort_levels(t.task, presets(t.task)) or {}
     chosen += [(f"effort {number}", level.preset, level) for number, level in levels.items()]
     for where, preset, level in chosen:
         settings = preset_settings(t.task, preset, choice.scene, level)
@@ -92,7 +92,7 @@ def check_description(t: TaskUnderTest) -> None:
 
 def _require_accepted(t: TaskUnderTest, where: str, model: dict[str, Any], options: dict[str, Any]) -> None:
     try:
-        complete = complete_options(t.task.options, options, f"task {t.task.name!r}")
+        complete = complete_task_options(t.task.options, options, f"task {t.task.name!r}")
         t.task.check(build_settings(t.task, validate(ModelSettings, model, "model"), complete))
     except ConfigError as error:
         t.require(False, where, f"a setting that is refused ({error})", "settings that the task accepts")
@@ -214,7 +214,7 @@ def check_conditions(t: TaskUnderTest) -> None:
     for spec in t.task.conditions:
         where = f"condition {spec.name!r}"
         t.require(spec.name.isidentifier(), where, repr(spec.name), "letters, digits and _, as it becomes a flag")
-        _check_parsing(t, spec, where)
+        _check_condition_parsing(t, spec, where)
         generator = torch.Generator().manual_seed(9)
         ends = [torch.full(spec.shape, float(end)) for end in spec.range]
         for value in (*ends, random_condition(spec, generator)):
@@ -234,7 +234,7 @@ def _with_condition(view: View, spec: ConditionSpec, value: Tensor) -> View:
     return replace(view, conditions={**view.conditions, spec.name: value})
 
 
-def _check_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
+def _check_condition_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
     low, high = drawn_range(spec)
     expected = torch.full(spec.shape, low + 0.25 * (high - low))
     text = ",".join(f"{x:g}" for x in expected.flatten().tolist())
@@ -257,7 +257,7 @@ def _check_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
 _STEPS = 4  # before the checkpoint and again after it; the population changes twice in each half
 
 
-def _supervision(t: TaskUnderTest, index: int) -> Supervision:
+def _training_supervision(t: TaskUnderTest, index: int) -> Supervision:
     pixels = t.dataset.train.pixels(index)
     return Supervision(t.dataset.train.view(index), pixels.mask, pixels.alpha)
 
@@ -265,7 +265,7 @@ def _supervision(t: TaskUnderTest, index: int) -> Supervision:
 def check_loss(t: TaskUnderTest) -> None:
     """The loss is one finite number with a finite gradient, least where image and truth agree, also under a mask."""
     loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
-    frame = _supervision(t, 0)
+    frame = _training_supervision(t, 0)
     truth = t.dataset.train.pixels(0).over(t.dataset.background)
     off = (truth + 0.2 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(2))).requires_grad_()
     value, parts = loss(off, truth, frame)
@@ -293,18 +293,18 @@ def check_resume(t: TaskUnderTest) -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "checkpoint.safetensors"
         tensors, header = first.state()
-        checkpoint.write(path, "checkpoint", tensors, {"task": t.task.name, **header})
-        header, tensors = checkpoint.read(path, "checkpoint")
+        checkpoint.write_tensors(path, "checkpoint", tensors, {"task": t.task.name, **header})
+        header, tensors = checkpoint.read_tensors(path, "checkpoint")
         second.load_state(tensors, header, str(path))
     for _ in range(_STEPS):
         second.train_step()
     expected, found = whole.state()[0], second.state()[0]
     where = f"{2 * _STEPS} steps against {_STEPS} + resume + {_STEPS}"
     t.require(set(expected) == set(found), where, f"tensors {sorted(set(expected) ^ set(found))} in one", "the same")
-    _require_equal(t, where, expected, found)
+    _require_equal_tensors(t, where, expected, found)
 
 
-def _require_equal(t: TaskUnderTest, where: str, a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
+def _require_equal_tensors(t: TaskUnderTest, where: str, a: dict[str, Tensor], b: dict[str, Tensor]) -> None:
     for name, value in a.items():
         same = value.shape == b[name].shape and torch.equal(value, b[name])
         t.require(same, f"{where}: {name}", "different values", "equal bits")
@@ -318,8 +318,8 @@ def check_save_load(t: TaskUnderTest) -> None:
         path = Path(folder) / "model.safetensors"
         checkpoint.save_model(path, model, t.task.name, {})
         loaded = checkpoint.load_model(path, t.task)[0]
-        _require_equal(t, "after loading", model.params, loaded.params)
-        _require_equal(t, "after folding twice", canonical.params, canonicalize(canonical).params)
+        _require_equal_tensors(t, "after loading", model.params, loaded.params)
+        _require_equal_tensors(t, "after folding twice", canonical.params, canonicalize(canonical).params)
         for view in t.views[:3]:
             image = t.draw("saved", model, view)
             for where, other, tolerance in (("loading", loaded, 0.0), ("folding", canonical, 1e-4)):
@@ -331,4 +331,4 @@ def check_save_load(t: TaskUnderTest) -> None:
             again = Primitives(model.density, model.colour, stored[-1])
             checkpoint.save_compressed(Path(folder) / "model.neuprim", again, t.task.name, {}, LEVELS[1])
             stored.append(checkpoint.load_model(Path(folder) / "model.neuprim", t.task)[0].params)
-        _require_equal(t, "compressed twice", stored[1], stored[2])
+        _require_equal_tensors(t, "compressed twice", stored[1], stored[2])

@@ -32,7 +32,7 @@ _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitiv
 """Of a header: what any reader may take for a number of at least 0, or nothing."""
 
 
-def write(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
+def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
     """Write tensors and a JSON header atomically; a full disk or a kill leaves the previous file untouched."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
     compact = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
@@ -95,7 +95,7 @@ def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
         return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
 
 
-def read(
+def read_tensors(
     path: Path, kind: str, rows: Callable[[str, tuple[int, ...]], slice | None] = lambda name, shape: None
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
@@ -130,7 +130,9 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
     tensors, sparse = store_sparse(model.params, specs)
-    write(path, "model", tensors, {**model_header(model, task, extra), **({"sparse": sparse} if sparse else {})})
+    write_tensors(
+        path, "model", tensors, {**model_header(model, task, extra), **({"sparse": sparse} if sparse else {})}
+    )
 
 
 def save_compressed(
@@ -174,7 +176,7 @@ def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict
     return {"task": task, "primitives": model.count, **fields, **extra}
 
 
-def extra_of(header: Mapping[str, Any]) -> dict[str, Any]:
+def read_header_extra(header: Mapping[str, Any]) -> dict[str, Any]:
     """Of a model's header, what :func:`save_model` was given beside the model itself."""
     own = ("format", "kind", "task", "primitives", "density", "colour")
     return {key: value for key, value in header.items() if key not in own}
@@ -190,7 +192,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     if header.get("task") != task.name:
         raise CheckpointError(f"{path}: written for task {cut(repr(header.get('task')))}; expected {task.name!r}")
     density, colour = (_read_field(path, header, task, kind) for kind in ("density", "colour"))
-    _, tensors = read(path, "model")
+    _, tensors = read_tensors(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
         found = f"{type(density).__name__} and {type(colour).__name__}"
         raise CheckpointError(f"{path}: density and colour fields are {found}; expected one of each")

@@ -46,7 +46,7 @@ def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
-def split_words(
+def split_conditions(
     words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool = True
 ) -> tuple[dict[str, str], list[str]]:
     """Return condition name -> text out of the words of a command, and the other words in their order.
@@ -102,7 +102,7 @@ def read_conditions(
     return {spec.name: _read_condition(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
 
 
-def in_step(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
+def count_common_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
     """Return how many frames conditions have together; those of one value hold it in all frames, others must agree."""
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if len(set(counts.values())) > 1:
@@ -208,7 +208,7 @@ def export_frames(
     if counts and not several:
         name = next(iter(counts))
         raise ConfigError(f"{flag(name)} {texts[name]}: {counts[name]} values; expected one value")
-    frames = in_step(texts, found)
+    frames = count_common_frames(texts, found)
     return [{name: values[i if len(values) > 1 else 0] for name, values in found.items()} for i in range(frames)]
 
 

@@ -137,7 +137,7 @@ def validate(cls: type[T], values: object, where: str = "") -> T:
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
             name = join_key(where, field.name)
-            raise ConfigError(f"{name}: required and not given; expected {_words(hints[field.name], name)}")
+            raise ConfigError(f"{name}: required and not given; expected {_describe_expected(hints[field.name], name)}")
     return cls(
         **{name: coerce(values[name], hint, join_key(where, name)) for name, hint in hints.items() if name in values}
     )
@@ -153,11 +153,11 @@ def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str,
     """
     refuse_unknown(found, offered, where)
     for key, value in found.items():
-        hint = _offered(offered[key])
+        hint = _choice_type(offered[key])
         made = coerce(value, hint, join_key(where, key))
         if made != value or (isinstance(made, int) and isinstance(value, float)):
             # "1e-3" for a number, 3 for text, 4.0 for a whole number: the field gets the value itself
-            raise _Unfit(join_key(where, key), value, _words(hint, join_key(where, key)))
+            raise _UnfitValue(join_key(where, key), value, _describe_expected(hint, join_key(where, key)))
 
 
 def validate_fields(settings: Any, where: str) -> None:
@@ -171,13 +171,13 @@ def validate_fields(settings: Any, where: str) -> None:
 
 def coerce(value: Any, hint: Any, where: str) -> Any:
     """Return ``value`` as the annotated type ``hint``, within its bounds; a ConfigError names ``where``."""
-    plain, notes = _unwrapped(hint)
+    plain, notes = _split_annotation(hint)
     if get_origin(plain) in (Union, types.UnionType):
-        return _one_of(value, get_args(plain), where)
-    made = _plain(value, plain, notes, where)
+        return _coerce_union(value, get_args(plain), where)
+    made = _coerce_plain(value, plain, notes, where)
     for note in notes:
         if isinstance(note, Range | Accepts) and not note.accepts(made):
-            raise _Unfit(where, value, note.says or note.words("a whole number" if plain is int else "a number"))
+            raise _UnfitValue(where, value, note.says or note.words("a whole number" if plain is int else "a number"))
     return made
 
 
@@ -194,17 +194,17 @@ def infer_type(default: Any) -> Any:
 
 def option_type(option: Option) -> Any:
     """What an option's values are converted to."""
-    return _offered(option[2]) if len(option) == 3 else infer_type(option[0])
+    return _choice_type(option[2]) if len(option) == 3 else infer_type(option[0])
 
 
-def _offered(kind: Any) -> Any:
+def _choice_type(kind: Any) -> Any:
     return Literal[kind] if isinstance(kind, tuple) else kind
 
 
 # ---------------------------------------------------------------- messages
 
 
-class _Unfit(ConfigError):
+class _UnfitValue(ConfigError):
     """A value that is not what its field expects."""
 
     def __init__(self, where: str, value: object, expected: str) -> None:
@@ -244,22 +244,22 @@ def _reads_as_number(value: str) -> bool:
     return True
 
 
-def _words(hint: Any, where: str) -> str:
+def _describe_expected(hint: Any, where: str) -> str:
     """What a field expects."""
-    plain, notes = _unwrapped(hint)
+    plain, notes = _split_annotation(hint)
     says = next((note.says for note in notes if isinstance(note, Accepts)), "")
     if says:
         return says
     origin, args = get_origin(plain), get_args(plain)
     if origin in (Union, types.UnionType):
-        return ", or ".join("null" if a is type(None) else _words(a, where) for a in args)
+        return ", or ".join("null" if a is type(None) else _describe_expected(a, where) for a in args)
     if origin is Literal:
-        return _either(args)
+        return _join_choices(args)
     if origin in (tuple, list):
         return (
-            f"a list, each {_words(args[0], where)}"
+            f"a list, each {_describe_expected(args[0], where)}"
             if origin is list or args[-1] is ...
-            else f"a list of {', '.join(_words(a, where) for a in args)}"
+            else f"a list of {', '.join(_describe_expected(a, where) for a in args)}"
         )
     if plain is str:
         return f"text (quote it: {where}='...')"
@@ -270,7 +270,7 @@ def _words(hint: Any, where: str) -> str:
     return kind if bounds is None else bounds.words(kind)
 
 
-def _either(values: tuple[object, ...]) -> str:
+def _join_choices(values: tuple[object, ...]) -> str:
     words = ["null" if v is None else str(v) for v in values]
     return words[0] if len(words) == 1 else ", ".join(words[:-1]) + " or " + words[-1]
 
@@ -285,12 +285,12 @@ def field_types(cls: type) -> Mapping[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
-def _unwrapped(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+def _split_annotation(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """The type without its notes, and these."""
     return (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
 
 
-def _one_of(value: Any, options: tuple[Any, ...], where: str) -> Any:
+def _coerce_union(value: Any, options: tuple[Any, ...], where: str) -> Any:
     """The value as the first of the types that it is one of."""
     if value is None and type(None) in options:
         return None
@@ -299,15 +299,15 @@ def _one_of(value: Any, options: tuple[Any, ...], where: str) -> Any:
         if option is not type(None):
             try:
                 return coerce(value, option, where)
-            except _Unfit as error:
+            except _UnfitValue as error:
                 if error.where != where:  # inside of a group that is the right one
                     raise
                 refused.append(error.expected)
     expected = ", or ".join([*refused, *(["null"] if type(None) in options else [])])
-    raise _Unfit(where, value, expected)
+    raise _UnfitValue(where, value, expected)
 
 
-def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
+def _coerce_plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
     """``value`` as a type without notes; they are for the message alone."""
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
@@ -319,7 +319,7 @@ def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
             return value
     elif isinstance(origin, type) and issubclass(origin, Mapping):
         if isinstance(value, Mapping):
-            return _entries(value, args, where)
+            return _coerce_entries(value, args, where)
         raise ConfigError(f"{where}={format_value(value)}: expected entries, each as {where}.KEY=VALUE")
     elif origin in (tuple, list):
         items = (
@@ -328,22 +328,22 @@ def _plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
         if isinstance(value, list | tuple) and len(items) == len(value):
             try:
                 return origin(coerce(v, item, where) for v, item in zip(value, items, strict=True))
-            except _Unfit:  # said of the whole list, below
+            except _UnfitValue:  # said of the whole list, below
                 pass
-    elif (made := _scalar(value, kind)) is not None:
+    elif (made := _coerce_scalar(value, kind)) is not None:
         return made
     hint = Annotated[kind, *notes] if notes else kind
-    raise _Unfit(where, value, _words(hint, where))
+    raise _UnfitValue(where, value, _describe_expected(hint, where))
 
 
-def _entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dict[str, Any]:
+def _coerce_entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dict[str, Any]:
     names, kind = args
     if get_origin(names) is Literal:
         refuse_unknown(value, get_args(names), where)
     return {str(k): coerce(v, kind, join_key(where, str(k))) for k, v in value.items()}
 
 
-def _scalar(value: Any, kind: Any) -> Any:
+def _coerce_scalar(value: Any, kind: Any) -> Any:
     """``value`` as a ``kind``, or None where it is none."""
     truth = isinstance(value, bool)
     if kind is bool:

@@ -44,7 +44,7 @@ def write_task_package(name: str, out: Path | None = None) -> list[str]:
         raise ConfigError(f"{folder}: exists; expected a folder to make (--out DIR)")
 
     template = resources.files("neuprim.plugins") / "template"
-    publish_folder(folder, lambda draft: _write(template, draft, variables), lambda path: path.exists())
+    publish_folder(folder, lambda draft: _write_template(template, draft, variables), lambda path: path.exists())
     place = folder if folder.is_absolute() else f"./{folder}"  # pip takes a bare name for a package of the index
     return [
         f"wrote {folder}: a task {name!r} that works; change {variables['package']}/fields.py and scene.py into yours",
@@ -56,12 +56,12 @@ def write_task_package(name: str, out: Path | None = None) -> list[str]:
     ]
 
 
-def _write(source: Traversable, target: Path, variables: dict[str, str]) -> None:
+def _write_template(source: Traversable, target: Path, variables: dict[str, str]) -> None:
     for entry in source.iterdir():
         name = entry.name.replace("PACKAGE", variables["package"]).replace("NAME", variables["name"])
         if entry.is_dir():
             (target / name).mkdir()
-            _write(entry, target / name, variables)
+            _write_template(entry, target / name, variables)
         elif name.endswith(_TEMPLATE_SUFFIX):
             text = Template(entry.read_text(encoding="utf-8")).substitute(variables)
             (target / name.removesuffix(_TEMPLATE_SUFFIX)).write_text(text, encoding="utf-8", newline="\n")

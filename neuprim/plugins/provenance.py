@@ -32,16 +32,16 @@ T = TypeVar("T")
 _LONGEST = 200
 
 
-def _is_version(value: Any) -> bool:
+def _is_version_text(value: Any) -> bool:
     return isinstance(value, str) and len(value) <= _LONGEST and value.isprintable()
 
 
-def _is_name(value: Any) -> bool:
-    return _is_version(value) and bool(value.strip()) and ":" not in value
+def _is_plugin_name(value: Any) -> bool:
+    return _is_version_text(value) and bool(value.strip()) and ":" not in value
 
 
-_Name = Annotated[str, Accepts(_is_name, f"a name of at most {_LONGEST} characters")]
-_Version = Annotated[str, Accepts(_is_version, f"a version of at most {_LONGEST} characters")]
+_Name = Annotated[str, Accepts(_is_plugin_name, f"a name of at most {_LONGEST} characters")]
+_Version = Annotated[str, Accepts(_is_version_text, f"a version of at most {_LONGEST} characters")]
 
 
 @dataclass(frozen=True)
@@ -131,9 +131,9 @@ def load_recorded_plugin(
     try:
         info, spec = group.load_with_info(qualified_plugin_name(plugin.package, entry or plugin.name))
     except UnknownPlugin as error:
-        raise ConfigError(_in_file(file, missing_plugin_message(group, plugin))) from error
+        raise ConfigError(_prefix_config_file(file, missing_plugin_message(group, plugin))) from error
     if not info.built_in:
-        _warn_of_version(file, plugin, group.kind, PluginVersion.of(info))
+        _warn_of_plugin_version(file, plugin, group.kind, PluginVersion.of(info))
     return info, spec
 
 
@@ -149,7 +149,9 @@ def missing_plugin_message(group: PluginGroup[Any], plugin: PluginVersion) -> st
 def warn_of_other_neuprim(made_by: Provenance, file: Path | None = None) -> None:
     """Warn if another minor version of neuprim made a run; patch versions keep results."""
     if _minor_version(made_by.neuprim) != _minor_version(__version__):
-        warn_once(_in_file(file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"))
+        warn_once(
+            _prefix_config_file(file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}")
+        )
 
 
 def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:
@@ -167,16 +169,16 @@ def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> Non
     for kind, old in before.plugins.items():
         new = now.plugins.get(kind)
         if new is not None and new.qualified_name == old.qualified_name and canonicalize_name(old.package) != BUILT_IN:
-            _warn_of_version(file, old, kind, new)
+            _warn_of_plugin_version(file, old, kind, new)
 
 
-def _warn_of_version(file: Path | None, plugin: PluginVersion, kind: str, installed: PluginVersion) -> None:
+def _warn_of_plugin_version(file: Path | None, plugin: PluginVersion, kind: str, installed: PluginVersion) -> None:
     if installed.version != plugin.version:
         text = f"this run was made by {plugin.origin} ({kind} {plugin.name}); installed is {installed.origin}"
-        warn_once(_in_file(file, text))
+        warn_once(_prefix_config_file(file, text))
 
 
-def _in_file(file: Path | None, text: str) -> str:
+def _prefix_config_file(file: Path | None, text: str) -> str:
     return text if file is None else f"{file}: {text}"
 
 

@@ -22,7 +22,7 @@ _FUNCTIONS = ("Callable", "Display", "Illuminate")
 """How annotations of functions begin."""
 
 
-class _Invalid(Exception):
+class _InvalidMember(Exception):
     """A member that cannot be used; the text says which, what it is and what was expected."""
 
 
@@ -30,14 +30,14 @@ def validate_spec(spec: Any) -> str | None:
     """Return ``"MEMBER is WHAT; expected WHAT"`` of the first member that cannot be used; None if all can."""
     try:
         _check_spec(spec)
-    except _Invalid as problem:
+    except _InvalidMember as problem:
         return str(problem)
     return None
 
 
 def _require_member(ok: bool, text: str) -> None:
     if not ok:
-        raise _Invalid(text)
+        raise _InvalidMember(text)
 
 
 def _check_spec(spec: Any) -> None:
@@ -58,14 +58,14 @@ def _check_spec(spec: Any) -> None:
         elif kind.startswith("Mapping"):
             _require_member(isinstance(value, Mapping), f"{found}; expected a mapping")
         elif kind in _NESTED:
-            _check_member(value, _NESTED[kind], name)
+            _check_spec_member(value, _NESTED[kind], name)
         elif kind.startswith("tuple"):
             nested = _NESTED.get(kind.removeprefix("tuple[").removesuffix(", ...]"))
             expected = "a tuple" if nested is None else f"a tuple of {nested.__name__}"
             _require_member(isinstance(value, tuple | list), f"{found}; expected {expected}")
             if nested is not None:
                 for i, entry in enumerate(value):
-                    _check_member(entry, nested, f"{name}[{i}]")
+                    _check_spec_member(entry, nested, f"{name}[{i}]")
                 names = [entry.name for entry in value]
                 _require_member(len(set(names)) == len(names), f"{name} has two of one name among {', '.join(names)}")
     for kind_of_spec, check in _CHECKS.items():
@@ -73,16 +73,16 @@ def _check_spec(spec: Any) -> None:
             check(spec)
 
 
-def _check_member(member: Any, kind: type, where: str) -> None:
+def _check_spec_member(member: Any, kind: type, where: str) -> None:
     _require_member(isinstance(member, kind), f"{where} is of type {type(member).__name__}; expected a {kind.__name__}")
     try:
         _check_spec(member)
-    except _Invalid as problem:
-        raise _Invalid(f"{where}.{problem}") from None
+    except _InvalidMember as problem:
+        raise _InvalidMember(f"{where}.{problem}") from None
 
 
-def _check_task(spec: TaskSpec) -> None:
-    _check_options(spec, "model.", "train.")
+def _check_task_spec(spec: TaskSpec) -> None:
+    _check_spec_options(spec, "model.", "train.")
     for name, field in (spec.fields or {}).items():
         where, is_field = f"fields[{name!r}]", isinstance(field, type) and issubclass(field, Field)
         _require_member(is_field, f"{where} is {field!r}; expected a subclass of neuprim.core.model.fields.Field")
@@ -96,13 +96,13 @@ def _check_channel_names(names: Any) -> None:
     _require_member(wrong is None, f"channels{wrong}")
 
 
-def _check_condition(spec: ConditionSpec) -> None:
+def _check_condition_spec(spec: ConditionSpec) -> None:
     ends = spec.range
     numbers = len(ends) == 2 and all(isinstance(end, int | float) for end in ends)
     _require_member(numbers and ends[0] < ends[1], f"range is {ends!r}; expected a lower and a higher number")
 
 
-def _check_layer(spec: LayerSpec) -> None:
+def _check_layer_spec(spec: LayerSpec) -> None:
     short = spec.name.isidentifier() and spec.name.isascii() and len(spec.name) <= 31
     _require_member(short, f"name is {spec.name!r}; expected at most 31 letters, digits and _")
     taken = spec.name in {LIGHTS, *(common.name for common in COMMON)} or spec.name.startswith("light_")
@@ -119,7 +119,7 @@ def _check_inspector(spec: Inspector) -> None:
         signature.bind(None)
     except TypeError:
         expected = "expected one of a frame alone, returning layers"
-        raise _Invalid(f"layers is a function of {signature}; {expected}") from None
+        raise _InvalidMember(f"layers is a function of {signature}; {expected}") from None
 
 
 def _check_exporter(spec: Exporter) -> None:
@@ -135,7 +135,7 @@ def _check_exporter(spec: Exporter) -> None:
     _require_member(fits, f"default is {default!r}; expected a name that ends in {' or '.join(suffixes)}")
 
 
-def _check_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
+def _check_spec_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
     """Check ``options``, and ``uses``, which may name optional settings of these groups."""
     for name, entry in spec.options.items():
         known = isinstance(name, str) and name.isidentifier()
@@ -148,17 +148,17 @@ def _check_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
         try:
             coerce(entry[0], option_type(tuple(entry)), where)
         except ConfigError as error:
-            raise _Invalid(f"the default of {error}") from None
+            raise _InvalidMember(f"the default of {error}") from None
     names = [name for name in OPTIONAL if name.startswith(groups)]
     for name in spec.uses:
         _require_member(name in names, f"uses has {name!r}; expected some of {', '.join(names)}")
 
 
 _CHECKS: dict[type, Any] = {
-    TaskSpec: _check_task,
-    ConditionSpec: _check_condition,
-    LayerSpec: _check_layer,
-    LossExtension: lambda spec: _check_options(spec, "train."),
+    TaskSpec: _check_task_spec,
+    ConditionSpec: _check_condition_spec,
+    LayerSpec: _check_layer_spec,
+    LossExtension: lambda spec: _check_spec_options(spec, "train."),
     Exporter: _check_exporter,
     Inspector: _check_inspector,
 }

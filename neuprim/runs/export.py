@@ -16,7 +16,7 @@ import torch
 
 from neuprim.core import checkpoint
 from neuprim.core.compression import is_compressed
-from neuprim.core.conditions import flag, named, read_conditions, split_words
+from neuprim.core.conditions import flag, named, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.files import StagedOutput, refuse_existing, staged, write_json
@@ -112,7 +112,7 @@ def _parse_options(
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Options of the exporter and texts of conditions; where both have one name, ``NAME=`` means the option."""
     options = {name: default for name, (default, _) in exporter.options.items()}
-    conditions, rest = split_words(words, specs, bare=False)
+    conditions, rest = split_conditions(words, specs, bare=False)
     if conditions and not exporter.conditions:
         raise ConfigError(f"{flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
     given = set()
@@ -253,7 +253,7 @@ def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
 
     def write(folder: Path) -> None:
-        checkpoint.write(folder / "model.safetensors", "model", tensors, header)
+        checkpoint.write_tensors(folder / "model.safetensors", "model", tensors, header)
 
     return _write_imported_run(path, out, stored.config, write)
 

@@ -64,7 +64,7 @@ def make_finetune_trainer(
     trainer.step = total - steps
     saved = config.output_dir / "checkpoint.safetensors"
     if trainer.exposures is not None and saved.exists():
-        trainer.exposures.load_state(select_state_tensors(checkpoint.read(saved, "checkpoint")[1], "exposure."))
+        trainer.exposures.load_state(select_state_tensors(checkpoint.read_tensors(saved, "checkpoint")[1], "exposure."))
     return trainer
 
 

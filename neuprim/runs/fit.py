@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from neuprim.config import Job, RunConfig, find_run_plugins, made_now
+from neuprim.config import Job, RunConfig, current_provenance, find_run_plugins
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -177,7 +177,7 @@ def prepare_training(
         refuse_chunks(config, "this trains one model at once, and only a whole run can be fitted in chunks")
     backends.check_device(config.renderer)
     task = Job.of(config).task
-    config = replace(config, made_by=made_now(config, task))
+    config = replace(config, made_by=current_provenance(config, task))
     job = Job(config, task)
     # what the loss or the task refuses must not cost the loading of the data or a training
     loss = make_loss(job)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.config import Job, RunConfig
-from neuprim.config.stored_run import check_stored, refuse_links
+from neuprim.config.stored_run import refuse_run_links, refuse_untrusted_settings
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset, View
@@ -79,7 +79,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     """
     if isinstance(run, StoredRun):
         return run
-    refuse_links(run)
+    refuse_run_links(run)
     config = RunConfig.from_yaml(run / "config.yaml")
     if not named:
         config = replace(config, source=None)
@@ -100,7 +100,7 @@ def make_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
         ConfigError: a stored configuration has the scene contact an address, or write outside of the run
         (:mod:`neuprim.config.stored_run`).
     """
-    check_stored(config)
+    refuse_untrusted_settings(config)
     return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
 
 

@@ -12,7 +12,7 @@ from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, read_stored_channels
-from neuprim.core.conditions import flag, in_step, read_conditions
+from neuprim.core.conditions import count_common_frames, flag, read_conditions
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
@@ -334,7 +334,7 @@ def set_view_conditions(
         :func:`neuprim.core.conditions.read_conditions`.
     """
     given = read_conditions(task.conditions, texts, warn)
-    frames = in_step(texts, given)
+    frames = count_common_frames(texts, given)
     if frames > 1:
         count = max(frames, len(views))
         digits = max(3, len(str(count - 1)))

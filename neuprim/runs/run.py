@@ -16,7 +16,7 @@ from typing import Any
 
 from neuprim.config import Job, RunConfig, find_run_plugins
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.config.overrides import drop_place, quote_override
+from neuprim.config.overrides import drop_output_overrides, quote_override
 from neuprim.core.checkpoint import load_model
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, NeuprimError
@@ -177,7 +177,7 @@ def _override_config(
             node = node[group]
         tree["non_default"][key] = [node.get(name), value]
         node[name] = value
-    tree["output_dir"], tree["overrides"] = str(directory), [*drop_place(config.overrides), *words]
+    tree["output_dir"], tree["overrides"] = str(directory), [*drop_output_overrides(config.overrides), *words]
     return RunConfig.from_dict(tree)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.config.overrides import drop_place, parse, swept_keys
+from neuprim.config.overrides import drop_output_overrides, parse, swept_keys
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import write_text
 from neuprim.report.run_record import RunRecord, read_run
@@ -120,10 +120,10 @@ def run_sweep(
     folder, keys = configs[0].output_dir.parent, set(swept_keys(words))
     runs = []
     for config in configs:
-        own = tuple(drop_place(config.overrides))
+        own = tuple(drop_output_overrides(config.overrides))
         swept = {a.key: a.text.partition("=")[2] for a in parse(own) if a.key in keys}
         runs.append(LaunchedRun(config.output_dir.name, own, swept))
-    record = LaunchRecord(folder / SWEEP_FILE, tuple(drop_place(words)), tuple(runs))
+    record = LaunchRecord(folder / SWEEP_FILE, tuple(drop_output_overrides(words)), tuple(runs))
     record = record.resume(read_sweep(folder) if configs[0].resume else None, more=True)
     with lock_directory(folder, "sweep"):
         record, results = launch_missing_runs(record, configs, settings, on_status)

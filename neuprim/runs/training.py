@@ -94,7 +94,7 @@ def _resume_training(fitted: Fitted, events: Events) -> None:
     config, saved = fitted.config, fitted.config.output_dir / "checkpoint.safetensors"
     if not (config.resume and saved.exists()):
         return
-    header, tensors = checkpoint.read(saved, "checkpoint")
+    header, tensors = checkpoint.read_tensors(saved, "checkpoint")
     if header.get("task") != config.task:
         raise CheckpointError(f"{saved}: written for task {header.get('task')!r}; this run's task is {config.task!r}")
     check_resumed_provenance(header.get("made_by"), config.made_by, saved)
@@ -197,7 +197,7 @@ def save_training(fitted: Fitted) -> None:
     moved = not dataset.world.identity or dataset.placement is not None
     world = {"world": {**placement, **dataset.world.to_json()}} if moved else {}
     header = {"task": config.task, "made_by": config.made_by.to_dict(), **world, **header}
-    checkpoint.write(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, header)
+    checkpoint.write_tensors(config.output_dir / "checkpoint.safetensors", "checkpoint", tensors, header)
     extra: dict[str, Any] = {
         "background": [float(x) for x in dataset.background],
         "color_space": dataset.color_space,

@@ -18,7 +18,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import Job, RunConfig, compose, find_run_plugins, task_of
+from neuprim.config import Job, RunConfig, compose, find_run_plugins, load_run_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse, quote_override
@@ -98,7 +98,7 @@ def run_ablation(
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
     models = _compose_model_set(request.words, seeds, launcher)
-    folder, centre, task = models.folder, models.centre, task_of(models.centre)
+    folder, centre, task = models.folder, models.centre, load_run_task(models.centre)
     with use_one_torch_thread(), use_launcher_threads(launcher), ExitStack() as stack:
         stack.enter_context(find_run_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)

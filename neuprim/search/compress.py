@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neuprim.config import Job
-from neuprim.core.checkpoint import extra_of, load_model, save_compressed
+from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
@@ -134,7 +134,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
             stored, coding, steps = quantized.model, quantized.quantizers, quantized.steps
             notes += quantized.notes
         text = (run_dir / "config.yaml").read_text(encoding="utf-8")
-        sizes = save_compressed(final, stored, task.name, extra_of(header), coding, text)
+        sizes = save_compressed(final, stored, task.name, read_header_extra(header), coding, text)
         seconds = time.perf_counter() - start
         measured: dict[str, tuple[float, float]] = {}
         if dataset is not None:

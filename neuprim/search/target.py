@@ -16,9 +16,9 @@ from typing import Any
 
 import torch
 
-from neuprim.config import Job, RunConfig, find_run_plugins, task_of
+from neuprim.config import Job, RunConfig, find_run_plugins, load_run_task
 from neuprim.config.command_settings import LauncherSettings, Target
-from neuprim.core.checkpoint import extra_of, load_model, save_compressed
+from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import Quantizers
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -77,7 +77,7 @@ def run_target(
     record = _resume_target(config, {**target.given(), "budget": budget})
     if record.achieved:
         return record
-    plugins, begun, task, folder = find_run_plugins(config), clock(), task_of(config), config.output_dir
+    plugins, begun, task, folder = find_run_plugins(config), clock(), load_run_task(config), config.output_dir
     with lock_directory(folder, "search"), plugins.attribute_errors(), use_launcher_threads(launcher):
 
         def show_progress(text: str, fraction: float) -> None:
@@ -251,7 +251,7 @@ def _prune_full_run(
     if made.run_dir is None:
         record.why.append("nothing could be pruned")
         return before
-    task = task_of(runner.config)
+    task = load_run_task(runner.config)
     model, _ = load_model(made.run_dir / "model.safetensors", task)
     held = _measure_held_out(runner, model)
     old, new = (default_compressed_bytes(one, task) for one in (before.run_dir, made.run_dir))
@@ -272,7 +272,7 @@ def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _Tar
 
     With a limit of bytes alone, quantize as finely as it allows.
     """
-    target, task, file = predictor.target, task_of(runner.config), before.run_dir / COMPRESSED
+    target, task, file = predictor.target, load_run_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model(before.run_dir / "model.safetensors", task)
     text = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
     margin = predictor.margin(before.held)
@@ -282,7 +282,7 @@ def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _Tar
     search = QuantizationSearch(model, views, TrainingQuality.of_run(runner.config, views))
 
     def save(quantizers: Quantizers) -> int:
-        save_compressed(file, search.model, task.name, extra_of(header), quantizers, text)
+        save_compressed(file, search.model, task.name, read_header_extra(header), quantizers, text)
         return file.stat().st_size
 
     def accept(quantizers: Quantizers) -> bool:

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import Job, RunConfig, find_run_plugins, made_now, task_of
+from neuprim.config import Job, RunConfig, current_provenance, find_run_plugins, load_run_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.run_config import flatten
 from neuprim.core.data import Dataset
@@ -167,7 +167,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
 def _trial_request(trial: Trial) -> dict[str, Any]:
     """Return the settings that must be equal to reuse a folder, as JSON reads them back."""
-    config = replace(trial.config, made_by=made_now(trial.config, task_of(trial.config)))
+    config = replace(trial.config, made_by=current_provenance(trial.config, load_run_task(trial.config)))
     settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))
     return request

@@ -9,7 +9,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose, read_stored_config
-from neuprim.config.stored_run import check_stored, refuse_links
+from neuprim.config.stored_run import refuse_run_links, refuse_untrusted_settings
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.trust import ENVIRONMENT, trusting
 from neuprim.runs.open import make_scene_context
@@ -34,21 +34,21 @@ def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monk
     with pytest.raises(ConfigError, match=r"config\.yaml: scene\.cache is .*; --trust allows it, NEUPRIM_TRUST=1"):
         make_scene_context(config, lambda text, fraction: None)
     with trusting(True):
-        check_stored(config)
-    check_stored(replace(config, source=None))  # of the user's own words
+        refuse_untrusted_settings(config)
+    refuse_untrusted_settings(replace(config, source=None))  # of the user's own words
     new = f"output_dir={tmp_path / 'new'}"
     with pytest.raises(ConfigError, match=r"type scene\.cache=\.\.\. to use it"):
         compose([new], stored=config)
     assert compose(["scene.cache=null", new], stored=config).scene["cache"] is None
     monkeypatch.setenv(ENVIRONMENT, "1")
-    check_stored(config)
+    refuse_untrusted_settings(config)
 
 
 def test_a_users_own_run_is_opened_again_without_a_word(tmp_path: Path) -> None:
     config = stored(
         tmp_path / "run", *VOLUMES, f"scene.cache={tmp_path / 'run' / 'cache'}", f"metrics.lpips={tmp_path / 'weights'}"
     )
-    check_stored(config)
+    refuse_untrusted_settings(config)
     assert config.scene["vdb"] == "/data/fire"
 
 
@@ -58,7 +58,7 @@ def test_any_setting_that_is_an_address_is_named(tmp_path: Path) -> None:
     with pytest.raises(
         ConfigError, match=r"model\.init\.points is 'https://host/points\.plyx+\.\.\.', an address"
     ) as refused:
-        check_stored(config)
+        refuse_untrusted_settings(config)
     assert len(str(refused.value)) < 400
 
 
@@ -93,9 +93,9 @@ def test_folders_that_are_links_out_of_the_run_are_refused(tmp_path: Path) -> No
     run = tmp_path / "run"
     (run / "own").mkdir(parents=True)
     (run / "inside").symlink_to(run / "own")
-    refuse_links(run)
+    refuse_run_links(run)
     (run / "renders").symlink_to(tmp_path)
     with pytest.raises(ConfigError, match=r"run/renders: is a link to .*, outside of the run"):
-        refuse_links(run)
+        refuse_run_links(run)
     with trusting(True):
-        refuse_links(run)
+        refuse_run_links(run)

@@ -55,7 +55,7 @@ def rewrite(
     path: Path, header: dict[str, Any] | str | None = None, tensors: dict[str, Tensor] | None = None, **changes: Any
 ) -> None:
     """The saved model with another header or other tensors."""
-    old, values = checkpoint.read(path, "model")
+    old, values = checkpoint.read_tensors(path, "model")
     text = header if isinstance(header, str) else json.dumps({**old, **(header or {}), **changes})
     save_file({**values, **(tensors or {})}, str(path), metadata={"neuprim": text})
 
@@ -66,7 +66,7 @@ def rewrite(
 def test_round_trip(saved: Path) -> None:
     again, header = checkpoint.load_model(saved, TASK)
     torch.manual_seed(0)
-    first = checkpoint.read(saved, "model")[1]
+    first = checkpoint.read_tensors(saved, "model")[1]
     assert list(again.params) == [s.name for s in again.specs]
     assert all(torch.equal(first[k], v) for k, v in again.params.items())
     assert isinstance(again.density, CosineDensity) and again.density.neurons == 3

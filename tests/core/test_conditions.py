@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.conditions import FRAMES, export_frames, in_step, read_conditions, split_words
+from neuprim.core.conditions import FRAMES, count_common_frames, export_frames, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.tasks.relight.lighting import orbit_in_frames, parse_lights
@@ -54,7 +54,7 @@ def shifts(text: str, spec: ConditionSpec = SHIFT) -> list[float]:
     ],
 )
 def test_every_spelling_is_the_same(words: list[str]) -> None:
-    assert split_words(["a", *words, "b=1", "--c"], SPECS) == ({"wavelength_shift": "0.3"}, ["a", "b=1", "--c"])
+    assert split_conditions(["a", *words, "b=1", "--c"], SPECS) == ({"wavelength_shift": "0.3"}, ["a", "b=1", "--c"])
 
 
 @pytest.mark.parametrize(
@@ -68,7 +68,7 @@ def test_every_spelling_is_the_same(words: list[str]) -> None:
 )
 def test_a_condition_is_given_once_with_a_value(words: list[str], text: str) -> None:
     with pytest.raises(ConfigError, match=text):
-        split_words(words, SPECS)
+        split_conditions(words, SPECS)
 
 
 # ---------------------------------------------------------------- texts
@@ -186,6 +186,6 @@ def lengths(time: str, light: str) -> tuple[int, int]:
 def test_an_animation_without_a_length_takes_the_others(time: str, light: str, count: int) -> None:
     assert lengths(time, light) == (count, count)
     found = read_conditions([TIME, LIGHT], {"time": time, "light": light})
-    assert in_step({}, found) == count
+    assert count_common_frames({}, found) == count
     assert float(found["time"][0]) == pytest.approx(float(time.replace(":", ",").split(",")[0]))
     assert len({tuple(place.tolist()) for place in found["light"]}) == count, "once round, no place twice"

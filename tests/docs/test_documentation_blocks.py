@@ -18,9 +18,9 @@ from neuprim.cli.command import split_render_overrides
 from neuprim.cli.measure_commands import is_override
 from neuprim.config import compose, compose_all
 from neuprim.config.command_settings import take_launcher, take_target, take_viewer
-from neuprim.config.overrides import drop_place
+from neuprim.config.overrides import drop_output_overrides
 from neuprim.core.cameras.camera_files import read_cameras
-from neuprim.core.conditions import read_conditions, split_words
+from neuprim.core.conditions import read_conditions, split_conditions
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.images import write_png
@@ -169,7 +169,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     if name == "run":
         for take in (take_viewer, take_launcher, take_target):
             _, settings = take(settings)
-        if (args.multirun and not drop_place(settings)) or args.config is not None:
+        if (args.multirun and not drop_output_overrides(settings)) or args.config is not None:
             settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
         rest = flags
@@ -186,7 +186,7 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     elif name in ("eval", "render", "tradeoff"):
         _, rest = split_render_overrides(rest)
     if name in ("render", "inspect", "export"):
-        given, rest = split_words(rest, conditions)
+        given, rest = split_conditions(rest, conditions)
         known = {condition: text for condition, text in given.items() if not PLACEHOLDER.search(text)}
         read_conditions(conditions, known, pytest.fail)
     if name == "export":

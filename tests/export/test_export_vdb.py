@@ -178,7 +178,7 @@ def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:
     tensors = load_file(run / "model.safetensors")
     header = checkpoint.read_header(run / "model.safetensors", "model")
     tensors["log_window"] -= 3.0
-    checkpoint.write(
+    checkpoint.write_tensors(
         run / "model.safetensors", "model", tensors, {k: v for k, v in header.items() if k not in ("format", "kind")}
     )
     report = export_run(run, "vdb", tmp_path / "frames")

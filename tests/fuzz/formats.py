@@ -446,9 +446,9 @@ def _checkpoint(folder: Path) -> None:
 
 def _read_checkpoint(folder: Path) -> None:
     from neuprim.runs.fit import ignore_event
-    from neuprim.runs.training import _resume
+    from neuprim.runs.training import _resume_training
 
-    _resume(_fitted(folder), ignore_event)
+    _resume_training(_fitted(folder), ignore_event)
 
 
 _DATASETS, _IMAGES = "neuprim.tasks.static.datasets", "neuprim.core.io.images"

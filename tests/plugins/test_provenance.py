@@ -265,9 +265,9 @@ def test_damaged_records(record: Any, text: str, tmp_path: Path) -> None:
 
 
 def test_a_damaged_record_in_a_checkpoint(made: Path) -> None:
-    header, tensors = checkpoint.read(made / "checkpoint.safetensors", "checkpoint")
+    header, tensors = checkpoint.read_tensors(made / "checkpoint.safetensors", "checkpoint")
     rest = {key: value for key, value in header.items() if key not in ("format", "kind")}
-    checkpoint.write(made / "checkpoint.safetensors", "checkpoint", tensors, {**rest, "made_by": {"task": 3}})
+    checkpoint.write_tensors(made / "checkpoint.safetensors", "checkpoint", tensors, {**rest, "made_by": {"task": 3}})
     config = compose(["task=glow", *SMALL, *QUICK, "output_dir=r", "resume=true"])
     with pytest.raises(CheckpointError, match=r"^r/checkpoint.safetensors: made_by"):
         run(config)

@@ -80,7 +80,7 @@ def run(site: Path, extra: str) -> int:
 
 def written() -> tuple[dict[str, Any], dict[str, Any]]:
     """Metrics, and what the model's header says of the data."""
-    header = checkpoint.read(Path("r/model.safetensors"), "model")[0]
+    header = checkpoint.read_tensors(Path("r/model.safetensors"), "model")[0]
     return json.loads(Path("r/metrics.json").read_text()), header["data"]
 
 

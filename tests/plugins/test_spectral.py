@@ -162,14 +162,14 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, s
     import trimesh
 
     colour = torch.tensor([0.1, 0.2, 0.3, 0.6, 0.8])
-    header, tensors = checkpoint.read(trained / "model.safetensors", "model")
+    header, tensors = checkpoint.read_tensors(trained / "model.safetensors", "model")
     (tmp_path / "config.yaml").write_text((trained / "config.yaml").read_text())
     painted = {
         **tensors,
         "logit": torch.cat([colour, colour[:1]]).logit().expand(len(tensors["logit"]), 6).contiguous(),
     }
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
-    checkpoint.write(tmp_path / "model.safetensors", "model", painted, rest)
+    checkpoint.write_tensors(tmp_path / "model.safetensors", "model", painted, rest)
     report = export_run(tmp_path, "mesh", tmp_path / f"m.{suffix}", ["grid=32", "wavelength_shift=0"])
     assert f"colours: {THROUGH}" in report.notes
     ball = trimesh.load(report.files[0], force="mesh", process=False)
@@ -202,10 +202,10 @@ def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
 
 
 def test_a_damaged_header_is_the_files_fault(trained: Path, tmp_path: Path) -> None:
-    header, tensors = checkpoint.read(trained / "model.safetensors", "model")
+    header, tensors = checkpoint.read_tensors(trained / "model.safetensors", "model")
     (tmp_path / "config.yaml").write_text((trained / "config.yaml").read_text())
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
-    checkpoint.write(tmp_path / "model.safetensors", "model", tensors, {**rest, "channels": ["a"]})
+    checkpoint.write_tensors(tmp_path / "model.safetensors", "model", tensors, {**rest, "channels": ["a"]})
     with pytest.raises(CheckpointError, match=r"header names the channels \['a'\]; expected 5"):
         render_run(tmp_path, RenderRequest("orbit", format="png", frames=1))
 
@@ -274,7 +274,7 @@ def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_pa
     out, _ = changed(site, tmp_path, "scene.bands=4", display="None", channels="('NIR', 'B', 'G', 'R')")
     report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "wavelength_shift=0"])
     assert "colours: R, G, B of 4 channels as red, green, blue" in report.notes and report.errors["psnr"] > 15
-    _, tensors = checkpoint.read(out / "model.safetensors", "model")
+    _, tensors = checkpoint.read_tensors(out / "model.safetensors", "model")
     data = (tmp_path / "g.ply").read_bytes()
     body = np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 62)
     own = sh.initial_dc(tensors["logit"].sigmoid()[:, [3, 2, 1]]).numpy()

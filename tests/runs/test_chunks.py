@@ -57,7 +57,7 @@ def finished(files: Path, told: list[Event], tmp_path_factory: pytest.TempPathFa
 
 
 def model_of(folder: Path) -> dict[str, torch.Tensor]:
-    return checkpoint.read(folder / "model.safetensors", "model")[1]
+    return checkpoint.read_tensors(folder / "model.safetensors", "model")[1]
 
 
 # ---------------------------------------------------------------- what it is

@@ -167,7 +167,7 @@ def test_a_page_and_a_compressed_model_say_where_they_are(tmp_path: Path) -> Non
         tmp_path / "m.neuprim",
         model,
         "static",
-        checkpoint.extra_of(header),
+        checkpoint.read_header_extra(header),
         LEVELS[1],
         (run / "config.yaml").read_text(),
     )

@@ -100,7 +100,7 @@ def contents(folder: Path) -> dict[str, Any]:
     """Every tensor, curve and metric below a folder, without times."""
     found: dict[str, Any] = {}
     for file in sorted(folder.rglob("*.safetensors")):
-        tensors = checkpoint.read(file, file.stem)[1]
+        tensors = checkpoint.read_tensors(file, file.stem)[1]
         found |= {f"{file.relative_to(folder)} {k}": (v.dtype, v.numpy().tobytes()) for k, v in tensors.items()}
     for file in sorted(folder.rglob("metrics.json*")):
         lines = file.read_text().splitlines() if file.suffix == ".jsonl" else [file.read_text()]

@@ -46,7 +46,7 @@ def whole(scene: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def tensors(run_dir: Path, kind: str = "model") -> dict[str, Tensor]:
-    return checkpoint.read(run_dir / f"{kind}.safetensors", kind)[1]
+    return checkpoint.read_tensors(run_dir / f"{kind}.safetensors", kind)[1]
 
 
 def curve(run_dir: Path) -> list[dict[str, Any]]:
@@ -198,7 +198,7 @@ def test_a_task_may_judge_views_and_make_films_and_tell_facts(
     assert "per_frame" not in metrics
     assert metrics["counted"] == [metrics["primitives"], 3]
     assert all(math.isfinite(view["psnr_mask"] + view["mse_mask"]) for view in metrics["per_view"])
-    header = checkpoint.read(out / "model.safetensors", "model")[0]
+    header = checkpoint.read_tensors(out / "model.safetensors", "model")[0]
     assert header["data"] == {"up": [0.0, 0.0, 1.0], "center": header["data"]["center"], "seen": 6}
     with Image.open(out / "renders" / "orbit.webp") as film:
         assert getattr(film, "n_frames", 1) == 3
@@ -264,7 +264,7 @@ def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) ->
         assert process.poll() is None, process.communicate()
         if seen.exists():
             snapshot.write_bytes(seen.read_bytes())  # the file is replaced all the time; a copy stays
-            if checkpoint.read(snapshot, "checkpoint")[0]["step"] >= step:
+            if checkpoint.read_tensors(snapshot, "checkpoint")[0]["step"] >= step:
                 return
         time.sleep(0.005)
     pytest.fail("no checkpoint appeared")
@@ -338,8 +338,8 @@ def test_bad_data_leaves_an_earlier_run_alone(scene: Path, tmp_path: Path) -> No
 
 def test_a_checkpoint_of_another_task_is_refused(scene: Path, tmp_path: Path) -> None:
     out = fit(words(scene, tmp_path / "run", 20))
-    header, tensors = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
-    checkpoint.write(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
+    header, tensors = checkpoint.read_tensors(out / "checkpoint.safetensors", "checkpoint")
+    checkpoint.write_tensors(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
     before = (out / "checkpoint.safetensors").read_bytes()
     with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors.*'dynamic'.*'static'"):
         fit(words(scene, out, 40, "resume=true"))

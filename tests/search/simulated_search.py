@@ -123,7 +123,7 @@ def simulate_search(
             key, _, value = word.partition("=")
             ladder[key] = (int(value) if value.isdigit() else value, "usual")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(size_search, "task_of", lambda config: None)
+        patch.setattr(size_search, "load_run_task", lambda config: None)
         patch.setattr(size_search, "list_smaller_settings", lambda *args: ladder)
         search = SizeSearch(config, target, dataset, record, runner)
         search.run()

@@ -121,7 +121,7 @@ def test_the_best_of_both_is_read(whole: Path, tmp_path: Path) -> None:
     run = tmp_path / "run"
     shutil.copytree(whole, run)
     compress_run(run, level=5)
-    exact = checkpoint.read(whole / "model.safetensors", "model")[1]
+    exact = checkpoint.read_tensors(whole / "model.safetensors", "model")[1]
     assert model_file(run) == run / "model.safetensors" and torch.equal(load_run(run).model.params["b1"], exact["b1"])
     (run / "model.safetensors").unlink()
     assert model_file(run) == run / "model.neuprim" and not torch.equal(load_run(run).model.params["b1"], exact["b1"])

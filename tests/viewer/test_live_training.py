@@ -46,7 +46,7 @@ def trained(config: RunConfig, live: LiveTraining | None = None) -> None:
 
 def state(config: RunConfig) -> tuple[dict[str, Any], dict[str, torch.Tensor]]:
     """Header and tensors of the checkpoint: parameters, moments, statistics, random numbers; without seconds."""
-    header, tensors = checkpoint.read(config.output_dir / "checkpoint.safetensors", "checkpoint")
+    header, tensors = checkpoint.read_tensors(config.output_dir / "checkpoint.safetensors", "checkpoint")
     return {name: value for name, value in header.items() if name != "elapsed"}, tensors
 
 
@@ -169,7 +169,7 @@ def test_a_checkpoint_now_and_a_stop_that_can_be_resumed(scene: Path, tmp_path: 
         live.checkpoint()
         file = stopped.output_dir / "checkpoint.safetensors"
         until(page, lambda: any(m["type"] == "NotificationShowMessage" and "is saved" in str(m) for m in page.messages))
-        assert checkpoint.read(file, "checkpoint")[0]["step"] == 1
+        assert checkpoint.read_tensors(file, "checkpoint")[0]["step"] == 1
         live.stop()
 
     watched = Watched(stopped, look)

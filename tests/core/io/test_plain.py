@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from neuprim.core.checkpoint import read_header, write
+from neuprim.core.checkpoint import read_header, write_tensors
 from neuprim.core.errors import CheckpointError, cut, one_line
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.io.plain import finite, load_json, load_yaml
@@ -65,7 +65,7 @@ def test_yaml_with_references_huge_numbers_or_code_is_refused_at_once(text: str)
 @pytest.mark.parametrize("key", ["elapsed", "iterations", "train_seconds", "background"])
 @pytest.mark.parametrize("value", ["many", -1, True, [[1.0]], ["x" * 10**5]])
 def test_a_header_with_anything_but_numbers_is_one_line(tmp_path: Path, key: str, value: object) -> None:
-    write(tmp_path / "m.safetensors", "model", {}, {key: value})
+    write_tensors(tmp_path / "m.safetensors", "model", {}, {key: value})
     with pytest.raises(CheckpointError, match=rf"m\.safetensors: {key} is .*; expected") as refused:
         read_header(tmp_path / "m.safetensors", "model")
     assert len(str(refused.value)) < 300

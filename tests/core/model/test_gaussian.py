@@ -200,5 +200,5 @@ def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: st
     assert sum(losses[-4:]) < 0.7 * sum(losses[:4])
     metrics = json.loads((out / "metrics.json").read_text())
     assert metrics["backend"] == "reference" and metrics["parameters_per_primitive"] == 11 + 12
-    header, _ = checkpoint.read(out / "model.safetensors", "model")
+    header, _ = checkpoint.read_tensors(out / "model.safetensors", "model")
     assert header["density"] == {"class": "GaussianDensity", "settings": {"deviations": 3.0}}

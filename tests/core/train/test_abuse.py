@@ -111,11 +111,11 @@ def test_a_run_forced_out_of_the_finite_keeps_the_checkpoint_before(
     out = tmp_path / "run"
     with pytest.raises(NonFiniteError, match=r"loss is (nan|inf) at step 6 on view r_\d"):
         fit(words(scene, out, 10, "train.checkpoint_every_seconds=0"))
-    header, saved = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
+    header, saved = checkpoint.read_tensors(out / "checkpoint.safetensors", "checkpoint")
     assert header["step"] == 6
     assert all(bool(torch.isfinite(v).all()) for v in saved.values() if v.is_floating_point())
     monkeypatch.undo()
     monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     fit([*words(scene, out, 10), "resume=true"])
-    header, _ = checkpoint.read(out / "checkpoint.safetensors", "checkpoint")
+    header, _ = checkpoint.read_tensors(out / "checkpoint.safetensors", "checkpoint")
     assert header["step"] == 10

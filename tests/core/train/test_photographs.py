@@ -117,8 +117,8 @@ def test_gains_are_saved_and_go_on(plain: Dataset, tmp_path: Path) -> None:
     reports = [r.loss for r in whole.run()]
     begun = [first.train_step().loss for _ in range(13)]
     tensors, header = first.state()
-    checkpoint.write(tmp_path / "c.safetensors", "checkpoint", tensors, header)
-    header, tensors = checkpoint.read(tmp_path / "c.safetensors", "checkpoint")
+    checkpoint.write_tensors(tmp_path / "c.safetensors", "checkpoint", tensors, header)
+    header, tensors = checkpoint.read_tensors(tmp_path / "c.safetensors", "checkpoint")
     second.load_state(tensors, header, "c.safetensors")
     assert begun + [r.loss for r in second.run()] == reports
     without = {k: v for k, v in tensors.items() if not k.startswith("exposure")}

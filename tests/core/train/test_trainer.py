@@ -87,11 +87,11 @@ def test_half_saved_loaded_and_half_is_the_whole(strategy: str, random_backgroun
     first = make()
     reports = [first.train_step() for _ in range(20)]
     tensors, header = first.state()
-    checkpoint.write(tmp_path / "c.safetensors", "checkpoint", tensors, header)
+    checkpoint.write_tensors(tmp_path / "c.safetensors", "checkpoint", tensors, header)
 
     torch.manual_seed(99)  # the global generator plays no part
     second = make()
-    header, tensors = checkpoint.read(tmp_path / "c.safetensors", "checkpoint")
+    header, tensors = checkpoint.read_tensors(tmp_path / "c.safetensors", "checkpoint")
     second.load_state(tensors, header, "c.safetensors")
     assert second.step == 20 and second.elapsed == first.elapsed
     same(first, second)

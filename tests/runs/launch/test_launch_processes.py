@@ -106,7 +106,9 @@ def test_killed_in_every_phase_a_run_ends_as_if_nothing_had_been(tmp_path: Path)
     ]
     for phase in PHASES:
         for kind in ("model", "checkpoint"):
-            first, second = (checkpoint.read(d / f"{kind}.safetensors", kind)[1] for d in (whole, tmp_path / phase))
+            first, second = (
+                checkpoint.read_tensors(d / f"{kind}.safetensors", kind)[1] for d in (whole, tmp_path / phase)
+            )
             assert first.keys() == second.keys() and all(torch.equal(first[name], second[name]) for name in first), (
                 phase,
                 kind,

@@ -140,8 +140,8 @@ class RowAdam:
         from neuprim.core.train.kernels_warp import adam_rows
 
         age, betas = self.age + 1, (BETA1, self.beta2)
-        _, *columns = zip(*updates, strict=True)
-        finite = adam_rows(*columns, age, betas)
+        _, values, grads, first, second, rates = zip(*updates, strict=True)
+        finite = adam_rows(values, grads, first, second, rates, age, betas)
         if finite:
             self.age = age
         return finite

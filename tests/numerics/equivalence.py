@@ -156,11 +156,7 @@ def row_errors(found: Tensor, expected: Tensor) -> Tensor:
 
 
 def same(
-    fast: str,
-    reference: str,
-    case: Case,
-    image_bound: float = 1e-5,
-    grad_bound: float = 1e-3,
+    fast: str, reference: str, case: Case, image_bound: float = 1e-5, grad_bound: float = 1e-3
 ) -> tuple[Frame, Frame]:
     """Draw a case with two backends and compare; return both frames.
 

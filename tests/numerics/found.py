@@ -33,7 +33,7 @@ FOUND: dict[str, Draw] = {
         off=1.0,
         depth=1.0,
         offset=1.0,
-    ),
+    )
 }
 """What hypothesis found."""
 

@@ -173,10 +173,7 @@ def test_a_wrong_opaque_density_is_named_wherever_it_is_asked() -> None:
             r"active_rows returned rows \[3, 20\]; expected ascending int64 rows \(M,\) from 0 to 19",
         ),
         ({"active_rows": lambda self, p, c: torch.tensor([-1, 3])}, r"active_rows returned rows \[-1, 3\]"),
-        (
-            {"active_rows": lambda self, p, c: torch.tensor([4, 2, 3, 5])},
-            r"active_rows returned rows \[4, 2, 3, 5\]",
-        ),
+        ({"active_rows": lambda self, p, c: torch.tensor([4, 2, 3, 5])}, r"active_rows returned rows \[4, 2, 3, 5\]"),
         (
             {"active_rows": lambda self, p, c: torch.ones(N, dtype=torch.bool)},
             r"active_rows returned torch\.bool \(20,\) on cpu; expected ascending int64",

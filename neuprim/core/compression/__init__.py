@@ -1,8 +1,5 @@
-"""Quantized models in ``.neuprim`` files.
-
-``bits`` chooses the bits of each parameter, ``quantizers`` maps numbers to codes, ``sections`` packs codes into bytes,
-``file`` reads and writes the container, ``codec`` converts models to sections.
-"""
+"""Quantized models in ``.neuprim`` files: ``codec`` turns models into sections, ``file`` reads and writes the
+container."""
 
 from neuprim.core.compression.bits import DEFAULT_LEVEL, LEVELS, BitTable, bit_table
 from neuprim.core.compression.codec import (

@@ -53,11 +53,7 @@ DEFAULT_LEVEL = 3
 
 
 def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
-    """Return a level's table with ``NAME=BITS`` overrides, where NAME is a parameter of the model or ``others``.
-
-    Raises:
-        ConfigError: no such level or parameter, or no such number of bits.
-    """
+    """Return a level's table with ``NAME=BITS`` overrides (a parameter or ``others``), or raise ConfigError."""
     if level not in LEVELS:
         raise ConfigError(f"--level {level}: expected one of {', '.join(map(str, LEVELS))}")
     table, names = LEVELS[level], [spec.name for spec in specs]

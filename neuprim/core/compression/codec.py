@@ -37,8 +37,7 @@ from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import nonzero_rows
 
-Quantizers = dict[str, Columns | Rotations]
-"""Parameter -> how its numbers are coded."""
+Quantizers = dict[str, Columns | Rotations]  # parameter -> how its numbers are coded
 
 
 @dataclass(frozen=True)
@@ -49,25 +48,19 @@ class StoredSize:
     size: int
 
 
-_SPIKY = 12.0
-"""A column whose error is this many times the usual one has outliers and gets twice the bits."""
+_SPIKY = 12.0  # A column whose error is this many times the usual one has outliers and gets twice the bits
 
-_LABEL = 16
-"""Bits of a number that is not learned, such as a label, at every level."""
+_LABEL = 16  # bits of a number that is not learned, such as a label, at every level
 
-_MIN_MASKED = 0.02
-"""A piece that a smaller share of the primitives lacks has no bit mask."""
+_MIN_MASKED = 0.02  # A piece that a smaller share of the primitives lacks has no bit mask
 
-_POSITION_STEPS = 50.0
-"""Smallest number of position steps in the median of the primitives' longest semi-axes."""
+_POSITION_STEPS = 50.0  # smallest number of position steps in the median of the primitives' longest semi-axes
 
 
 def canonicalize(model: Primitives) -> Primitives:
     """Return the equal model in the numbers that files store, detached, on the CPU.
 
-    Raises:
-        CheckpointError: numbers that cannot be stored: not float32, not finite, or a quaternion of zeros.
-        FormError: a field's own code returned something of another shape.
+    Raises CheckpointError for numbers that cannot be stored, FormError for what a field's own code returned.
     """
     params = {name: value.detach().cpu() for name, value in model.params.items()}
     for field in (model.density, model.colour):
@@ -120,11 +113,11 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
     """Return quantizers of a canonical model with which every column adds the same error.
 
     Rounding to steps of length s has a mean squared error of s^2 / 12. Equal errors spend bits best (reverse water
-    filling), and codes that no number has take next to no bytes.
+    filling).
 
     Args:
-        effects: parameter -> (C,) mean squared change of images when its numbers change by independent amounts of
-            variance 1 (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
+        effects: parameter -> (C,) mean squared change of images per variance of its numbers
+            (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
         error: mean squared change that one column may add.
     """
     found: Quantizers = {}
@@ -207,10 +200,7 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[Section]:
 def _masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Return bit masks of pieces that some primitives lack, and parameter -> each column's mask number (0: none).
-
-    One bit then replaces the most frequent code of every column of the piece.
-    """
+    """Return bit masks of pieces that some primitives lack, and parameter -> each column's mask number (0: none)."""
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])
@@ -235,10 +225,7 @@ def _masks(
 
 
 def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, Tensor]:
-    """Quantize and dequantize tensors, with straight-through gradients, for quantization-aware training.
-
-    Numbers beyond a column's range become its end.
-    """
+    """Quantize and dequantize tensors, with straight-through gradients; numbers beyond a range become its end."""
     return {
         name: made[name].fake_quantize(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
         for name, x in params.items()

@@ -1,7 +1,7 @@
 """Read and write ``.neuprim`` files: a JSON header, a table of sections, their bytes through zstd.
 
-Little-endian; docs/data_formats.md describes every byte. Files may be hostile: nothing is executed, every size is
-checked against the file's own before memory is allocated, and the expansion is limited (:data:`MAX_EXPANSION`).
+Little-endian; docs/data_formats.md describes every byte. Files may be hostile: every size is checked against the file's
+own before memory is allocated, and the expansion is limited (:data:`MAX_EXPANSION`).
 """
 
 from __future__ import annotations
@@ -40,11 +40,9 @@ from neuprim.core.io.plain import load_json
 
 MAGIC = b"\x89NEUPRIM"
 VERSION = 1
-CONFIG = "config.yaml"
-"""Name of the one text section: the configuration of the run."""
+CONFIG = "config.yaml"  # name of the one text section: the configuration of the run
 
-MAX_EXPANSION = 64
-"""Largest number of float32 bytes for each byte of the file, beyond the first MiB."""
+MAX_EXPANSION = 64  # largest number of float32 bytes for each byte of the file, beyond the first MiB
 
 _PLAIN, _ZSTD = 0, 1
 _MAX_PLANES = 3  # of a column's codes
@@ -77,15 +75,9 @@ class _Head:
 
 
 def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections: Sequence[Section]) -> dict[str, int]:
-    """Write a file atomically; returns the bytes of each section.
+    """Write a file atomically; returns the bytes of each section, whose names must be unique.
 
-    Args:
-        header: JSON-able.
-        count: primitives.
-        sections: their names must be unique.
-
-    Raises:
-        CheckpointError: the file could not be written; names it and the reason.
+    Raises CheckpointError where the file could not be written.
     """
     text = json.dumps(header, allow_nan=False).encode()
     if len(text) > _MAX_HEADER:
@@ -144,21 +136,13 @@ def is_compressed(path: Path) -> bool:
 
 
 def read_head(path: Path) -> dict[str, Any]:
-    """Return the header, without reading a section.
-
-    Raises:
-        CheckpointError: missing, damaged, another format or version, or impossible sizes.
-    """
+    """Return the header without reading a section, or raise CheckpointError."""
     with _opened(path) as file:
         return _head(path, file).header
 
 
 def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str | None]:
-    """Return header, float32 tensors by name and the run's configuration (None where it is missing).
-
-    Raises:
-        CheckpointError: see :func:`read_head`; or a section is damaged.
-    """
+    """Return header, float32 tensors by name and the run's configuration (or None), or raise CheckpointError."""
     with _opened(path) as file:
         head = _head(path, file)
         tensors: dict[str, Tensor] = {}

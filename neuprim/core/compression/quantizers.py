@@ -17,14 +17,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-MIN_BITS = 3
-"""Smallest bits of a component of an orientation."""
+MIN_BITS = 3  # smallest bits of a component of an orientation
 
-MAX_BITS = 20
-"""Largest bits of a column: products of a float32 and a code stay exact in double precision."""
+MAX_BITS = 20  # largest bits of a column: products of a float32 and a code stay exact in double precision
 
-_MANTISSA = 24
-"""Bits of a float32."""
+_MANTISSA = 24  # bits of a float32
 
 _LARGEST = float(torch.finfo(torch.float32).max)
 
@@ -61,16 +58,13 @@ class Columns:
         return self.values(self.codes(x)).to(x) + (x - x.detach())
 
     def to(self, device: torch.device) -> Columns:
-        """Move the quantizer to a device."""
         return Columns(self.bits.to(device), self.low.to(device), self.high.to(device))
 
 
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> Columns:
     """Fit the ends of every column of x (N, C), finite, on the CPU.
 
-    Args:
-        bits: one per column, 1 to :data:`MAX_BITS`.
-        clips: candidate shares of the column beyond either end; the first wins a tie.
+    ``clips``: candidate shares of the column beyond either end; the first wins a tie.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
     best = Columns(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
@@ -91,10 +85,8 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
 def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Columns:
     """Return columns of step ``steps`` (C,) that reach all of x (N, C), finite, on the CPU.
 
-    Steps grow where they would need more than :data:`MAX_BITS`. A column within one step is a single value.
-
-    Args:
-        through: (C,) or a number that is one of the values, within the column's range.
+    Steps grow where they would need more than :data:`MAX_BITS`. ``through``: (C,) or a number that is one of the
+    values.
     """
     if not x.numel():
         return fit_columns(x, [1] * x.shape[1])
@@ -111,10 +103,7 @@ def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Column
 
 
 def snap_to_zero(columns: Columns) -> Columns:
-    """Move the ends inwards, by two steps at most, so that 0 is one of the values and decodes to exactly 0.
-
-    Ends are whole multiples of a step with so few mantissa bits that both are float32 numbers.
-    """
+    """Move the ends inwards, by two steps at most, so that 0 is one of the values and decodes to exactly 0."""
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
     place = -low / torch.where(width > 0, width, 1.0) * last  # of zero, between two codes
@@ -138,10 +127,7 @@ def _quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def relative_error(x: Tensor, columns: Columns) -> Tensor:
-    """Return the (C,) root mean squared errors over those of steps between -1 and 1 standard deviations.
-
-    A normal distribution has about 4; a column with outliers has tens and more.
-    """
+    """Return the (C,) root mean squared errors over those of steps between -1 and 1 standard deviations."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
     usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
@@ -165,7 +151,7 @@ class Rotations:
         return (1 << (self.bits - 1)) - 1
 
     def codes(self, quats: Tensor) -> Tensor:
-        """Return (N, 4) int64 of wxyz (N, 4) of any norm but 0: number of the largest component, codes of the others.
+        """Return (N, 4) int64 of wxyz (N, 4): number of the largest component, codes of the others.
 
         Where rounding makes another component as large as the largest, it is reduced, so that codes are stable.
         """

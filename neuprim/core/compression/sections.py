@@ -1,7 +1,4 @@
-"""Pack codes into byte planes, and unpack and validate them.
-
-All numbers are little-endian. docs/data_formats.md describes every byte.
-"""
+"""Pack codes into byte planes, and unpack and validate them; little-endian (docs/data_formats.md)."""
 
 from __future__ import annotations
 
@@ -27,14 +24,11 @@ CODINGS = {
     SPARSE: "sparse columns",
 }
 
-MASKS_NAME = "rows|"
-"""Name of the one section of bit masks; no parameter can have it."""
+MASKS_NAME = "rows|"  # name of the one section of bit masks; no parameter can have it
 
-MAX_TEXT = 2**20
-"""Largest number of bytes of a text."""
+MAX_TEXT = 2**20  # largest number of bytes of a text
 
-_ZSTD_LEVELS = 19, 1
-"""Low levels search fewer repetitions, which in noise cost more than they save."""
+_ZSTD_LEVELS = 19, 1  # low levels search fewer repetitions, which in noise cost more than they save
 
 _RECORD = struct.Struct("<Bff")
 _MASK_NUMBER = struct.Struct("<H")
@@ -119,14 +113,7 @@ def _bytes(bits: int) -> int:
 
 
 def content_size(section: Section, count: int, masks: Sequence[np.ndarray] = ()) -> int:
-    """Return the bytes of a section's planes, from its head.
-
-    Args:
-        masks: bit masks of the file.
-
-    Raises:
-        CorruptSection: the head is invalid.
-    """
+    """Return the bytes of a section's planes, from its head, or raise CorruptSection."""
     if section.coding == MASKS:
         return section.columns * ((count + 7) // 8)
     if section.coding == ROTATIONS:
@@ -140,11 +127,7 @@ def content_size(section: Section, count: int, masks: Sequence[np.ndarray] = ())
 
 
 def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarray]:
-    """Return the (count,) bool masks of a section's ``content``.
-
-    Raises:
-        CorruptSection: bits of primitives that do not exist.
-    """
+    """Return the (count,) bool masks of a section, or raise CorruptSection."""
     bits = np.unpackbits(
         np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little"
     )
@@ -154,11 +137,7 @@ def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarra
 
 
 def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
-    """Decode a section: (count, *shape) float32 of its head and ``content`` of :func:`content_size` bytes.
-
-    Raises:
-        CorruptSection: codes that do not exist.
-    """
+    """Decode a section: (count, *shape) float32 of ``content`` of :func:`content_size` bytes, or raise CorruptSection."""
     planes = _Planes(content)
     if section.coding == ROTATIONS:
         scheme = _rotations(section)

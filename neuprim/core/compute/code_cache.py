@@ -1,8 +1,7 @@
 """Folders of compiled code that later processes run.
 
-Rule: whoever may write into such a folder, or put another in its place, decides what this user's processes execute. So
-it is used only if this user owns it and nobody else may do either; otherwise compiled code is kept in a folder of this
-process alone.
+Whoever may write into such a folder, or replace it, decides what this user's processes execute. So it is used only if
+this user owns it and nobody else may do either; otherwise code is kept in a folder of this process alone.
 """
 
 from __future__ import annotations
@@ -39,8 +38,7 @@ def code_cache(folder: Path) -> Path:
 
 
 def weakness(folder: Path) -> str:
-    """Who else may change what a folder holds, in words; empty where nobody may. Windows keeps users' folders apart by
-    itself."""
+    """Return who else may change what a folder holds, in words; empty where nobody may, and on Windows."""
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()

@@ -1,7 +1,4 @@
-"""Devices of tensors, the CPU and a CUDA device, and which kernels may read them.
-
-Operations with a CPU kernel ask :func:`on_numba` first; other tensors take an equivalent path in torch.
-"""
+"""Devices of tensors, the CPU and a CUDA device, and which kernels may read them."""
 
 from __future__ import annotations
 
@@ -12,8 +9,7 @@ import torch
 from torch import Tensor
 
 CPU, CUDA = "cpu", "cuda"
-DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)
-"""The devices that models are kept on."""
+DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)  # the devices that models are kept on
 
 HOST = torch.device(CPU)
 
@@ -52,8 +48,7 @@ def current_device(kind: str) -> torch.device:
 
 
 def copy_from_host(tensor: Tensor, device: torch.device) -> Tensor:
-    """The tensor on ``device``, itself if it is there already. Copies to a card go by pinned memory and do not wait for
-    it."""
+    """Return the tensor on ``device``. Copies to a GPU go through pinned memory and do not wait."""
     if tensor.device == device:
         return tensor
     if device.type != CUDA or not tensor.is_cpu:
@@ -62,8 +57,7 @@ def copy_from_host(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def to_like(tensor: Tensor, like: Tensor) -> Tensor:
-    """A few numbers on the device of another tensor, and of its dtype; differentiable. Copies to a card do not wait for
-    it."""
+    """Return a few numbers on another tensor's device and of its dtype; differentiable, without waiting for a GPU."""
     return tensor.to(like, non_blocking=tensor.is_cpu)
 
 

@@ -1,9 +1,9 @@
-"""How the kernels are compiled: flags, and where numba keeps the result.
+"""How numba compiles the kernels: flags, and where it keeps the result.
 
-numba's cache notices edits of the file a kernel is in, but not of *other* files whose functions it inlined or whose
-constants it froze; and site-packages may be read-only. So the cache lives in the user's own cache folder, and a
-kernel's code under a name made of its module and a hash of every source that can end up in it: see
-:func:`kernel_sources`. Checkouts with the same sources share it. ``NUMBA_CACHE_DIR``, where set, wins.
+numba's cache notices edits of a kernel's own file, but not of others whose functions it inlined or whose constants it
+froze; and site-packages may be read-only. So code lives in the user's cache folder, under a hash of every source that
+can
+end up in it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, where set, wins.
 """
 
 from __future__ import annotations
@@ -28,22 +28,14 @@ from neuprim.version import __version__
 
 
 def _prefer_wide_vectors() -> None:
-    """Ask LLVM for 512-bit vectors where the processor has them; it avoids them by default, at a cost in these kernels.
-
-    Takes effect when nothing was compiled before; NUMBA_CPU_FEATURES, where set, wins.
-    """
+    """Ask LLVM for 512-bit vectors, unless NUMBA_CPU_FEATURES is set; before anything is compiled."""
     features = llvm.get_host_cpu_features()
     if features.get("avx512f") and numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]
         numba.config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
 
 
 def _one_vector_at_a_time() -> None:
-    """Ask LLVM not to compute several vectors at a time, for the whole process.
-
-    In loops that sum it would, without counting what the loop already holds in registers: it spills, and leaves up to
-    three vectors over to a loop of half the width. Lanes come in whole vectors, so that one at a time leaves nothing
-    over.
-    """
+    """Ask LLVM not to compute several vectors at a time: loops that sum would spill registers."""
     llvm.set_option("neuprim", "-force-vector-interleave=1")
 
 
@@ -59,8 +51,7 @@ _IMPORT = re.compile(r"^\s*from (neuprim[\w.]*) import (\([^)]*\)|[^\n]*)|^\s*im
 
 
 def kernel_sources(module: Path, package: Path = _ROOT) -> set[Path]:
-    """Files whose text can end up in the compiled kernels of a module: its own, and those of all modules of the package
-    that it imports, directly or not; of this one, which says how kernels are compiled, no further."""
+    """Files whose text can end up in a module's kernels: its own and all of the package that it imports."""
     found: set[Path] = set()
     todo = [module]
     while todo:
@@ -110,8 +101,7 @@ _sources_hash = functools.cache(sources_hash)
 
 
 class KernelLocator(getattr(caching, "UserProvidedCacheLocator", object)):  # type: ignore[misc]
-    """numba's own, but for a folder that does not depend on where the sources are; a numba without this choice does
-    not ask."""
+    """numba's own, but for a folder that does not depend on where the sources are."""
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
@@ -139,16 +129,11 @@ inline_source = njit(fastmath=FAST, error_model="numpy", inline="always")
 """As if its text stood in the caller: LLVM sees both at once, and computes the bits that it would compute of one
 function."""
 
-kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)
-"""A pixel kernel, called from worker threads."""
+kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)  # A pixel kernel, called from worker threads
 
 
 def dispatch_by_length(*functions: Any) -> Any:
-    """One function of (tuple, *arguments) for use in kernels, which calls ``functions[len(tuple)]`` of the arguments.
-
-    A tuple's length belongs to its type: the choice is made while a kernel is compiled, and what is not chosen leaves
-    no trace in it.
-    """
+    """One function of (tuple, *arguments) that calls ``functions[len(tuple)]``, chosen during compilation."""
 
     def choose(key: Any, *arguments: Any) -> Any: ...
 
@@ -163,5 +148,4 @@ def dispatch_by_length(*functions: Any) -> Any:
 exact_kernel = _jit(error_model="numpy", nogil=True, cache=True)
 """A kernel in strict IEEE arithmetic: per-primitive preparation, binning, sums whose order matters."""
 
-strict = njit(error_model="numpy", forceinline=True)
-"""Building block of an :data:`exact_kernel`."""
+strict = njit(error_model="numpy", forceinline=True)  # building block of an :data:`exact_kernel`

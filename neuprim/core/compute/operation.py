@@ -1,4 +1,4 @@
-"""Operations with a gradient of their own, where nobody asks for one: their forward pass alone."""
+"""Autograd operations without their bookkeeping where no gradient is needed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from torch import Tensor
 
 
 class _Nowhere:
-    """Takes what a forward pass leaves behind for a backward pass that will not come."""
+    """Takes what a forward pass saves for a backward pass that will not come."""
 
     def save_for_backward(self, *tensors: Tensor) -> None:
         pass
@@ -24,8 +24,7 @@ def needs_grad(*arguments: Any) -> bool:
 
 
 def apply_autograd(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
-    """``operation.apply(*arguments)``; its bookkeeping, which takes longer than the tensors of a small model, is left
-    out where no gradient is asked for."""
+    """``operation.apply(*arguments)``, or its forward pass alone where no gradient is asked for."""
     if needs_grad(*arguments):
         return operation.apply(*arguments)
     return operation.forward(_Nowhere(), *arguments)

@@ -1,5 +1,4 @@
-"""Run a nogil kernel over a range on all cores. Results do not depend on the number of threads: chunks never share
-output."""
+"""Run a nogil kernel over a range on all cores; chunks never share output, so results do not depend on the threads."""
 
 from __future__ import annotations
 
@@ -47,8 +46,7 @@ def core_count() -> int:
 
 @contextmanager
 def limit_process_threads(threads: int) -> Iterator[None]:
-    """Inside, the whole process has a share of the cores, as there are others that work beside it; 0: all. One at a
-    time."""
+    """Inside, the whole process has a share of the cores; 0: all. One at a time."""
     global _share
     before, _share = _share, threads
     try:
@@ -59,8 +57,7 @@ def limit_process_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Inside, "all cores" means ``threads`` of them, 0 for all: for code that is called without being told how many it
-    may use, such as a loss or a colour."""
+    """Inside, "all cores" means ``threads`` of them, 0 for all, also for code that gets no number of threads."""
     token = _limit.set(threads)
     try:
         yield
@@ -81,8 +78,7 @@ def _pool(threads: int) -> ThreadPoolExecutor:
 
 
 def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: int, *args: Any) -> list[Any]:
-    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``, drawn dynamically; returns the results in
-    chunk order.
+    """Call ``function(start, stop, *args)`` for chunks of ``range(count)``; returns the results in chunk order.
 
     ``threads`` 0 is all cores, or as many as :func:`limit_threads` says.
     """

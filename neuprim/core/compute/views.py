@@ -1,5 +1,4 @@
-"""Things that numba has no word for: an array that is borrowed, sixteen floats at once, and those of sixteen that
-count."""
+"""numba intrinsics: a borrowed array, copies of sixteen floats, and compression of sixteen by flags."""
 
 from __future__ import annotations
 
@@ -19,11 +18,9 @@ _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
 
 def _lent(context, array):  # type: ignore[no-untyped-def]
-    """The same array without its owner: views of it count no references.
+    """The same array without its owner: views of it count no references, which is atomic and slow.
 
-    Counting is atomic: it costs a pair of a few lanes as much as a vector of arithmetic, and threads that count views
-    of one array wait for each other. Only for arrays that somebody else keeps, such as the arguments of a kernel; a
-    kernel's own are given back by :func:`release_array` after the last use of what was lent.
+    Only for arrays that somebody else keeps; a kernel's own are given back by :func:`release_array` after the last use.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -35,16 +32,13 @@ def _lent(context, array):  # type: ignore[no-untyped-def]
 
 
 def _place(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
-    """Where the sixteen floats of an argument begin: at the place that another argument says."""
+    """Where the sixteen floats of an argument begin."""
     data = make_array(signature.args[array])(context, builder, value=arguments[array]).data
     return builder.bitcast(builder.gep(data, [arguments[index]]), _SIXTEEN.as_pointer())
 
 
 def _copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
-    """target[at : at + 16] = source[first : first + 16] of contiguous float32 arrays, read whole before it is written.
-
-    LLVM cannot know that two arrays do not overlap, and copies one float after the other.
-    """
+    """target[at : at + 16] = source[first : first + 16] of float32 arrays, which LLVM would copy one by one."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         read, written = (_place(context, builder, signature, arguments, *where) for where in ((2, 3), (0, 1)))
@@ -55,11 +49,9 @@ def _copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
 
 
 def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
-    """Moves those of array[first : first + 16] whose flag in array[flags : flags + 16] is not 0 to array[at:], side by
-    side; returns how many.
+    """Move those of array[first : first + 16] whose flag is not 0 to array[at:], zeros behind them; returns how many.
 
-    All sixteen are read before any is written, and sixteen are written, zeros behind those that are moved: ``at`` may
-    be at most ``first`` where more is to be read.
+    All sixteen are read before any is written: ``at`` may be at most ``first`` where more is to be read.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -88,8 +80,7 @@ def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
 
 
 def _returned(context, array):  # type: ignore[no-untyped-def]
-    """Does nothing, after the last use of what an array of the kernel's own lent: numba lets go of it behind the last
-    line that names it."""
+    """Does nothing, after the last use of what a kernel's own array lent: numba would free it earlier."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()

@@ -1,9 +1,8 @@
-"""Warp, started as the kernels of :mod:`neuprim.core.render.cuda` need it, and the only place that launches one of
-them.
+"""Warp as the kernels need it, and the only place that launches one of them.
 
-A frame is a dozen launches with a hundred arrays. Warp's own way to make an array of a tensor and to pack it for a
-launch takes longer than the kernels of a small frame, so a kernel's launch is recorded once on each device, and its
-arguments are written over.
+Making arrays of tensors and packing them takes longer than the kernels of a small frame, so a kernel's launch is
+recorded
+once on each device, and its arguments are written over.
 """
 
 from __future__ import annotations
@@ -22,8 +21,7 @@ from torch import Tensor
 from neuprim.core.compute.code_cache import code_cache
 from neuprim.core.io import files
 
-BLOCK = 256
-"""Threads of a block where a kernel asks for nothing else."""
+BLOCK = 256  # threads of a block where a kernel asks for nothing else
 
 OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
 """Of every kernel's module: adjoints are written by hand, and divisions and roots are rounded properly."""
@@ -60,8 +58,7 @@ _Bare: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))
 
 
 class _Array:
-    """A tensor that a kernel takes as an array of ``dtype``, which may hold several numbers, those of the last
-    dimension."""
+    """A tensor that a kernel takes as an array of ``dtype``, which may hold the numbers of the last dimension."""
 
     __slots__ = ("dtype", "tensor")
 
@@ -70,8 +67,7 @@ class _Array:
 
 
 def array(tensor: Tensor, dtype: Any) -> Any:
-    """A contiguous tensor as an argument of a kernel; ``dtype`` may take several numbers together, those of the last
-    dimension."""
+    """Return a contiguous tensor as an argument of a kernel; ``dtype`` may take the numbers of the last dimension."""
     return _Array(tensor, dtype)
 
 
@@ -149,11 +145,7 @@ def _stream(device: torch.device) -> Any:
 def launch(
     kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK
 ) -> None:
-    """Run a kernel on the caller's stream; ``dim`` empty, nothing.
-
-    Raises:
-        RuntimeError: blocks on the CPU are off, so that results would be wrong.
-    """
+    """Run a kernel on the caller's stream; nothing where ``dim`` is empty."""
     if not wp.config.enable_cpu_blocks:
         raise RuntimeError("Warp runs blocks on the CPU as single threads: wp.config.enable_cpu_blocks was turned off")
     dims = (dim,) if isinstance(dim, int) else tuple(dim)

@@ -19,13 +19,9 @@ from neuprim.core.io.images import pillow_image, to_uint8
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
     """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix picks the format; atomic.
 
-    GIF has frame times in hundredths of a second, so its rate is the nearest possible one. MP4 is H.264 with even
-    sizes: an odd last row or column is repeated; RGB only.
-
-    Raises:
-        BackendUnavailable: MP4 without the package ``av``.
-        DataError: no frames, frames of different shapes or with NaN, an unknown suffix, a rate that is not positive, or
-            the file cannot be written.
+    GIF rounds frame times to hundredths of a second. MP4 is H.264 with even sizes (an odd last row or column is
+    repeated),
+    RGB only. Raises DataError for frames, suffix or rate, and BackendUnavailable for MP4 without the package ``av``.
     """
     _check_rate(path, len(frames), fps)
     shapes = sorted({tuple(f.shape) for f in frames})
@@ -39,10 +35,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
 
 
 class FrameSpool:
-    """Collect frames of one size in a temporary file, then write them as an animation; memory stays constant.
-
-    The file in ``folder`` has no name and disappears however this process ends.
-    """
+    """Collect frames of one size in a nameless temporary file in ``folder``, then write them as an animation."""
 
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)

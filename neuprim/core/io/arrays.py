@@ -17,12 +17,7 @@ ArrayType = tuple[Any, tuple[int | None, ...]]  # dtype and shape; None for any 
 
 
 def read_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.ndarray]:
-    """Read the named arrays of an uncompressed file of ``numpy.savez``; other arrays are ignored.
-
-    Raises:
-        DataError: no such file, a damaged one, a missing array, another dtype or shape, or a header that claims more
-            bytes than there are.
-    """
+    """Read the named arrays of an uncompressed file of ``numpy.savez``; raises DataError before memory is allocated."""
     damaged = (OSError, ValueError, KeyError, EOFError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile)
     try:
         size = path.stat().st_size

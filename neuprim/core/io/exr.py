@@ -1,7 +1,7 @@
 """Read and write OpenEXR files: linear light, any named channels, atomic writes, lossless ZIP compression.
 
-Channels without a prefix are the image that every reader shows (R, G, B and premultiplied A). A prefix and a dot name a
-layer, e.g. ``depth.Z``, as Nuke and Blender read it (OpenEXR, "Technical Introduction": channel names and layers).
+Channels without a prefix are the image (R, G, B and premultiplied A). A prefix and a dot name a layer, e.g.
+``depth.Z``.
 """
 
 from __future__ import annotations
@@ -53,10 +53,7 @@ def default_channel_names(count: int) -> tuple[str, ...]:
 
 
 def channel_name_error(names: Sequence[Any]) -> str | None:
-    """``"PROBLEM; expected ..."`` for the first name that an OpenEXR file cannot hold or that is ambiguous, else None.
-
-    "A" is reserved for alpha. Any other printable text of at most 31 bytes is allowed, e.g. ``450 nm``.
-    """
+    """``"PROBLEM; expected ..."`` for the first name that OpenEXR cannot hold or that is ambiguous, else None."""
     used: set[str] = set()
     for i, name in enumerate(names):
         if not isinstance(name, str):
@@ -95,11 +92,7 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
-    """From the header: names of the wanted channels, or of R, G, B(, A) of the only layer that has them; width; height.
-
-    Raises:
-        DataError: damaged, too large, or without these channels.
-    """
+    """From the header: names of the wanted channels, or of the only R, G, B(, A); width; height; or DataError."""
     channels, width, height = _read_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
@@ -143,11 +136,7 @@ def _read_header(path: Path) -> tuple[dict[str, Any], int, int]:
 
 
 def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tensor:
-    """(H, W, C) float16 or float32 values of the named channels, as stored.
-
-    Raises:
-        DataError: truncated or corrupt data, another size or type than in the header, NaN or infinite values.
-    """
+    """(H, W, C) float16 or float32 values of the named channels, as stored, all finite; or DataError."""
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = [np.array(file.channels()[name].pixels) for name in names]
@@ -180,11 +169,7 @@ class ExrChannel:
 
 
 def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str] | None = None) -> None:
-    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``; not clamped.
-
-    Raises:
-        DataError: wrong shapes or names, or as :func:`write_exr_layers`.
-    """
+    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``; not clamped."""
     error = None if names is None else channel_name_error(names)
     if error:
         raise DataError(f"{path}: names{error}")
@@ -202,12 +187,8 @@ def write_exr_layers(
     """Write an image of several layers as one OpenEXR file; atomic.
 
     Args:
-        channels: by name with the layer's prefix, all of one size.
+        channels: by name with the layer's prefix, all of one size, finite, and at most 65504 where half.
         attributes: of the file's header: text, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
-
-    Raises:
-        DataError: no channels, different sizes, values that are not finite or (where half) beyond 65504, or the file
-            cannot be written.
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:

@@ -38,11 +38,7 @@ def cache_directory() -> Path:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary file that replaces ``path`` when the block succeeds; the old file survives any failure.
-
-    Raises:
-        OSError: the file cannot be written, e.g. because the disk is full; names ``path``.
-    """
+    """Yield a temporary file that replaces ``path`` when the block succeeds; an OSError names ``path``."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary: Path | None = None
     try:
@@ -86,8 +82,7 @@ def write_text(path: Path, text: str) -> None:
 def read_json(path: Path, what: str, instead: str) -> Any:
     """Read a JSON file that neuprim wrote; None if there is no file.
 
-    Raises DataError where it cannot be read, is not JSON, or holds null; the message says ``what`` the file should be
-    and what the user can do ``instead``.
+    A DataError says ``what`` the file should be and what the user can do ``instead``.
     """
     try:
         data = load_json(path.read_text(encoding="utf-8"))
@@ -133,9 +128,9 @@ _DAY = 86400.0
 
 
 def remove_leftovers(folder: Path) -> None:
-    """Remove temporary files and staging folders of killed writers, from a folder and its subfolders.
+    """Remove temporary files and staging folders of killed writers from a locked folder and its subfolders.
 
-    Call it while holding the folder's lock. A running process of this machine keeps files younger than a day.
+    A running process of this machine keeps files younger than a day.
     """
     subfolders = (p for p in folder.iterdir() if p.name[0] != "." and p.is_dir() and not p.is_symlink())
     for place in (folder, *subfolders):
@@ -172,10 +167,9 @@ def _is_running(number: str | None) -> bool:
 
 
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Have ``write`` fill a folder that is renamed to ``final`` when it is done, unless a ``complete`` one exists.
+    """Have ``write`` fill a folder that is renamed to ``final`` when done, unless a ``complete`` one exists.
 
-    An interrupted call leaves nothing behind, and an incomplete folder at ``final`` is deleted. Of several processes
-    the first one wins, so all must write the same files. Raises OSError where the folder cannot be written.
+    An incomplete folder at ``final`` is deleted. Of several processes the first wins: all must write the same files.
     """
     if complete(final):
         return
@@ -212,10 +206,7 @@ def refuse_existing(final: Path, overwrite: bool) -> None:
 
 
 class StagedOutput:
-    """A place to write what becomes ``final`` once :meth:`publish` moves it.
-
-    ``out`` has the name of ``final`` and does not exist yet, in a private folder of the same file system.
-    """
+    """A place to write what becomes ``final`` once :meth:`publish` moves it; write to ``out``."""
 
     def __init__(self, folder: Path, final: Path, overwrite: bool) -> None:
         self._folder, self._final, self._overwrite = folder, final, overwrite
@@ -236,10 +227,7 @@ class StagedOutput:
         return text.replace(str(self.out), str(self._final)).replace(str(self._folder), str(self._final.parent))
 
     def publish(self) -> None:
-        """Move everything to its place, file by file, also into existing folders.
-
-        If something is in the way, nothing is moved and ConfigError is raised.
-        """
+        """Move everything to its place, file by file; ConfigError, and nothing is moved, if something is in the way."""
         moves: list[tuple[Path, Path]] = []
         for entry in sorted(self._folder.iterdir()):
             target = self.final_path(entry)

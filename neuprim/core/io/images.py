@@ -1,10 +1,8 @@
 """Read and write PNG, JPEG, WebP and OpenEXR images, and convert between sRGB and linear light.
 
-PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha. OpenEXR holds linear light with
-*premultiplied* alpha. Nothing here converts between the two silently. Images that 8-bit RGB or RGBA holds without loss
-(grey, palettes) are read as such; others are refused by name. Colour profiles and EXIF orientation are not applied, as
-in COLMAP. Every failure is a :class:`~neuprim.core.errors.DataError` that names the file, the problem and what was
-expected.
+PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha, OpenEXR linear light with *premultiplied*
+alpha. Grey and palettes are read as RGB(A); what 8-bit RGB(A) cannot hold is refused. Colour profiles and EXIF
+orientation are not applied, as in COLMAP. Every failure is a :class:`~neuprim.core.errors.DataError`.
 """
 
 from __future__ import annotations
@@ -51,12 +49,7 @@ class ImageInfo:
 
 
 def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
-    """Read size and channels of an image from its header; ``channels`` as in :func:`read_image`.
-
-    Raises:
-        DataError: missing, empty, another format, not representable as 8-bit or float RGB(A), without a named channel,
-            or larger than :data:`~neuprim.core.io.exr.MAX_PIXELS`.
-    """
+    """Read size and channels of an image from its header; arguments and errors as in :func:`read_image`."""
     if is_exr(path, required=channels is not None):
         names, width, height = read_exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
@@ -67,15 +60,9 @@ def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
 def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequence[str] | None = None) -> Tensor:
     """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha, or linear premultiplied float (OpenEXR).
 
-    Grey and palette images become RGB, or RGBA if they have alpha. OpenEXR values stay float16 or float32 and are never
-    clamped.
-
     Args:
         size: expected (width, height).
         channels: names of OpenEXR channels to read instead of R, G, B(, A), in this order, as (H, W, C).
-
-    Raises:
-        DataError: as :func:`image_info`; also truncated or corrupt data, another size, NaN or infinite values.
     """
     with refuse_out_of_memory(path):
         if is_exr(path, required=channels is not None):
@@ -191,10 +178,7 @@ def pillow_image(path: Path, image: Tensor) -> Image.Image:
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write (H, W, 3 or 4) sRGB values, float 0..1 (clamped, rounded) or uint8, with straight alpha; atomic.
-
-    Raises DataError for a wrong shape, NaN values, or where the file cannot be written.
-    """
+    """Write (H, W, 3 or 4) sRGB values, float 0..1 (clamped, rounded) or uint8, with straight alpha; atomic."""
     picture = pillow_image(path, image)
     with checked_atomic_path(path) as temporary:
         picture.save(temporary, format="PNG")

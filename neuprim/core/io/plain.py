@@ -1,8 +1,7 @@
-"""Parse untrusted JSON and YAML text as plain data.
+"""Parse untrusted JSON, YAML and npz as plain data; every such file of a run or a user is parsed here.
 
-Rule: every JSON or YAML file of a run or of a user's folder is parsed here. Numbers are finite and whole ones have at
-most 64 bits, so that converting them later cannot overflow. YAML may not use anchors or aliases, which let a few lines
-describe more than memory holds. Nothing in the text is executed or looked up.
+Numbers are finite, whole ones have at most 64 bits, and YAML may not use anchors, which let a few lines describe more
+than memory holds. Arrays are checked before memory is allocated. Nothing is executed or looked up.
 """
 
 from __future__ import annotations
@@ -30,25 +29,14 @@ def finite(value: object) -> float | None:
 
 
 def load_json(text: str | bytes, infinite: bool = False) -> Any:
-    """Parse JSON text.
-
-    Args:
-        infinite: accept NaN and infinite numbers, for callers that check each number they use.
-
-    Raises:
-        ValueError, RecursionError: not JSON, or a number beyond the limits.
-    """
+    """Parse JSON text; ``infinite`` accepts NaN and infinity. Raises ValueError or RecursionError."""
     parse_float = float if infinite else _parse_float
     parse_constant = float if infinite else _refuse_constant
     return json.loads(text, parse_int=_parse_int, parse_float=parse_float, parse_constant=parse_constant)
 
 
 def load_yaml(text: str) -> Any:
-    """Parse YAML text.
-
-    Raises:
-        yaml.YAMLError, ValueError, RecursionError: not YAML, an anchor or an alias, or a number beyond the limits.
-    """
+    """Parse YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
     loader = _Loader(text)
     try:
         return loader.get_single_data()

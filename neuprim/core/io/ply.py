@@ -1,7 +1,6 @@
-"""Read untrusted PLY files (Turk 1994) with any elements and properties; write vertices.
+"""Read untrusted PLY files (Turk 1994), ASCII or binary, with any elements and properties; write vertices.
 
-ASCII and binary files of either byte order are read; binary little-endian files are written. Memory is allocated only
-for data that the file's bytes can hold, whatever the header claims.
+Memory is allocated only for data that the file's bytes can hold, whatever the header claims.
 """
 
 from __future__ import annotations
@@ -90,10 +89,7 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Read the ``wanted`` elements that a file of ``size`` bytes has and no data behind them.
-
-    The header must have vertices. Raises DataError as :func:`read_ply`; ``path`` is for messages.
-    """
+    """Read the ``wanted`` elements that a file of ``size`` bytes has; raises DataError."""
     order, elements, comments = _read_header(file, path)
     result: dict[str, PlyElement] = {}
     missing = set(wanted) & {element.name for element in elements}

@@ -1,8 +1,7 @@
 """Folders of files that several processes and machines share: a local or mounted folder, or an object store by URL.
 
-A folder counts as complete when its last file exists. In a file system a finished folder is renamed as a whole; in an
-object store, where an upload is atomic, the last file is uploaded last. So a killed process leaves nothing that looks
-complete. Of two processes that make the same folder either may win, as both make the same files.
+A folder counts as complete when its last file exists: a killed process leaves nothing that looks complete. Of two
+processes that make the same folder either may win, as both make the same files.
 """
 
 from __future__ import annotations
@@ -34,10 +33,7 @@ T = TypeVar("T")
 def open_store(address: str, copies: Path) -> Store:
     """Open the store at a folder's path or a URL; files of an object store are copied to the folder ``copies``.
 
-    Raises:
-        ConfigError: none of :data:`PROTOCOLS`, or a chain of them.
-        BackendUnavailable: the protocol's package is not installed.
-        DataError: the store cannot be reached.
+    Raises ConfigError, BackendUnavailable (a protocol's package is missing) or DataError.
     """
     protocol, is_url, path = address.partition("://")
     if "::" in address or (is_url and protocol not in PROTOCOLS):
@@ -66,10 +62,7 @@ def open_store(address: str, copies: Path) -> Store:
 
 
 class Store:
-    """Folders of files in one place; the content of a name never changes, so local copies stay valid.
-
-    ``path`` is the local folder itself, or that for copies of files from ``root`` in fsspec's ``system``.
-    """
+    """Folders of files in one place, ``path`` or fsspec's ``system`` and ``root``; a name's content never changes."""
 
     def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
         self.address, self.path, self._system, self._root = address, path, system, root
@@ -120,11 +113,7 @@ class Store:
             return bool(self._system.exists(f"{self._root}/{name}"))
 
     def fetch_file(self, name: str, max_bytes: int) -> Path:
-        """Path of a local file with that content; it does not exist if the store has no such file.
-
-        Raises:
-            DataError: the file is larger than ``max_bytes`` (checked before reading), or the store cannot be read.
-        """
+        """Return a local file with that content, which does not exist if the store has none; or raise DataError."""
         file = self.path / name
         if self.is_local:
             try:
@@ -144,11 +133,7 @@ class Store:
         return file
 
     def write_folder(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        """Have ``write`` fill an empty folder, then publish it under ``name`` unless a complete one exists by then.
-
-        Raises:
-            OSError, DataError: from ``write``, or the store cannot be written; then nothing exists under that name.
-        """
+        """Have ``write`` fill an empty folder, then publish it under ``name`` unless a complete one exists."""
         if self.is_local:  # the store's folder must exist: creating a lost mount would hide it
             fill_folder(self.path / name, write, lambda folder: (folder / last).is_file())
             for draft in self.path.glob(f".{name}-*"):  # of killed or slower processes
@@ -175,8 +160,7 @@ class Store:
     def retry(self, call: Callable[[], T], notify: Callable[[str], None]) -> T:
         """Return what ``call`` returns; if a local folder disappeared meanwhile, wait for it and call again.
 
-        Raises:
-            DataError: the folder did not come back within :data:`MAX_WAIT` seconds; or as ``call``.
+        Raises DataError if it is not back within :data:`MAX_WAIT` seconds; or as ``call``.
         """
         second_try = True
         while True:

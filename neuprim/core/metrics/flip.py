@@ -1,5 +1,4 @@
-"""FLIP, the perceptual difference of two images flipped between (Andersson et al. 2020), by the extra
-``neuprim[flip]``."""
+"""FLIP, the perceptual difference of two images flipped between (Andersson et al. 2020), by ``neuprim[flip]``."""
 
 from __future__ import annotations
 
@@ -11,8 +10,7 @@ from torch import Tensor
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.metrics import matched
 
-PIXELS_PER_DEGREE = 67.0
-"""The authors' default: a 0.7 m wide screen of 3840 pixels at 0.7 m."""
+PIXELS_PER_DEGREE = 67.0  # the authors' default: a 0.7 m wide screen of 3840 pixels at 0.7 m
 
 
 def flip_available() -> bool:
@@ -21,15 +19,7 @@ def flip_available() -> bool:
 
 
 def flip(rendered: Tensor, truth: Tensor) -> float:
-    """Mean LDR-FLIP of two images, 0 for equal ones to 1.
-
-    Args:
-        rendered, truth: (H, W, 3) float display-referred sRGB values; clamped to 0..1.
-
-    Raises:
-        BackendUnavailable: the package ``flip-evaluator`` is missing.
-        DataError, NonFiniteError: as :func:`neuprim.core.metrics.psnr`.
-    """
+    """Mean LDR-FLIP of two (H, W, 3) display-referred sRGB images, clamped to 0..1: 0 for equal ones to 1."""
     try:
         from flip_evaluator import evaluate
     except ImportError as error:

@@ -1,13 +1,7 @@
 """Image quality of one rendered view against its truth: PSNR and SSIM.
 
-Both take float images (H, W, C) with any number of channels and compare them as they are: nothing is clipped, quantised
-or converted between linear and sRGB, so the caller decides what is compared and says so. Sums are accumulated in
-float64.
-
-A render equal to its truth has an infinite PSNR, for which JSON has no number. Files therefore hold ``null`` and a flag
-beside it:
-``{"psnr": null, "psnr_infinite": true}``. :func:`to_json` and :func:`from_json` convert; a ``null`` without the flag is
-a missing value.
+Float images (H, W, C) are compared as they are: nothing is clipped, quantised or converted. Sums are in float64. JSON
+has no infinity: files hold ``{"psnr": null, "psnr_infinite": true}`` (:func:`to_json`, :func:`from_json`).
 """
 
 from __future__ import annotations
@@ -26,20 +20,13 @@ from neuprim.core.errors import DataError, NonFiniteError
 
 _MAX_NAMED = 6  # views in one line; metrics.json names all
 
-SSIM_WINDOW = 11
-"""Taps of the Gaussian window per axis (Wang et al. 2004)."""
+SSIM_WINDOW = 11  # taps of the Gaussian window per axis (Wang et al. 2004)
 
-SSIM_SIGMA = 1.5
-"""Standard deviation of that window in pixels; kornia fixes it."""
+SSIM_SIGMA = 1.5  # standard deviation of that window in pixels; kornia fixes it
 
 
 def matched(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Both images as detached float64 (H, W, C) on the CPU, after checking that they can be compared.
-
-    Raises:
-        DataError: not floating point, not (H, W, C), empty, or of different shapes.
-        NonFiniteError: a NaN or infinite value in either image.
-    """
+    """Return both images as detached float64 (H, W, C) on the CPU, or raise DataError or NonFiniteError."""
     images = {"rendered": rendered, "truth": truth}
     for name, image in images.items():
         if not image.is_floating_point():
@@ -59,15 +46,9 @@ def matched(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``.
+    """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; ``math.inf`` where the images are equal.
 
-    Args:
-        rendered, truth: (H, W, C) float images in the same colour space.
-        mask: (H, W) bool of pixels that count, None for all.
-        peak: the value that counts as full signal.
-
-    Returns:
-        The ratio, ``math.inf`` when the images are equal (see the module's text on JSON).
+    ``mask``: (H, W) bool of pixels that count; ``peak``: the value that counts as full signal.
     """
     first, second = matched(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -86,9 +67,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
 
 def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: what is left when exposure
-    and white balance are taken away, which no model can know of a photograph that it has not seen. Arguments and errors
-    as of :func:`psnr`."""
+    """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: without exposure."""
     first, second = matched(rendered, truth)
     counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
     square = first[counted].square().sum(0)
@@ -99,15 +78,10 @@ def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak:
 def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     """Structural similarity, the mean over pixels and channels of kornia's SSIM map, in -1..1 and 1 for equal images.
 
-    Fixed so that numbers compare across runs: an 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only
-    positions where the window lies wholly inside the image ("valid", as in Wang et al. 2004, scikit-image and
-    torchmetrics), so no padding takes part.
-    Where an image is lower or narrower than 11 pixels the window shrinks, on both axes, to the largest odd size that
-    fits.
-
-    Args:
-        rendered, truth: (H, W, C) float images in the same colour space.
-        peak: the data range L of the constants (K1 L)^2 and (K2 L)^2.
+    An 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only positions where the window lies inside the
+    image
+    ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data range
+    L.
     """
     first, second = matched(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -120,17 +94,11 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
 
 
 def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
-    """Structural similarity as the tools of 3D Gaussian splatting count it, those of the paper among them: for
-    comparing with their tables.
+    """Structural similarity as the tools of 3D Gaussian splatting count it, for comparing with their tables.
 
-    The window, its sigma and the constants are those of :func:`ssim`, for a data range of 1. What differs is the
-    border: every pixel has a window, and beyond the image both are black (zero padding), where :func:`ssim` counts only
-    windows inside. Windows at the border so see an edge that both images share, and often an empty background, so the
-    mean is mostly higher. Images lower or narrower than 11 pixels keep the whole window. Those tools read images back
-    from 8-bit files; here nothing is quantised.
-
-    Args:
-        rendered, truth: (H, W, C) float images of 0 to 1, as displayed.
+    As :func:`ssim` of values 0 to 1, but every pixel has a whole window, and beyond the image both are black. The mean
+    is
+    mostly higher. Nothing is quantised, as those tools do.
     """
     first, second = matched(rendered, truth)
     border = SSIM_WINDOW // 2
@@ -139,8 +107,7 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
 
 
 def to_json(key: str, value: float) -> dict[str, float | bool | None]:
-    """The entries that hold ``value`` under ``key`` in a JSON file: infinity becomes ``null`` and ``<key>_infinite:
-    true``."""
+    """Return the entries for ``value`` under ``key``: infinity becomes ``null`` and ``<key>_infinite: true``."""
     return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
 
 
@@ -171,10 +138,7 @@ def from_json(entries: Mapping[str, object], key: str) -> float | None:
 
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
-    """Summarise metrics.json in one line: mean, worst view, and views worse than an image of the background alone.
-
-    The mean is over the views that are not exact, as that of an empty frame without any error is infinite.
-    """
+    """Summarise metrics.json in one line: mean of inexact views, worst view, views worse than a black image."""
     worst, bad = from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"]
     values = [value for entry in metrics["per_view"] if (value := from_json(entry, "psnr")) is not None]
     wrong = [value for value in values if math.isfinite(value)]

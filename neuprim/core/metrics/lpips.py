@@ -1,9 +1,7 @@
 """LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), by weights of the user's own.
 
-neuprim has the arithmetic and no weights, and downloads none. What it reads are the state dictionaries that the authors
-of LPIPS and torchvision publish, as torch or safetensors files: that of a whole ``lpips.LPIPS(net="vgg")``, or its
-linear layers (``lpips/weights/v0.1/ vgg.pth``) and the network's convolutions (torchvision's ``vgg16-*.pth``) side by
-side in a folder. AlexNet and VGG16 are told apart by shapes.
+Weights are state dictionaries that LPIPS and torchvision publish, as torch or safetensors files: a whole
+``lpips.LPIPS(net="vgg")``, or linear layers and convolutions side by side in a folder. Shapes tell AlexNet from VGG16.
 """
 
 from __future__ import annotations
@@ -53,8 +51,7 @@ _ALEXNET = (
     _Layer(10, 256, 256, 3, 1, 1, 0, True),
 )
 _NETWORKS = {"alex": _ALEXNET, "vgg": _vgg16()}
-_LEAST = {"alex": 31, "vgg": 16}
-"""The smallest image side that leaves a pixel for the last layer."""
+_LEAST = {"alex": 31, "vgg": 16}  # the smallest image side that leaves a pixel for the last layer
 
 _SHIFT, _SCALE = (-0.030, -0.088, -0.188), (0.458, 0.448, 0.450)
 _EPS = 1e-10
@@ -81,12 +78,7 @@ class Lpips:
 
     @staticmethod
     def load(path: str | Path) -> Lpips:
-        """Weights of a file, or of all of a folder's ``.pth``, ``.pt`` and ``.safetensors`` files together; no code in
-        them is run.
-
-        Raises:
-            DataError: unreadable, or not the weights of LPIPS; names what is missing.
-        """
+        """Read weights of a file, or of all of a folder's together, without running code; or raise DataError."""
         where = Path(path)
         files = sorted(f for f in where.iterdir() if f.suffix in _SUFFIXES) if where.is_dir() else [where]
         if not files:
@@ -94,20 +86,12 @@ class Lpips:
         return _made({key: value for file in files for key, value in _read(file).items()}, where)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> float:
-        """The distance as published: of values 0 to 1, which are mapped to -1 to 1 first.
-
-        Args:
-            rendered, truth: (H, W, 3) float display-referred sRGB values; clamped to 0..1.
-
-        Raises:
-            DataError, NonFiniteError: as :func:`neuprim.core.metrics.psnr`; images smaller than :attr:`least`, or not
-            of 3 channels.
-        """
+        """The distance as published: of (H, W, 3) values clamped to 0..1 and mapped to -1..1; DataError below
+        :attr:`least`."""
         return self._distance(*(2.0 * image - 1.0 for image in self._images(rendered, truth)))
 
     def unmapped(self, rendered: Tensor, truth: Tensor) -> float:
-        """The distance as the tools of 3D Gaussian splatting take it: the network, made for -1 to 1, gets values 0 to 1
-        as they are."""
+        """The distance as the tools of 3D Gaussian splatting take it: of values 0 to 1 as they are."""
         return self._distance(*self._images(rendered, truth))
 
     def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:

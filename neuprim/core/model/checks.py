@@ -1,13 +1,7 @@
-"""What fields hand to the renderer, checked at every entrance to it: one line that names field, tensor, found and
-expected.
+"""Checks of what fields hand to the renderer: one line names field, tensor, found and expected.
 
-Compiled kernels index without looking. A tensor that is too short would be read and written beyond its end, one of
-another layout would be read as something else, and torch would broadcast what does not fit. Here every closed form says
-what its tensors must be, with the sizes they share, and the first that does not fit is named. That costs microseconds
-per frame.
-
-Tensors are float32 or float64, in any mix, dense and all on one device; their strides do not matter, as backends copy
-what is not contiguous.
+Compiled kernels index without looking, and torch would broadcast what does not fit. Tensors are float32 or float64, in
+any mix, dense and all on one device; strides do not matter.
 """
 
 from __future__ import annotations
@@ -66,11 +60,7 @@ def method(field: Field, name: str) -> str:
 
 
 def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
-    """The sizes that the tensors of ellipsoids share; ``count`` is how many there must be, where that is known.
-
-    Raises:
-        FormError: they do not; names ``who``, tensor, found and expected.
-    """
+    """Return the sizes that the tensors of ellipsoids share (``count`` of them, where known), or raise FormError."""
     if not isinstance(geometry, Geometry):
         raise FormError(f"{who} has type {type(geometry).__name__}; expected Geometry")
     sizes: Sizes = {} if count is None else {"N": (count, "the geometry given")}
@@ -100,8 +90,7 @@ def _check_form(who: str, form: Any, kinds: tuple[type[Shaped], ...], sizes: Siz
 
 
 def check_channels(found: int, colour: ColourField) -> None:
-    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says, which are the data
-    set's."""
+    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says."""
     if found != colour.channels:
         raise FormError(
             f"{method(colour, 'lower')} returned a colour of C={found}; "
@@ -119,8 +108,7 @@ def check_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") ->
 
 
 def check_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
-    """Raise :class:`FormError` unless ``rows`` are ascending int64 rows (M,) of a ``model`` of so many primitives,
-    ``length`` of them."""
+    """Raise :class:`FormError` unless ``rows`` are ascending int64 (M,), ``length`` of them, below ``model``."""
     found = None
     if not _is_dense(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
         found = _described(rows)
@@ -139,11 +127,7 @@ def check_rows(rows: Any, model: int | None, who: str, length: int | None = None
 
 
 def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
-    """What a field's own code returned: a dense tensor of real numbers, of this shape.
-
-    Raises:
-        FormError: it is something else; ``who`` names field and method.
-    """
+    """Return what a field's own code returned if it is a dense tensor of real numbers of this shape."""
     if not _is_dense(value) or not value.is_floating_point():
         kinds = " or ".join(device.DEVICE_TYPES)
         raise FormError(f"{who} returned {_described(value)}; expected a dense tensor of real numbers on the {kinds}")
@@ -154,11 +138,7 @@ def check_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
 
 
 def check_shading(found: Any, count: int, who: str) -> Shading:
-    """What ``shade`` returned, for ``count`` primitives; None is no shading.
-
-    Raises:
-        FormError: it is something else; ``who`` names field and method.
-    """
+    """Return what ``shade`` returned if it fits ``count`` primitives; None is no shading."""
     if found is None:
         return Shading()
     if not isinstance(found, Shading):
@@ -169,11 +149,7 @@ def check_shading(found: Any, count: int, who: str) -> Shading:
 
 
 def check_start(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
-    """The float32 start value (N, *shape) that a parameter's own initialiser draws.
-
-    Raises:
-        FormError: it is of another shape; names ``who`` and the parameter.
-    """
+    """Return the float32 start value (N, *shape) that a parameter's own initialiser draws."""
     value, shape = spec.init(context), (context.count, *spec.shape)
     if not isinstance(value, Tensor):
         raise FormError(f"{who}: {spec.name}: init returned type {type(value).__name__}; expected a torch tensor")
@@ -183,11 +159,7 @@ def check_start(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
 
 
 def check_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
-    """A field's own parameters from one of its methods: names, shapes and dtypes of ``like``.
-
-    Raises:
-        FormError: they are not; ``who`` names field and method.
-    """
+    """Return a field's own parameters from one of its methods: names, shapes and dtypes of ``like``."""
     if not isinstance(found, Mapping):
         raise FormError(f"{who} returned type {type(found).__name__}; expected a dict of tensors by name")
     if set(found) != set(like):
@@ -206,11 +178,7 @@ def check_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str,
 def check_halves(
     found: Any, like: Mapping[str, Tensor], place: Geometry, who: str
 ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-    """What ``divide`` returned: a mask of P parents, and tensors and geometry of 2 P rows like ``like`` and ``place``.
-
-    Raises:
-        FormError: it is something else; ``who`` names field and method.
-    """
+    """Return what ``divide`` returned: a mask of P parents, and 2 P rows like ``like`` and ``place``."""
     if not isinstance(found, tuple) or len(found) != 3:
         raise FormError(f"{who} returned type {type(found).__name__}; expected (mask, tensors, Geometry) or None")
     mask, halves, where = found

@@ -1,18 +1,16 @@
 """Sums of cosines, w_k cos(rate (v_k . x + b_k)): a canonical form for quantisation, and pruning of neurons.
 
 **Canonical form.** A sum stays the same when (v_k, b_k) changes sign, when rate b_k gains a whole turn, and when it
-gains half a turn and w_k changes sign. So every w_k can be positive and every b_k between 0 and half a turn, where few
-bits say more. Likewise a strength b exp(g) is the sign of b times another gain.
+gains half a turn and w_k changes sign. So every w_k can be positive and every b_k between 0 and half a turn.
 
-**Pruning.** The neurons whose part of the density varies most stay as they are; the others leave their mean behind.
-Over an ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
+**Pruning.** The neurons whose part of the density varies most stay; the others leave their mean behind. Over an
+ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
 
     mean of cos(phi + r.y) = cos(phi) b(|r|),   b(r) = 3 (sin r - r cos r)/r^3,   phi = omega0 b1,
     r = omega0 diag(s/m) R^T W1
 
 and its variance follows from the mean of cos^2 = (1 + cos 2(.))/2. Where phases advance in time, phi + xi a for xi in
-0..1, b gets the factor sinc(a/2) and phi becomes that of the middle of the sequence, phi + a/2. Means are those of a
-hard edge; a soft one weights the middle more.
+0..1, b gets the factor sinc(a/2) and phi becomes phi + a/2. Means are those of a hard edge.
 """
 
 from __future__ import annotations
@@ -35,10 +33,8 @@ def canonicalize_cosines(
     """Make every weight of the first output at least 0, and every phase between 0 and half a turn, pi/rate.
 
     Args:
-        params: name -> (N, ...); those that are not named pass through.
         inputs: names of what cosines multiply with, (N, K) or (N, K, ...).
-        phase: name of the b_k, (N, K).
-        weights: name of the w_k, (N, K) or (N, outputs, K).
+        phase, weights: names of the b_k, (N, K), and of the w_k, (N, K) or (N, outputs, K).
     """
     turn = 2 * math.pi / rate
     b, w = params[phase].detach().double(), params[weights].detach()
@@ -58,13 +54,7 @@ def canonicalize_cosines(
 
 
 def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
-    """Make every b of the products b exp(g) -1, 0 or 1.
-
-    Args:
-        params: name -> (N, ...); those that are not named pass through.
-        strength, log_gain: names of b and g, (N, 1).
-        limit: a g counts as no further from 0; where it would be, and where b is 0, both stay as they are.
-    """
+    """Make every b of the products b exp(g) -1, 0 or 1; a g stays where it would be beyond ``limit``."""
     b, g = params[strength].detach(), params[log_gain].detach()
     joined = g.double().clamp(-limit, limit) + b.double().abs().log()
     fits = (b != 0) & (joined.abs() <= limit)
@@ -77,11 +67,7 @@ def smaller_neuron_counts(neurons: int) -> tuple[int, ...]:
 
 
 def prune_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
-    """Keep the ``keep`` neurons of each primitive whose part of the density varies most; other tensors pass through.
-
-    Args:
-        params: W1 (N, K, 3), b1 (N, K), w2 (N, K), b2 (N, 1), and W_t (N, K) where phases advance in time.
-    """
+    """Keep the ``keep`` neurons of each primitive whose part of the density varies most."""
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
     rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations

@@ -1,8 +1,8 @@
 """The edge of a support: how a primitive's density, or its life in time, fades to nothing.
 
-With u the distance from the middle over the distance from the middle to the edge, the weight is (1 - u^2)^p. p = 0 is a
-hard edge, p = 1 and 2 soft ones. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 -
-|y|^2)^p becomes D^p (1 - u^2)^p, and
+With u the distance from the middle over that to the edge, the weight is (1 - u^2)^p: p = 0 is a hard edge, 1 and 2 soft
+ones. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 - |y|^2)^p is D^p (1 - u^2)^p,
+and
 
     1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
     B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
@@ -19,11 +19,9 @@ import math
 import torch
 from torch import Tensor
 
-EDGES = (0, 1, 2)
-"""Exponents p that there are."""
+EDGES = (0, 1, 2)  # exponents p that there are
 
-NORMS = (2.0, 4 / 3, 16 / 15)
-"""N_p: the integral of (1 - u^2)^p over [-1, 1]. numba freezes them into kernels."""
+NORMS = (2.0, 4 / 3, 16 / 15)  # N_p: the integral of (1 - u^2)^p over [-1, 1]. numba freezes them into kernels
 
 _SERIES_BELOW, _TERMS = (
     2.0,
@@ -80,11 +78,9 @@ def legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
 def chord_integral(
     quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
 ) -> Tensor:
-    """(M,) 1/2 integral over u in [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)),
-    p = 1 or 2.
+    """(M,) 1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)).
 
-    Args:
-        quadratic: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
+    p = 1 or 2; ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
     """
     a = legendre(*quadratic, edge)
     total = offset * a[0]

@@ -1,8 +1,7 @@
-"""The two interfaces of the design: a density field and a colour field; the closed forms they lower to are in
-:mod:`neuprim.core.model.forms`.
+"""Density fields and colour fields: the parameters of primitives, and how they *lower* to a closed form.
 
-A *field* owns some per-primitive parameters. Before a frame is drawn it *lowers*: conditions such as time or light are
-folded into one of a few closed forms that the renderer knows. The renderer never sees a task.
+Before a frame is drawn, conditions such as time or light are folded into one of a few closed forms
+(:mod:`neuprim.core.model.forms`) that the renderer knows. The renderer never sees a task.
 """
 
 from __future__ import annotations
@@ -47,21 +46,16 @@ class ConditionSpec:
 
     Attributes:
         name: of the flag, and the key in a frame's conditions.
-        range: lowest and highest value of every element. Numbers that are not finite are refused by every command; for
-        numbers beyond
-            the range there is a warning.
-        parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame of an animation; raises
-            :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()`` it is asked for each element of a list
-            ``A,B,C``, and need not know ranges ``A:B:COUNT`` (:mod:`neuprim.core.conditions`).
-        strict: whether numbers beyond the range are refused, a data set's among them.
+        range: lowest and highest value of every element. Numbers that are not finite are refused; beyond the range
+            there
+            is a warning, or with ``strict`` a refusal.
+        parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
+            :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()``, lists and ranges are parsed before
+            (:mod:`neuprim.core.conditions`).
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
-        in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say itself
-        how many; None
-            where it does. So an animation without a length takes that of another one beside it. Not asked about ranges
-            of numbers.
-        place: for conditions that are positions: ``parse`` of a text whose numbers are in the world of the user's
-        files, (text, world) ->
-            values in scene units; see :meth:`within`.
+        in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say how
+            many.
+        place: for positions: ``parse`` of a text in the world of the user's files, (text, world) -> scene units.
     """
 
     name: str
@@ -75,8 +69,7 @@ class ConditionSpec:
     place: Callable[[str, World], list[Tensor]] | None = None
 
     def within(self, world: World) -> ConditionSpec:
-        """The condition of a model whose scene lies in ``world``: positions that users write are in the coordinates of
-        their files."""
+        """The condition of a model in ``world``: users write positions in the coordinates of their files."""
         place = self.place
         return self if place is None or world.identity else replace(self, parse=lambda text: place(text, world))
 
@@ -89,10 +82,7 @@ class ConditionSpec:
 
 
 class Field(ABC):
-    """Per-primitive parameters with a meaning. Subclasses are final: no field inherits from another.
-
-    ``init_settings`` names the keys of ``model.init`` that the field's initialisers read.
-    """
+    """Per-primitive parameters with a meaning; ``init_settings``: keys of ``model.init`` that initialisers read."""
 
     init_settings: tuple[str, ...] = ()
 
@@ -113,33 +103,22 @@ class Field(ABC):
         """Receive the used fraction of the budget, 0..1, before every training step; e.g. to unlock SH bands."""
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Compute rows of children created inside their parents.
+        """Compute rows of children created inside their parents, which continue the parents' field.
 
         Args:
             params: this field's tensors, one row per child, gathered from the parents.
-            old: the parents' geometry, one row per child.
-            new: the children's geometry.
-
-        Returns:
-            tensors of the same shapes, such that each child continues its parent's field inside its own support.
+            old, new: the parents' and the children's geometry, one row per child.
         """
         return dict(params)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Return settings that a fitted model can reduce, with the smaller values in descending order, e.g.
-        ``{"degree": (2, 1, 0)}``."""
+        """Return settings that a fitted model can reduce, smaller values descending: ``{"degree": (2, 1, 0)}``."""
         return {}
 
     def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
-        """Reduce one of :meth:`reductions`: the field and tensors closest to this one's without more training.
+        """Return the field and tensors closest to this one's with one of :meth:`reductions` applied.
 
-        Args:
-            params, geometry: of all primitives.
-            name, value: a setting, and one of the values that it can have.
-
-        Returns:
-            the field, and its tensors by name; with "means" among them where the primitives' centres (N, 3) change with
-            it, as they do where a density moves them.
+        "means" is among the tensors where the primitives' centres (N, 3) change with it.
         """
         raise NotImplementedError(
             f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it"
@@ -152,16 +131,13 @@ class Field(ABC):
     def canonicalize(self, params: Params) -> dict[str, Tensor]:
         """Return equivalent tensors whose numbers lie close together, for quantised files.
 
-        Where several tensors describe the same field, as with the sign of a cosine's argument, choose one of them.
         Images may change by rounding only; a second call changes no bit.
         """
         return dict(params)
 
     def script(self) -> str | None:
-        """JavaScript that folds conditions into the field's closed form as :meth:`DensityField.lower` and
-        :meth:`ColourField.lower` do, for pages that draw the model in a browser; docs/plugins.md says what it must
-        evaluate to. None: such pages cannot show the field.
-        """
+        """JavaScript that folds conditions into the closed form, for web pages (docs/plugins.md); None: not shown
+        there."""
         return None
 
 
@@ -182,9 +158,9 @@ def read_script(package: str, name: str) -> str:
 class DensityField(Field):
     """How much light a point absorbs.
 
-    ``exact_split`` says that children continue their parent's sigma inside their own support (see :meth:`on_split`). A
-    family of densities that is too small for that, such as Gaussians, sets it to False; its children must then hold
-    their parent's mass, the integral of sigma over space.
+    ``exact_split``: children continue their parent's sigma inside their own support. Where a family is too small for
+    that,
+    such as Gaussians, they must hold their parent's mass, the integral of sigma over space.
     """
 
     exact_split: bool = True
@@ -195,19 +171,17 @@ class DensityField(Field):
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
-        """Return sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3) inside
-        them."""
+        """Return sigma (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3)."""
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         """Rows whose density is ``factor`` (rows,) times as large everywhere (a clone in place halves both copies)."""
 
     def components(self, params: Params) -> dict[str, Tensor]:
-        """Return name -> (N,) share, 0..1, of each primitive's extinction that comes from the source grid of that name.
+        """Return name -> (N,) share, 0..1, of each primitive's extinction that comes from a source grid.
 
-        Only fields fitted to data in which several grids make the extinction have any
-        (:attr:`neuprim.core.data.PointSamples.components`).
-        Images do not depend on them.
+        For fields fitted to several grids (:attr:`neuprim.core.data.PointSamples.components`); images do not depend on
+        them.
         """
         return {}
 
@@ -216,10 +190,7 @@ class DensityField(Field):
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return (M,) ascending int64 rows of active primitives, which can absorb anything under these conditions.
-
-        Inactive primitives are left out before anything else is computed. None: all are active.
-        """
+        """Return (M,) ascending int64 rows of primitives that can absorb anything; None: all."""
         return None
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
@@ -227,22 +198,20 @@ class DensityField(Field):
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """How fresh primitives look like Gaussians of opacities ``alphas`` (N,), 0..1: (N,) standard deviations from
-        the middle to the edge of the support, and (N,) opacities through the middle. By default those of an ellipsoid
-        of constant density with the same covariance.
+        """How fresh primitives look like Gaussians of opacities ``alphas`` (N,): standard deviations from
+        middle to edge, and opacities through the middle, (N,) each. By default an ellipsoid of constant density.
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
     def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
-        """Split along a condition instead of in space, for densities that are active in a part of its range.
+        """Split along a condition instead of in space; None: never.
 
         Args:
-            params: this field's tensors, one row per parent (P rows).
-            geometry: the parents'.
+            params, geometry: of P parents, one row each.
 
         Returns:
-            (P,) bool of the parents that are better divided this way; this field's tensors and the geometry of 2 P
-            rows, all first halves then all second halves (rows of other parents are ignored). None: never.
+            (P,) bool of the parents that are better divided this way; tensors and geometry of 2 P rows, first halves
+                first.
         """
         return None
 
@@ -253,9 +222,7 @@ class ColourField(Field):
     channels: int
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """The colour as :func:`neuprim.core.model.colours.sh.colors` takes it under these conditions, for fields that
-        are that: zero-order coefficients (N, C) and those of the higher bands (N, B, C) or None. None for other fields.
-        """
+        """Return (N, C) and (N, B, C) or None as :func:`neuprim.core.model.colours.sh.colors` takes them, or None."""
         return None
 
     @abstractmethod
@@ -265,7 +232,5 @@ class ColourField(Field):
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading | None:
-        """What else the frame's colours are multiplied by. Images drawn for it take their backend and threads from
-        ``settings``, those of the frame.
-        """
+        """What else the frame's colours are multiplied by; images for it are drawn with the frame's settings."""
         return None

@@ -16,18 +16,15 @@ from torch import Tensor
 
 _LOGITS = torch.linspace(-6, 6, 25, dtype=torch.float64)
 """Of the opacities that are tabulated; beyond, the nearest counts."""
-_NODES, _FAR = 160, 5.0
-"""Rings of the footprint, and where it ends: standard deviations."""
-_WIDTHS = (1.45, 4.0)
-"""Where c is looked for."""
+_NODES, _FAR = 160, 5.0  # rings of the footprint, and where it ends: standard deviations
+_WIDTHS = (1.45, 4.0)  # where c is looked for
 _GOLDEN = (5**0.5 - 1) / 2
 
 
 def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[Tensor, Tensor]:
-    """(N,) c and (N,) tau of primitives of this edge, float64, for Gaussians of opacity ``alphas`` (N,), 0..1.
+    """(N,) c and (N,) tau, float64, of primitives for Gaussians of opacity ``alphas`` (N,), 0..1.
 
-    Args:
-        volume: the Gaussians are densities in space, whose optical depth, and not whose alpha, is a bell on the screen.
+    ``volume``: the Gaussians are densities in space, whose optical depth, not alpha, is a bell on the screen.
     """
     table = _table(edge, volume)
     alphas = alphas.double().clamp(1e-9, 1 - 1e-9)
@@ -40,8 +37,7 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
 @lru_cache
 def _table(edge: int, volume: bool) -> Tensor:
-    """(O, 2) c and the logarithm of tau over that of the opacity, -log(1 - o), for the tabulated opacities; by a golden
-    section of c."""
+    """(O, 2) c and log(tau / -log(1 - o)) for the tabulated opacities, by a golden section of c."""
     r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
     opacity = torch.sigmoid(_LOGITS)[:, None]
     bell = (-r * r / 2).exp()

@@ -1,8 +1,6 @@
 """The closed forms that fields lower to: what a renderer draws, with its task's conditions folded in.
 
-Each knows its tensors, what shapes they must have, and its mathematics: the optical depth along chords of rays
-(:class:`Pairs`), the colour that is seen there. A renderer that asks for these draws any form; kernels know a few of
-them by name.
+Each knows its tensors' shapes and its mathematics along chords (:class:`Pairs`); kernels know a few by name.
 """
 
 from __future__ import annotations
@@ -25,19 +23,15 @@ from neuprim.core.model.tensors import MOST_UNITS, Shaped, Shapes, Sizes, functi
 
 @dataclass(frozen=True)
 class Cosine(Shaped):
-    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, world density (1 - |y|^2)^p f/m inside the ellipsoid |y|
-    < 1.
+    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
 
-    p = 0 is the paper's; p = 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`), and p = 2 with K = 0 is close
-    to a
-    Gaussian.
+    p = 0 is the paper's; 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`). ``first + second`` is a sum of
+    densities.
 
     Attributes:
-        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`, and K = 0 is a constant
-        f. omega0: multiplies the whole phase.
+        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`.
+        omega0: multiplies the whole phase.
         edge: p, 0, 1 or 2.
-
-    ``first + second`` is the sum of two densities of the same primitives, see :meth:`__add__`.
     """
 
     shapes: ClassVar[Shapes] = {
@@ -60,14 +54,9 @@ class Cosine(Shaped):
         return super().fault(sizes) or labelled("omega0", number_fault(self.omega0))
 
     def __add__(self, other: Cosine) -> Cosine:
-        """f + g, exactly: the neurons of both side by side. Differentiable.
+        """f + g, exactly: the neurons of both side by side, with the first omega0 (the second if that is 0).
 
-        Both have the first one's omega0 (the second one's if that is 0); frequencies and phases of the other are scaled
-        to it.
-
-        Raises:
-            FormError: they are not of the same primitives, have different edges, or more than :data:`MOST_UNITS`
-            neurons together.
+        Raises FormError for other primitives, different edges, or more than :data:`MOST_UNITS` neurons together.
         """
         if not isinstance(other, Cosine):
             return NotImplemented
@@ -120,8 +109,9 @@ class Cosine(Shaped):
 class CustomDensity(Shaped):
     """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
 
-    ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) primitive rows, (M, 3) ray origins and unit directions
-    in scene units and the (M,) chord ends in scene units, and returns the (M,) optical depths, the integral of sigma.
+    ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) rows, (M, 3) ray origins and unit directions and (M,)
+    chord
+    ends in scene units, and returns the (M,) optical depths.
     """
 
     edge: ClassVar[int] = 0
@@ -146,8 +136,7 @@ class CustomDensity(Shaped):
         return CustomDensity(line_integral)
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
-        """Integrals of sigma along chords as the code returns them, unchecked: see
-        :meth:`~neuprim.core.model.primitives.Lowered.optical_depth`."""
+        """Integrals of sigma along chords as the code returns them, unchecked."""
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
 
@@ -195,8 +184,7 @@ class Constant(Shaped):
 class CustomColour(Shaped):
     """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
 
-    ``radiance(prim, x, d)`` takes (M,) primitive rows, (M, 3) chord middles in scene units and (M, 3) unit directions,
-    and returns (M, C).
+    ``radiance(prim, x, d)`` takes (M,) rows, (M, 3) chord middles in scene units and unit directions, returns (M, C).
     """
 
     per_primitive: ClassVar[bool] = False
@@ -220,8 +208,7 @@ class CustomColour(Shaped):
         return CustomColour(radiance, self.channels)
 
     def chord_colours(self, pairs: Pairs) -> Tensor:
-        """Colours that are seen along chords as the code returns them, unchecked: see
-        :meth:`~neuprim.core.model.primitives.Lowered.chord_colours`."""
+        """Colours seen along chords as the code returns them, unchecked."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
     def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
@@ -237,11 +224,10 @@ class RayNet(Shaped):
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
-    with x_m the middle of the ray's chord, after the cut by the near plane if there is one: the point that the closed
-    form of the density is anchored at. One hidden layer of H cosine units, H = 0 to :data:`MOST_UNITS`, phases in
-    radians; H = 0 is the constant colour max(0, base). Whatever does not change within a primitive (view direction at
-    its centre, light) a field folds into ``bias``,
-    ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
+    with x_m the middle of the ray's chord, after the near plane's cut. One hidden layer of H cosine units, H = 0 to
+    :data:`MOST_UNITS`. What does not change within a primitive (view direction, light) a field folds into ``bias``,
+    ``Wout``
+    and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
 
     Attributes:
         Wx: (N, H, 3) on scene axes, radians per m; bias: (N, H), radians.
@@ -276,8 +262,7 @@ class RayNet(Shaped):
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 
     def radiance(self, prim: Tensor, local: Tensor) -> Tensor:
-        """(M, C) float64 colours of primitives ``prim`` (M,) at local chord middles ``local`` = x~_m (M, 3) float64;
-        differentiable."""
+        """(M, C) float64 colours of primitives ``prim`` (M,) at ``local`` = x~_m (M, 3) float64; differentiable."""
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
@@ -307,10 +292,7 @@ class Shading:
 
     Attributes:
         primitives: (M,) at least 0, one for each primitive of the frame; None: 1.
-        pixels: a factor that varies faster than primitives do, such as a shadow's edge: the renderer asks for it once
-        per pixel, at the
-            mean depth of what the pixel shows (deferred shading). None: 1 everywhere, and no depth image is drawn for
-            it.
+        pixels: a factor asked for once per pixel, at the mean depth of what it shows (deferred shading); None: 1.
     """
 
     primitives: Tensor | None = None

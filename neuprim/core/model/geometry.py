@@ -13,10 +13,7 @@ from neuprim.core.model.tensors import Shaped, Shapes
 
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of wxyz quaternions (..., 4), normalised on use.
-
-    Raises nothing: a zero quaternion gives NaN here and is refused by name before it reaches a renderer.
-    """
+    """Rotation matrices (..., 3, 3) of wxyz quaternions (..., 4), normalised on use; NaN of a zero quaternion."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),

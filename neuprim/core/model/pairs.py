@@ -11,9 +11,8 @@ from neuprim.core.model.geometry import Geometry
 
 @dataclass(frozen=True)
 class Pairs:
-    """M chords, one for each ray and primitive that meet; float64, differentiable.
-
-    A primitive's own length is m, its longest semi-axis: what is measured in it never over- or underflows.
+    """M chords, one for each ray and primitive that meet; float64, differentiable. Lengths are in m, the longest
+    semi-axis.
 
     Attributes:
         prim: (M,) int64 rows of the primitives.
@@ -21,13 +20,9 @@ class Pairs:
         local: (M, 3) middles of the chords, (x - mu)/m, scene axes.
         half: (M,) half lengths of the chords, in m.
         origin: (M, 3) or (3,) starts of the rays, scene units.
-        near, far: (M,) ends of the chords, and middle: (M,) their middles, as ray distances in m.
+        near, far, middle: (M,) ends and middles of the chords, as ray distances in m.
         m: (M,) scene units.
-        whitened: (M, 3) middles of the chords in whitened space, where the ellipsoids are the unit ball; pace: (M, 3)
-        what a ray distance of
-            1 m moves a point there.
-
-    What only code of a plugin needs, in scene units, is computed when it is asked for.
+        whitened, pace: (M, 3) middles in whitened space, and what a ray distance of 1 m moves a point there.
     """
 
     prim: Tensor
@@ -68,8 +63,7 @@ class Pairs:
 
     @property
     def support(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(M,) each: c0, c1, c2 of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1] from their starts to
-        their ends."""
+        """(M,) each: c0, c1, c2 of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1]."""
         step = self.half[:, None] * self.pace
         return 1 - self.whitened.square().sum(-1), -2 * (self.whitened * step).sum(-1), -step.square().sum(-1)
 

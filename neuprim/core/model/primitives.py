@@ -24,14 +24,7 @@ from neuprim.core.model.checks import (
     method,
     source,
 )
-from neuprim.core.model.fields import (
-    ColourField,
-    Conditions,
-    DensityField,
-    LoweredColour,
-    LoweredDensity,
-    Shade,
-)
+from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.pairs import Pairs
 from neuprim.core.model.schema import InitContext, ParameterSpec
@@ -43,9 +36,8 @@ from neuprim.core.settings import RenderSettings
 class Lowered:
     """The input of the renderer for one frame, whatever the task.
 
-    ``rows`` (M,) int64 says which primitives these are where a field left some out; None for all. ``shade``, if any, is
-    a factor on each pixel (see :meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields`` are the class names of
-    density and colour field, for messages; None for forms that no field made.
+    ``rows`` (M,) int64: which primitives of the model these are; None for all. ``shade``: a factor on each pixel
+    (:meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields``: class names of the fields, for messages.
     """
 
     geometry: Geometry
@@ -56,11 +48,7 @@ class Lowered:
     fields: tuple[str, str] | None = None
 
     def check(self, viewmat: Any = None, background: Any = None) -> None:
-        """Check everything that a renderer takes.
-
-        Raises:
-            FormError: something does not fit; names field (where the model knows it), form, tensor, found and expected.
-        """
+        """Raise :class:`FormError` unless everything that a renderer takes fits."""
         density, colour = self.fields or (None, None)
         sizes = check_geometry(self.geometry, "geometry")
         check_density(self.density, sizes, density)
@@ -70,11 +58,7 @@ class Lowered:
         self.check_frame(viewmat, background)
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
-        """Check what :meth:`Primitives.lower` has not checked.
-
-        Raises:
-            FormError: as of :meth:`check`.
-        """
+        """Check what :meth:`Primitives.lower` has not checked; raises as :meth:`check`."""
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
@@ -145,8 +129,7 @@ class ActiveSet:
     geometry: Geometry  # where they are under the conditions
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
-        """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,), 0..M-1, at points ``x``
-        (P, 3)."""
+        """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
         return check_result(found, (len(prim),), method(self.field, "density"))
 
@@ -157,10 +140,7 @@ class Primitives:
     Attributes:
         density, colour: the fields.
         specs: every parameter, geometry first; the only list of tensors there is.
-        params: name -> (N, *shape) tensor, in the order of ``specs``.
-
-    Raises:
-        ValueError: when names clash or a tensor's shape differs from its spec.
+        params: name -> (N, *shape) tensor, in the order of ``specs``. Others are a ValueError.
     """
 
     def __init__(self, density: DensityField, colour: ColourField, params: Mapping[str, Tensor]) -> None:
@@ -181,11 +161,7 @@ class Primitives:
 
     @classmethod
     def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
-        """Fresh primitives from the specs' own initialisers.
-
-        Raises:
-            FormError: one of them returned something of another shape.
-        """
+        """Fresh primitives from the specs' own initialisers; raises FormError for other shapes."""
         own = [("starting points", spec) for spec in GEOMETRY_SPECS]
         own += [(method(field, "parameters"), spec) for field in (density, colour) for spec in field.parameters()]
         return cls(density, colour, {spec.name: check_start(spec, context, who) for who, spec in own})
@@ -218,12 +194,11 @@ class Primitives:
     def lower(
         self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None, shaded: bool = True
     ) -> Lowered:
-        """Fold a frame's conditions into closed forms; differentiable. Primitives that are not active in it are left
-        out.
+        """Fold a frame's conditions into closed forms; differentiable. Inactive primitives are left out.
 
         Args:
             settings: for images that a colour field needs first, such as a shadow's; None: the defaults.
-            shaded: whether the colour field's :meth:`~neuprim.core.model.fields.ColourField.shade` is asked.
+            shaded: whether :meth:`~neuprim.core.model.fields.ColourField.shade` is asked.
 
         Raises:
             FormError: a field hands over tensors that do not fit.
@@ -260,19 +235,14 @@ class Primitives:
         return density, sizes
 
     def component(self, name: str) -> Primitives:
-        """The part of the extinction that comes from the source grid ``name``: every density times its share. KeyError:
-        there is none."""
+        """The part of the extinction that comes from the source grid ``name``, or KeyError."""
         own = {key: value.detach() for key, value in self.of(self.density).items()}
         scaled = self.density.scale_density(own, self.density.components(own)[name])
         return Primitives(self.density, self.colour, {**self.params, **scaled})
 
     @torch.no_grad()
     def limit(self, largest: float) -> None:
-        """Scale, in place, every primitive that may have more than this extinction anywhere, so that it has no more.
-
-        The largest extinction of the data is none of a single primitive: needles between their voxels would show at
-        other resolutions.
-        """
+        """Scale densities, in place, so that no primitive exceeds this extinction: the data's largest."""
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
         if found is None:

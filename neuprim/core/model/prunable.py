@@ -1,7 +1,8 @@
-"""Prunable units: numbers of a primitive's fields that it can do without, such as a neuron or a colour coefficient.
+"""Prunable units: numbers that a primitive can do without, such as a neuron; files store pruned parameters sparsely.
 
-A unit is as few numbers as can be zero without the others losing their meaning. Pruning decides per primitive which
-units stay. Files leave out zeros (:mod:`neuprim.core.model.sparse_storage`).
+Pruning decides per primitive which units stay. Where it is smaller, a file has two tensors of a parameter:
+``NAME|there``,
+uint8, one bit per number, row by row and lowest bit first, and ``NAME|numbers``, float32, those whose bit is set.
 """
 
 from __future__ import annotations
@@ -15,8 +16,7 @@ from torch import Tensor
 
 from neuprim.core.model.schema import Params
 
-Index = tuple[int | slice, ...]
-"""Index into a parameter, behind the axis of the primitives."""
+Index = tuple[int | slice, ...]  # index into a parameter, behind the axis of the primitives
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,7 @@ def removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Ten
 
 
 def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
-    """Copy the parameters with units set to zero.
-
-    Args:
-        units: name -> (unit, (N,) bool of the primitives that lose it).
-    """
+    """Copy the parameters with units, name -> (unit, (N,) bool of primitives that lose it), set to zero."""
     changed = {name for unit, gone in units.values() if bool(gone.any()) for name in unit.places}
     found = {name: value.detach().clone() if name in changed else value for name, value in params.items()}
     for unit, gone in units.values():

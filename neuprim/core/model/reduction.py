@@ -1,7 +1,4 @@
-"""Reduced models: fields with less of a setting, such as fewer neurons, written ``density.neurons=0``.
-
-Fields declare what they can reduce by :meth:`~neuprim.core.model.fields.Field.reductions`.
-"""
+"""Reduced models: fields with less of a setting, such as fewer neurons, written ``density.neurons=0``."""
 
 from __future__ import annotations
 
@@ -15,8 +12,7 @@ from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 
-KINDS = ("density", "colour")
-"""First parts of the names."""
+KINDS = ("density", "colour")  # first parts of the names
 
 
 def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
@@ -25,11 +21,7 @@ def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
 
 
 def validate_reduction(density: DensityField, colour: ColourField, kind: str, name: str, value: Any) -> int:
-    """Return the value if the field of this kind can be reduced to it.
-
-    Raises:
-        ConfigError: no such value or setting; names what there is.
-    """
+    """Return the value if the field of this kind can be reduced to it, or raise ConfigError."""
     field = density if kind == KINDS[0] else colour
     offered = field.reductions()
     if name not in offered:
@@ -57,14 +49,7 @@ def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primiti
 def reduce_fields(
     density: DensityField, colour: ColourField, overrides: Sequence[str]
 ) -> tuple[DensityField, ColourField]:
-    """Reduce fields before there is a model.
-
-    Args:
-        overrides: the setting ``model.reduced``, applied one after the other.
-
-    Raises:
-        ConfigError: an override is malformed, or the fields cannot be reduced that way.
-    """
+    """Reduce fields before there is a model, by the overrides of ``model.reduced``, one after the other."""
     for word in overrides:
         key, equals, text = word.partition("=")
         kind, dot, name = key.partition(".")

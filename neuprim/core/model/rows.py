@@ -1,8 +1,4 @@
-"""Some rows of many tensors as one differentiable operation: the primitives that live in a frame.
-
-Rows ascend, so that each is taken once: a gradient goes back by writing, in one pass, where torch adds up rows one by
-one.
-"""
+"""Rows of many tensors as one differentiable operation. Rows ascend, so that a gradient is written in one pass."""
 
 from __future__ import annotations
 
@@ -18,15 +14,11 @@ from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.operation import apply_autograd, needs_grad
 from neuprim.core.compute.threads import parallel_for
 
-_FEW = 4096
-"""Below, without a gradient, torch is done before a kernel would have begun with the last tensor."""
+_FEW = 4096  # below, without a gradient, torch is done before a kernel would have begun with the last tensor
 
 
 def take_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Rows (M,) int64, ascending, of each of ``tensors`` (N, ...), float32 or float64; differentiable, once.
-
-    Nothing is checked: the kernels would read and write beyond the ends.
-    """
+    """Rows (M,) int64, ascending, of ``tensors`` (N, ...), float32 or float64; differentiable, once. Not checked."""
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, apply_autograd(_Rows, rows, *tensors.values()), strict=True))

@@ -1,8 +1,4 @@
-"""What a parameter is.
-
-One list of :class:`ParameterSpec` per model drives the optimiser, population control, checkpoints and export; there is
-no second list of tensors anywhere.
-"""
+"""Parameters: one list of :class:`ParameterSpec` drives optimiser, population control, checkpoints and export."""
 
 from __future__ import annotations
 
@@ -33,10 +29,10 @@ class InitContext:
         colors: (N, C) initial colours in the data set's own colour space.
         generator: the only source of randomness initialisers may use.
         settings: free settings of the preset (``model.init``), e.g. ``{"alpha": 0.8}``.
-        conditions: name -> (N,) condition at which each starting point was found ("time"), where the data set says so.
-        axes: (N, 3) initial semi-axes and quats: (N, 4) wxyz their orientations, where the starting points are
-        ellipsoids. alphas: (N,) opacities in 0..1 through their middles, where they have one.
-        steps: condition name -> from one of a sequence's frames to the next, where the data are one.
+        conditions: name -> (N,) condition at which each starting point was found, where the data set says so.
+        axes, quats: (N, 3) semi-axes and (N, 4) wxyz orientations of starting points that are ellipsoids.
+        alphas: (N,) opacities in 0..1 through their middles, where they have one.
+        steps: condition name -> from one of a sequence's frames to the next.
     """
 
     means: Tensor
@@ -52,12 +48,8 @@ class InitContext:
 
     @property
     def thickness(self) -> Tensor:
-        """(N,) float64 chord through the middle over the longest axis: the mean over the three axes, each weighted by
-        what is seen along it.
-
-        1 for balls. So weighted, primitives hide as much from all sides together as they would if every chord were that
-        long.
-        """
+        """(N,) float64 chord through the middle over the longest axis, weighted so that as much is hidden from all
+        sides."""
         if self.axes is None:
             return torch.ones(self.count, dtype=torch.float64)
         axes = self.axes.double()
@@ -73,20 +65,12 @@ class InitContext:
         return (2.0 * u - 1.0) * bound
 
     def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
-        """``settings[name]`` as a number strictly between ``low`` and ``high``.
-
-        Raises:
-            ConfigError: it is something else.
-        """
+        """Return ``settings[name]``, strictly between ``low`` and ``high``, or raise ConfigError."""
         bounds = Range(above=low, below=high)
         return float(coerce(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
 
     def choice(self, name: str, *offered: str) -> str:
-        """``settings[name]``, one of those offered; the first by default.
-
-        Raises:
-            ConfigError: it is something else.
-        """
+        """Return ``settings[name]``, one of those offered (default: the first), or raise ConfigError."""
         return str(coerce(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
 
 
@@ -97,12 +81,10 @@ class ParameterSpec:
     Attributes:
         name: unique within a model; the key in checkpoints, rates and exports.
         shape: shape per primitive, ``()`` for a scalar.
-        lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is not learned, has no gradient and
-        is kept in every file. init: draws the (N, *shape) float32 start value.
-        lr_unit: what ``lr`` and ``train.rates.NAME`` are multiplied by: "absolute", nothing, so that a position's rate
-        is in scene units
-            a step; "extent", the data set's :attr:`~neuprim.core.data.Dataset.extent` (positions).
-            ``train.rate_units.NAME`` overrides it.
+        lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is kept in every file.
+        init: draws the (N, *shape) float32 start value.
+        lr_unit: what rates are multiplied by: "absolute", nothing; "extent", the data set's
+            :attr:`~neuprim.core.data.Dataset.extent`. ``train.rate_units.NAME`` overrides it.
     """
 
     name: str

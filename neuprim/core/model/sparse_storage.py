@@ -34,15 +34,9 @@ def store_sparse(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[s
 
 
 def load_sparse(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
-    """Return the dense tensors of a model file.
+    """Return the dense tensors of a model file with sparse parameters ``names``; ``where``: the file, for messages.
 
-    Args:
-        names: sparse parameters, from the file's header.
-        specs: of the fields' parameters.
-        where: the file, for messages.
-
-    Raises:
-        CheckpointError: the tensors do not fit the fields or each other.
+    Raises CheckpointError where the tensors do not fit the fields or each other.
     """
     shapes = {spec.name: spec.shape for spec in specs}
     if not isinstance(names, list) or not all(isinstance(name, str) and name in shapes for name in names):

@@ -1,8 +1,6 @@
-"""What a tensor must be for a kernel to read it, in words: its shape in letters that tensors share, its dtype, layout
-and device.
+"""What a tensor must be for a kernel to read it: shape in letters that tensors share, dtype, layout and device.
 
-Compiled kernels index without looking: a tensor that is too short would be read and written beyond its end. Here faults
-are told, None where there is none; :mod:`neuprim.core.model.checks` raises them.
+Functions return a fault in words, or None; :mod:`neuprim.core.model.checks` raises them.
 """
 
 from __future__ import annotations
@@ -17,11 +15,9 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 
-Shape = tuple[int | str, ...]
-"""A letter stands for a size that tensors share."""
+Shape = tuple[int | str, ...]  # A letter stands for a size that tensors share
 
-Sizes = dict[str, tuple[int, str]]
-"""Letter -> its size and the tensor that has it."""
+Sizes = dict[str, tuple[int, str]]  # letter -> its size and the tensor that has it
 
 MOST_UNITS = 256
 """Most neurons of a density and units of a colour network: the fast kernels number a primitive's neurons in a byte."""
@@ -142,10 +138,9 @@ class Shaped:
         return replace(self, **{name: getattr(self, name).to(device) for name in self.shapes})  # type: ignore[type-var]
 
     def fault(self, sizes: Sizes) -> str | None:
-        """The first part that does not fit, e.g. ``"w2 has shape (5,); expected (100, 3), as means has N=100 and W1 has
-        K=3"``; None if all do.
+        """The first part that does not fit, or None: ``"w2 has shape (5,); expected (100, 3), as means has N=100
+        ..."``.
 
-        Args:
-            sizes: those known so far; gets the ones that this form adds.
+        ``sizes``: those known so far; gets the ones that this form adds.
         """
         return tensors_fault([(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes)

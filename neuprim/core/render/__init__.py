@@ -49,21 +49,18 @@ def render(
 ) -> RenderOutput:
     """Draw one frame; differentiable in every parameter, in ``camera.viewmat`` and in ``background``.
 
-    Tensors may be on the CPU or on a GPU, all of a model on one of them; the image is where they are.
+    All tensors of a model are on one device, the CPU or a GPU; the image is there too.
 
     Args:
-        model: the primitives; each field lowers under ``conditions`` first.
-        camera: the view; rgb is (camera.height, camera.width, C). A :class:`RayCamera` (any central projection) is
-            drawn by the reference backend alone.
+        camera: the view; rgb is (camera.height, camera.width, C). Only the reference draws a :class:`RayCamera`.
         conditions: e.g. ``{"time": tensor(0.5)}``.
-        settings: every speed/accuracy setting; None: the defaults, with ``near="auto"``.
+        settings: None: the defaults, with ``near="auto"``.
         background: (C,) colour behind everything; None is black.
 
     Raises:
-        FormError: a field, the camera or the background has a tensor that does not fit (field, tensor, found and
-            expected).
+        FormError: a field, the camera or the background has a tensor that does not fit.
         NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
-        BackendUnavailable: the named backend cannot draw this model or this camera, or cannot run here.
+        BackendUnavailable: the named backend cannot draw this model or camera, or cannot run here.
         ConfigError: there is no backend of the name.
     """
     settings = settings or RenderSettings(near="auto")
@@ -77,8 +74,7 @@ def render(
 def render_lowered(
     lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
 ) -> RenderOutput:
-    """Draw a model whose conditions are already folded in; refuses what does not fit or is not finite, see
-    :func:`render`."""
+    """Draw a model whose conditions are folded in already; the same errors as :func:`render`."""
     lowered.check(camera.viewmat, background)
     return _draw_checked(lowered, camera, settings, background)
 

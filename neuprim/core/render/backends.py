@@ -1,7 +1,4 @@
-"""The table of renderer backends. A new one is a folder of this package and a row here; nothing else names it.
-
-Importing this module loads none of them: a row knows where its ``render`` is.
-"""
+"""The table of renderer backends, which names where each one's ``render`` is without importing it."""
 
 from __future__ import annotations
 
@@ -46,19 +43,16 @@ class Backend:
     """One way to draw; ``name`` is of the setting ``renderer.backend``."""
 
     name: str
-    load: Callable[[], Draw]
-    """Imports it and returns its :data:`~neuprim.core.render.draw.Draw`."""
+    load: Callable[[], Draw]  # imports it and returns its :data:`~neuprim.core.render.draw.Draw`
     unsupported: Callable[[Lowered, AnyCamera | None], str | None] = _no_reason
     """What it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
     "cannot draw"; None if it can."""
     device_name: Callable[[], str] = _processor_name
     missing: Callable[[], str | None] = _no_reason
     """Why this machine lacks what it needs, such as a package; None if it has it. Cheap."""
-    checks: bool = False
-    """Whether it refuses numbers that are not finite while it prepares a frame."""
+    checks: bool = False  # whether it refuses numbers that are not finite while it prepares a frame
     differentiates_intrinsics: bool = False
-    devices: tuple[str, ...] = (hardware.CPU,)
-    """Kinds of device that it draws tensors of, its own first."""
+    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it draws tensors of, its own first
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_reason
     """Loads and returns what draws the slabs of a set of primitives in one frame; None without."""
 
@@ -150,11 +144,7 @@ def check_backend_name(name: object) -> None:
 
 
 def find_backend(name: str) -> Backend:
-    """Return the backend of this name.
-
-    Raises:
-        ConfigError: there is none.
-    """
+    """Return the backend of this name, or raise :class:`ConfigError`."""
     for backend in TABLE:
         if backend.name == name:
             return backend
@@ -163,12 +153,9 @@ def find_backend(name: str) -> Backend:
 
 
 def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tuple[Backend, ...]:
-    """Return those that may draw tensors on a ``kind`` of device under these settings, whatever is drawn.
+    """Return the backends that may draw tensors on a ``kind`` of device under these settings.
 
-    Tensors stay where they are if they can: those on the CPU go to a GPU only where the settings say so.
-
-    Raises:
-        ConfigError: they name a backend that does not exist.
+    Tensors on the CPU go to a GPU only where the settings say so.
     """
     if settings.backend != AUTO:
         return (find_backend(settings.backend),)
@@ -189,7 +176,7 @@ def gpu_unavailable() -> str | None:
 
 
 def check_backend_device(settings: RenderSettings) -> None:
-    """Raise :class:`ConfigError` for a device that the named backend does not draw on, whatever the machine."""
+    """Raise :class:`ConfigError` for a device that the named backend does not draw on."""
     if AUTO in (settings.backend, settings.device):
         return
     backend = find_backend(settings.backend)
@@ -223,12 +210,7 @@ def with_available_device(settings: RenderSettings) -> RenderSettings:
 
 
 def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions) -> torch.device:
-    """Return the device that frames like this one are best drawn on, where a run keeps its tensors; see
-    :attr:`~neuprim.core.settings.RenderSettings.device`.
-
-    Raises:
-        BackendUnavailable, ConfigError: see :func:`check_device`.
-    """
+    """Return the device where a run keeps its tensors to draw frames like this one; raises as :func:`check_device`."""
     check_device(settings)
     if settings.device != AUTO:
         return hardware.current_device(settings.device)
@@ -244,8 +226,7 @@ def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, co
 
 
 def computing_device(settings: RenderSettings) -> torch.device:
-    """Return where a run computes what is no frame of its model, such as the ground truth of volumes: a GPU that the
-    settings allow and that is there."""
+    """Return the device for ground truth and the like: a GPU if the settings allow it and there is one."""
     kind: str = settings.device
     if kind == AUTO:
         kind = hardware.CUDA if settings.backend == AUTO else find_backend(settings.backend).devices[0]
@@ -254,11 +235,9 @@ def computing_device(settings: RenderSettings) -> torch.device:
 
 
 def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
-    """Return the backend that will draw this model through this camera; without a camera, through a pinhole.
+    """Return the backend that draws this model through this camera (None: any pinhole).
 
-    Raises:
-        BackendUnavailable: the named one does not know the model's forms or the camera, or cannot run here.
-        ConfigError: there is none of this name.
+    Raises BackendUnavailable if the named one cannot, and ConfigError if there is none of the name.
     """
     check_device(settings)
     reasons = []

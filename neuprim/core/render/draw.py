@@ -1,5 +1,4 @@
-"""A backend's draw function, and what can be put around it: several rays per pixel, deferred shading, another
-device."""
+"""Wrappers of a backend's draw function: several rays per pixel, deferred shading, another device."""
 
 from __future__ import annotations
 
@@ -24,11 +23,7 @@ Draw = Callable[..., RenderOutput]
 def draw_samples(
     draw: Draw, lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw ``settings.samples`` squared rays per pixel; memory and time grow with their number.
-
-    rgb and alpha are means over the rays; depth is their mean weighted by alpha, the mean over everything the pixel
-    shows.
-    """
+    """Draw ``settings.samples`` squared rays per pixel: means of rgb and alpha, and of depth weighted by alpha."""
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
     alpha = _pool(fine.alpha, n)
@@ -44,8 +39,7 @@ def _pool(image: Tensor, n: int) -> Tensor:
 
 
 def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
-    """Return the (H, W, 3) float64 scene points at a depth image (H, W): camera-z, or distance for a ``RayCamera``; no
-    gradient."""
+    """Return the (H, W, 3) float64 scene points at a depth image (H, W); no gradient."""
     depth = depth.detach().double()
     view = device.to_like(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
@@ -58,8 +52,7 @@ def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
 
 
 def with_shade(draw: Draw) -> Draw:
-    """Return a draw function that multiplies the frame's matter, not its background, by ``lowered.shade`` at each
-    pixel's mean depth."""
+    """Return a draw function that multiplies the frame, not its background, by ``lowered.shade`` at the mean depth."""
 
     def shaded(
         lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
@@ -81,8 +74,7 @@ def with_shade(draw: Draw) -> Draw:
 
 
 def on_device(draw: Draw, place: torch.device) -> Draw:
-    """Return a draw function that draws on another device than the frame's tensors are on, and moves the frame back;
-    differentiable."""
+    """Return a draw function that draws on another device and moves the frame back; differentiable."""
 
     def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
         own = lowered.geometry.means.device

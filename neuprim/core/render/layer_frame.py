@@ -26,8 +26,7 @@ _ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly
 
 @dataclass(frozen=True)
 class LayerFrame:
-    """One frame of a model as a layer sees it, under every condition of the task; nothing has a gradient, and
-    everything is where the model is."""
+    """One frame of a model under every condition of the task, on the model's device; no gradients."""
 
     model: Primitives
     camera: Camera
@@ -56,17 +55,14 @@ class LayerFrame:
 
     @cached_property
     def unshaded(self) -> Tensor:
-        """(H, W, C) the frame over black without what :meth:`~neuprim.core.model.fields.ColourField.shade` multiplies
-        its colours by."""
+        """(H, W, C) the frame over black without :meth:`~neuprim.core.model.fields.ColourField.shade`."""
         with torch.no_grad():
             forms = self.model.lower(self.camera, self.conditions, shaded=False)
         return self._render(replace(self.lowered, colour=forms.colour, shade=None), self.settings).rgb
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """(H, W) mean factor of :meth:`~neuprim.core.model.fields.ColourField.shade` over what a pixel shows, 0 where
-        nothing is hit; None for a colour that has none.
-        """
+        """(H, W) mean shading factor of what a pixel shows, 0 where nothing is hit; None without shading."""
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
@@ -83,23 +79,18 @@ class LayerFrame:
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def composite(self, colour: LoweredColour) -> Tensor:
-        """(H, W, C') the frame over black with other colours of the primitives of :attr:`lowered`: the sum along each
-        ray of a primitive's weight alpha_i T_i times its colour."""
+        """(H, W, C') the frame over black with other colours of :attr:`lowered`: the sum of alpha_i T_i c_i."""
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
-        """(H, W) the sum along each ray of the primitives' optical depths, each times its weight: the integral of
-        weight times sigma.
+        """(H, W) sum along each ray of the primitives' optical depths, each times its weight.
 
-        Optical depths are those of whole chords behind the near plane, at least 0 each; nothing is clamped at
-        ``alpha_max``, left out below ``alpha_min`` or cut where a ray ends. It is -log of the transmittance of a medium
-        made as thin as that takes.
+        Optical depths are those of whole chords behind the near plane, at least 0. Nothing is clamped at ``alpha_max``,
+        skipped below ``alpha_min`` or cut where a ray ends: it is -log of the transmittance of a medium made thin
+        enough.
 
         Args:
-            weights: (N,) at least 0, one for each primitive of :attr:`lowered`; None for 1.
-
-        Raises:
-            FormError: weights of another shape, negative or not finite.
+            weights: (N,) finite and at least 0, one per primitive of :attr:`lowered`; None for 1.
         """
         count = self.lowered.geometry.count
         weights = torch.ones(count, device=self.lowered.geometry.means.device) if weights is None else weights.detach()
@@ -116,8 +107,7 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """-log of the transmittance for densities times 1, for the pixels that are opaque then for thinner ones, and so
-        on."""
+        """-log of the transmittance, in thinner and thinner media for the pixels that are opaque."""
         T = transmittance(1.0)
         found, opaque, factor = _depth(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
@@ -129,8 +119,7 @@ class LayerFrame:
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
-        """(H, W) of the frame with densities times ``weights``: what is left of a white background behind black
-        primitives."""
+        """(H, W) of the frame with densities times ``weights``, by a white background behind black primitives."""
         lowered, means = self.lowered, self.lowered.geometry.means
         black = Constant(torch.zeros(len(means), 1, device=means.device))
         thin = replace(lowered, density=lowered.density.scaled(weights), colour=black, shade=None)

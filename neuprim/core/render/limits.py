@@ -1,8 +1,4 @@
-"""Constants of the per-primitive stage that both kernel stacks share: states of a primitive, bounds of float32, and
-the smallest optical depth that is drawn; numba and Warp read them.
-
-The bounds of float32 were found with ``benchmarks/numerics.py``.
-"""
+"""Constants of the per-primitive stage of both kernel stacks; float32 bounds were found with benchmarks/numerics.py."""
 
 from __future__ import annotations
 
@@ -37,6 +33,5 @@ MIN_RIM_SHARES = tuple(MIN_RIM ** (p + 0.5) for p in EDGES)  # share of the larg
 
 
 def min_visible_depth(alpha_min: float) -> float:
-    """Return the optical depth that a chord must be able to reach to be drawn: that of ``alpha_min``, but for
-    rounding."""
+    """Return the optical depth that a chord must reach to be drawn: that of ``alpha_min``, but for rounding."""
     return -float(np.log1p(-alpha_min)) * VISIBLE_SHARE

@@ -1,5 +1,4 @@
-"""Distance of points from the cameras that see them, and the near plane and extent that follow: no length of a scene is
-known beforehand."""
+"""The near plane and the extent of a scene, from the depths at which cameras see its points."""
 
 from __future__ import annotations
 
@@ -21,10 +20,9 @@ _MIN_NEAR = 1e-6  # of the typical depth: a point in a camera's centre does not 
 
 
 def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
-    """Return (nearest, median) depth at which cameras see the points (N, 3): camera-z, or ray distance for a
-    ``RayCamera``.
+    """Return (nearest, median) depth at which cameras see points (N, 3); ray distance for a ``RayCamera``.
 
-    Where no camera sees one, the distances of all points count.
+    Where no camera sees a point, the distances of all points count.
     """
     means = means.detach().double().cpu()[:: max(len(means) // _MAX_POINTS, 1)]
     cameras = [
@@ -42,8 +40,7 @@ def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tup
 
 
 def scene_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """Return the data set's extent, or where that is below 1/100 of the median depth of points (N, 3), as on a tripod,
-    that depth."""
+    """Return the data set's extent, or the median depth of points (N, 3) where that is 100 times as large."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth
 

@@ -26,12 +26,9 @@ def non_finite_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
 
 
 def refuse_non_finite(lowered: Lowered) -> None:
-    """Raise for the first primitive with a NaN, an infinite number, a zero quaternion or scales beyond the range.
+    """Raise NonFiniteError for the first primitive with a number, quaternion or scale that cannot be drawn.
 
     The kernels check the same while they prepare a frame.
-
-    Raises:
-        NonFiniteError: names parameter and primitive.
     """
     g = lowered.geometry
     if not g.count:
@@ -51,12 +48,9 @@ def refuse_non_finite(lowered: Lowered) -> None:
 
 
 def refuse_non_finite_colours(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
-    """Raise for the first number of the colours, which the per-primitive kernels do not read; a GPU is waited for.
+    """Raise NonFiniteError for colours, which the per-primitive kernels do not read; waits for a GPU.
 
-    ``named`` are all tensors of the frame: the first of them that is not finite is the cause, e.g. a centre.
-
-    Raises:
-        NonFiniteError: names tensor and primitive.
+    ``named``: all tensors of the frame; the first of them that is not finite is the cause.
     """
     total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
     if math.isfinite(total):  # one number, so that a GPU is waited for once

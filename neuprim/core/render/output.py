@@ -1,4 +1,4 @@
-"""What a rendered frame consists of."""
+"""A rendered frame, its statistics, and the contributions of its primitives."""
 
 from __future__ import annotations
 
@@ -21,8 +21,7 @@ class Contributions:
     rows: Tensor | None = None  # of the model, where some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return (count,) weight and error_weight of all primitives of the model, zero for those left out of the
-        frame."""
+        """Return (count,) sums of all primitives of the model, zero for those left out of the frame."""
         if self.rows is None:
             return self.weight, self.error_weight
         weight, error_weight = (
@@ -32,8 +31,7 @@ class Contributions:
 
 
 def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributions:
-    """Return the sums over several frames of a model with ``count`` primitives, one after the other: in the order in
-    which several processes add them up."""
+    """Return the sums over several frames of a model with ``count`` primitives, added in their order."""
     weight, error = frames[0].of_all(count)
     for contributions in frames[1:]:
         more = contributions.of_all(count)
@@ -104,25 +102,19 @@ class RenderOutput:
     stats: RenderStats  # see RenderStats
 
     def request_contributions(self, error: Tensor) -> Contributions:
-        """Have the backward pass sum what each primitive contributed to the frame and to an error; call it before
-        ``backward()``.
+        """Have the backward pass sum each primitive's part in the frame and in an error.
+
+        Call it before ``backward()``, which fills the result. A second call replaces the first.
 
         Args:
-            error: (H, W) any measure of what is wrong at each pixel; constant, no gradient reaches it.
-
-        Returns:
-            the sums, which the backward pass fills. A second call takes the place of the first.
-
-        Raises:
-            FormError: ``error`` is not of the frame's size.
+            error: (H, W) any measure of what is wrong at each pixel; no gradient reaches it.
         """
         check_shape("request_contributions: error", error, tuple(self.alpha.shape), ", that of the frame")
         return self.stats.request_contributions(error)
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
-    """Return (H, W) sum of w z over sum of w; 0 where nothing is hit. The weights of a ray telescope: their sum is its
-    alpha."""
+    """Return (H, W) sum of w z over sum of w, which is a ray's alpha; 0 where nothing is hit."""
     hit = alpha > 0
     if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):
         return (weighted / alpha).masked_fill_(~hit, 0.0)

@@ -1,7 +1,6 @@
-"""What the kernel backends share around their kernels: the tensors of a lowered model, and its image.
+"""Tensors and image of a lowered model, around the :class:`torch.autograd.Function` of a kernel backend.
 
-Each of them is one :class:`torch.autograd.Function` with ``forward(ctx, request, viewmat, background, palette,
-*tensors)``, where ``tensors`` are those of :data:`PARAMETERS`, then, of colour networks, those of :data:`NET`.
+Its ``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``: :data:`PARAMETERS`, then :data:`NET`.
 """
 
 from __future__ import annotations
@@ -60,8 +59,7 @@ def rasterize(
     background: Tensor | None,
     settings: RenderSettings,
 ) -> RenderOutput:
-    """Render a :class:`Cosine` density with :class:`Constant` or :class:`RayNet` colours by the ``operation`` of
-    backend ``name``."""
+    """Render :class:`Cosine` densities with :class:`Constant` or :class:`RayNet` colours by a backend's operation."""
     colour = lowered.colour
     net: tuple[Tensor, ...] = ()
     assert isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"

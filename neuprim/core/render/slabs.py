@@ -1,4 +1,4 @@
-"""Slabs of a set of primitives, each drawn as if it were alone: what a light sees of the scene."""
+"""Slabs of primitives, each drawn as if it were alone: what a light sees of the scene."""
 
 from __future__ import annotations
 
@@ -19,17 +19,13 @@ from neuprim.core.settings import RenderSettings
 def render_slabs(
     geometry: Geometry, density: LoweredDensity, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return (S, H, W) opacities and mean depths of the slabs, in their order; those without any primitive may be left
-    out. No gradients.
+    """Return (S, H, W) opacities and mean depths of the slabs that have primitives, in their order; no gradients.
 
-    They are drawn in one frame where the backend can, else in one for each slab: the images are the same bits.
+    They are drawn in one frame where the backend can, else one by one: the same bits.
 
     Args:
-        slabs: (N,) of each primitive, 0 to ``count`` - 1, on the primitives' device.
+        slabs: (N,) slab of each primitive, 0 to ``count`` - 1, on the primitives' device.
         settings: with ``depth``.
-
-    Raises:
-        NonFiniteError: naming the primitive by its number among all of them.
     """
     with torch.no_grad():
         black = Constant(torch.zeros(geometry.count, 1, device=geometry.means.device))

@@ -12,14 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neuprim.core.compression.quantizers import (
-    MAX_BITS,
-    Columns,
-    Rotations,
-    columns_of_step,
-    fit_columns,
-    snap_to_zero,
-)
+from neuprim.core.compression.quantizers import MAX_BITS, Columns, Rotations, columns_of_step, fit_columns, snap_to_zero
 from neuprim.core.compression.sections import morton_decode, morton_encode
 
 finite = st.floats(width=32, allow_nan=False, allow_infinity=False)

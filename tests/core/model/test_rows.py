@@ -10,13 +10,7 @@ from neuprim.core.model.rows import take_rows
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
-ROWS = {
-    "some": [1, 2, 5, 8],
-    "all": list(range(9)),
-    "none": [],
-    "the first": [0],
-    "the last": [8],
-}
+ROWS = {"some": [1, 2, 5, 8], "all": list(range(9)), "none": [], "the first": [0], "the last": [8]}
 
 
 def tensors(dtype: torch.dtype) -> dict[str, Tensor]:

@@ -1,8 +1,7 @@
 """OpenVDB files without OpenVDB: numpy, zlib and the package ``blosc``.
 
-``read_header`` lists the grids of a file, ``read_grid`` reads one as a sparse :class:`Grid`, ``read_grids`` several,
-``write_vdb`` writes them, and ``sequence`` orders a folder of frames. Every failure is a DataError that names the file,
-what was found and what was expected; no claim in a file makes memory be taken that its bytes do not pay for.
+Every failure is a DataError that names the file, what was found and what was expected; no claim in a file makes memory
+be taken that its bytes do not pay for.
 """
 
 from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, Grid, Tiles, scale_transform

@@ -14,8 +14,7 @@ from neuprim.core.errors import DataError
 
 TILE_SIZES = (8, 128, 4096)  # edges of a constant tile in voxels: in a lower node, in an upper node, in the root
 
-DENSE_LIMIT = 2 * 2**30
-"""Most bytes that :meth:`Grid.to_dense` takes unless told otherwise: 2 GiB."""
+DENSE_LIMIT = 2 * 2**30  # most bytes that :meth:`Grid.to_dense` takes unless told otherwise: 2 GiB
 
 Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
 """A box of voxels: lowest index, and the first index beyond the highest, per axis."""
@@ -55,8 +54,8 @@ class Grid:
     """A float or vec3s grid.
 
     A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have
-    the background value and are not active. NaN and infinite values are kept as they are stored and counted in
-    :attr:`non_finite`.
+    the
+    background value and are not active. Values that are not finite are kept and counted in :attr:`non_finite`.
     """
 
     name: str
@@ -81,15 +80,12 @@ class Grid:
         half: bool = False,
         metadata: Mapping[str, Any] | None = None,
     ) -> Grid:
-        """A fog volume of the voxels that differ from the background.
+        """A fog volume of the voxels that differ from the background; DataError for another shape or range.
 
         Args:
             array: (X, Y, Z) or (X, Y, Z, 3), any real type; kept as float32.
             lower: index of ``array[0, 0, 0]``.
-            transform: (4, 4) index to world; :func:`scale_transform` makes one. None: voxels of edge 1.
-
-        Raises:
-            DataError: another shape, or indices beyond the 32 bits of the format.
+            transform: (4, 4) index to world, as of :func:`scale_transform`; None: voxels of edge 1.
         """
         array = np.asarray(array, np.float32)
         if array.ndim not in (3, 4) or array.shape[3:] not in ((), (3,)):
@@ -200,11 +196,9 @@ class Grid:
 
         Args:
             bounds: the box, in indices; None takes :attr:`bounds`, and (0, 0, 0) voxels for a grid without active ones.
-            max_bytes: most memory for the result, which is built on whole leaves (up to 7 voxels more on each side).
+            max_bytes: most memory for the result, else DataError; built on whole leaves (up to 7 voxels more on each
+                side).
             non_finite: what replaces NaN and infinite numbers; None keeps them.
-
-        Raises:
-            DataError: an inverted box, or one that takes more than ``max_bytes``.
         """
         box = self.bounds if bounds is None else bounds
         channels = (3,) if self.channels == 3 else ()

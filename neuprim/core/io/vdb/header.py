@@ -1,7 +1,4 @@
-"""Read what an OpenVDB file says about itself, through a cursor that checks every length.
-
-No tree is decoded here. Every length is checked against the bytes that are left before anything is allocated.
-"""
+"""Read what an OpenVDB file says about itself; every length is checked before anything is allocated."""
 
 from __future__ import annotations
 
@@ -85,10 +82,7 @@ def compression_label(flags: int) -> str:
 
 
 def blosc_module() -> Any:
-    """The package ``blosc``, set to one thread.
-
-    OpenVDB packs leaves in blocks of 256 bytes; with more threads every leaf of 2 KB would start and join them all.
-    """
+    """Return the package ``blosc``, set to one thread: threads would start and join for every leaf of 2 KB."""
     try:
         import blosc
     except ImportError as error:
@@ -99,10 +93,7 @@ def blosc_module() -> Any:
 
 
 def decompressor(flags: int) -> Callable[[bytes, int], bytes]:
-    """The function (chunk, size) -> bytes that undoes a grid's compression; it never makes more than ``size`` bytes.
-
-    It raises ValueError, with a text that says what is wrong, for damaged chunks and for any other size.
-    """
+    """Return the function (chunk, size) -> bytes that undoes a grid's compression, or raises ValueError."""
     if not flags & BLOSC:
         return _unzip
     blosc = blosc_module()
@@ -232,10 +223,7 @@ class FileHeader:
 
 
 def read_header(path: Path) -> FileHeader:
-    """Describe a file without decoding a tree.
-
-    Raises DataError for another format, a version outside :data:`VERSIONS`, a stream, or a damaged file.
-    """
+    """Describe a file without decoding a tree, or raise DataError."""
     with open_cursor(Path(path)) as cursor:
         return parse_header(cursor)
 

@@ -1,8 +1,7 @@
 """Read grids: decode trees of root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ slots of 8³) and leaves.
 
-The layout is that of OpenVDB's ``RootNode``, ``InternalNode``, ``LeafNode`` and ``io/Compression.h``, file versions
-222 to 224: first the topology, depth first, in which a leaf is 64 bytes of mask; then all leaf buffers in the same
-order. Memory stays within about 150 times the file's size, as every node and leaf needs bytes in the file.
+The layout is OpenVDB's (``RootNode``, ``InternalNode``, ``LeafNode``, ``io/Compression.h``), versions 222 to 224: first
+the topology, depth first, in which a leaf is 64 bytes of mask; then all leaf buffers in the same order.
 """
 
 from __future__ import annotations
@@ -33,28 +32,21 @@ LEAF_LIMIT = 4 * 2**30
 
 
 def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Grid:
-    """Read one grid of a file; the others stay undecoded.
-
-    Args:
-        name: the grid, as :func:`~neuprim.core.io.vdb.header.read_header` lists it.
-        max_bytes: most memory for its leaves and tiles; more is refused before it is taken.
-        level_sets: read signed distances too, for inspection.
-
-    Raises:
-        DataError: no such file or grid; points, a level set or another type that is not read; truncated or damaged.
-        BackendUnavailable: the grid is Blosc-compressed, and the package ``blosc`` is missing.
-    """
+    """Read one grid of a file; the others stay undecoded. Arguments and errors as of :func:`read_grids`."""
     return next(read_grids(path, (name,), max_bytes=max_bytes, level_sets=level_sets))
 
 
 def read_grids(
     path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False
 ) -> Iterator[Grid]:
-    """Several grids of a file, one at a time; the file's header is read once.
+    """Read several grids of a file, one at a time.
 
     Args:
-        names: which, in this order; None for all that can be decoded (of level sets: if ``level_sets``), in file order.
-        max_bytes, level_sets: as in :func:`read_grid`; the limit is for each grid. Errors are the same, too.
+        names: which, in this order; None for all that can be decoded, in file order.
+        max_bytes: most memory for the leaves and tiles of each; more is refused before it is taken.
+        level_sets: read signed distances too, for inspection.
+
+    Raises DataError, or BackendUnavailable where the package ``blosc`` is missing.
     """
     with open_cursor(Path(path)) as cursor:
         file = parse_header(cursor)
@@ -106,10 +98,7 @@ UPPER, LOWER = Slots(5, 128), Slots(4, 8)
 
 
 class _TreeReader:
-    """Decodes the tree of ``source`` into the arrays of a :class:`~neuprim.core.io.vdb.grid.Grid`.
-
-    ``what`` names the grid in messages; leaves and tiles take at most ``max_bytes``.
-    """
+    """Decodes the tree of ``source``, called ``what``, into the arrays of a Grid of at most ``max_bytes``."""
 
     def __init__(self, file: Cursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = Cursor(file.path, file.data, source.block, source.end)

@@ -31,12 +31,9 @@ class Sequence:
 
 
 def sequence(folder: Path, prefix: str | None = None) -> Sequence:
-    """The .vdb files of a folder, sorted by the last number in each name: ``fire_9.vdb`` comes before ``fire_10.vdb``.
+    """The .vdb files of a folder by the last number in each name, after ``prefix`` where it holds several sequences.
 
-    ``prefix`` is what stands before the number, where a folder holds several sequences; subfolders are not searched.
-
-    Raises:
-        DataError: no folder, no .vdb file, a name without a number, several prefixes, or one number twice.
+    Raises DataError for no file, a name without a number, several prefixes, or one number twice.
     """
     folder = Path(folder)
     expected = "expected a folder with .vdb files"

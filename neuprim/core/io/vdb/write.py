@@ -36,10 +36,7 @@ def write_vdb(
         compression: one of :data:`COMPRESSIONS`.
         metadata: of the file: str, bool, int, float, or three ints or floats each.
 
-    Raises:
-        DataError: names that repeat, leaves or tiles that overlap or are out of place, values that no half float holds,
-            a transform that is no invertible affine map, or metadata of another type.
-        BackendUnavailable: Blosc is asked for, and the package ``blosc`` is missing.
+    Raises DataError for what the format cannot hold, BackendUnavailable without the package ``blosc``.
     """
     path = Path(path)
     if compression not in COMPRESSIONS:

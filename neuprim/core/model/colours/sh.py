@@ -21,11 +21,7 @@ def coefficient_count(degree: int) -> int:
 
 
 def basis(directions: Tensor, degree: int) -> Tensor:
-    """(N, (degree + 1)^2) basis values at unit ``directions`` (N, 3).
-
-    Raises:
-        ValueError: for a degree outside 0..3.
-    """
+    """(N, (degree + 1)^2) basis values at unit ``directions`` (N, 3), degree 0..3."""
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical-harmonics degree {degree}; expected 0..3")
     x, y, z = directions.unbind(-1)
@@ -49,7 +45,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
-    """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 CPU tensors.
+    """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 tensors.
 
     Args:
         means: (N, 3) scene units. origin: (3,) the camera's position.
@@ -58,7 +54,7 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         degree: bands in use, 0..3.
 
     Raises:
-        FormError: a tensor does not fit; the fused kernel would read beyond its end.
+        FormError: a tensor does not fit.
     """
     _check(means, dc, rest, origin, degree)
     if degree == 0:
@@ -96,12 +92,7 @@ def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
 
 
 def truncate_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
-    """The tensors with the bands above ``degree`` gone from the one called ``name``, (N, bands but the first, C); it
-    goes with the last of them.
-
-    What is left is the closest there is, as bands are orthogonal: no other coefficients are nearer on average over all
-    directions.
-    """
+    """Return the tensors without the bands above ``degree`` of ``name``: the closest there is, on average."""
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : coefficient_count(degree) - 1].contiguous()} if degree else kept
 

@@ -1,12 +1,10 @@
-"""Factors of the real spherical harmonics up to degree 3, with the signs of 3D Gaussian splatting; numba freezes them
-into its kernels."""
+"""Factors of the real spherical harmonics up to degree 3, with the signs of 3D Gaussian splatting, for all kernels."""
 
 from __future__ import annotations
 
 import math
 
-C0 = 0.5 / math.sqrt(math.pi)
-"""Y_00: a colour c of every direction has the coefficient (c - 0.5)/C0."""
+C0 = 0.5 / math.sqrt(math.pi)  # Y_00: a colour c of every direction has the coefficient (c - 0.5)/C0
 
 C1 = math.sqrt(3.0 / (4.0 * math.pi))
 C2 = (

@@ -148,10 +148,6 @@ class _Colors(torch.autograd.Function):
 
 
 def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """max(0, SH(direction origin -> mean) + 0.5) of float32 CPU tensors: means (N, 3), dc (N, C), rest (N, bands, C) ->
-    (N, C).
-
-    ``origin`` (3,) is the camera centre; gradients flow to all four. ``degree`` 1..3 selects how many bands count.
-    """
+    """:func:`~neuprim.core.model.colours.sh.colors` of float32 CPU tensors, degree 1..3; differentiable in all four."""
     result: Tensor = apply_autograd(_Colors, means, dc, rest, origin, degree)
     return result

@@ -1,6 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Spherical-harmonics colours with their gradient on a card, a thread a primitive, float64 inside: the twin of
-:mod:`neuprim.core.model.colours.sh_cpu`. Warp is imported with this module."""
+"""Spherical-harmonics colours on a GPU, a thread a primitive, float64 inside: the twin of ``sh_cpu``."""
 
 import functools
 from typing import Any
@@ -163,10 +162,6 @@ class _Colors(torch.autograd.Function):
 
 
 def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """max(0, SH(direction origin -> mean) + 0.5) of float32 tensors: means (N, 3), dc (N, C), rest (N, bands, C) -> (N,
-    C).
-
-    ``origin`` (3,) is the camera centre; gradients flow to all four. ``degree`` 1..3 selects how many bands count.
-    """
+    """:func:`~neuprim.core.model.colours.sh.colors` of float32 GPU tensors, degree 1..3; differentiable in all four."""
     result: Tensor = _Colors.apply(means, dc, rest, origin, degree)
     return result

@@ -25,8 +25,7 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import number_fault
 from neuprim.core.validation import Range
 
-OMEGA0 = 30.0
-"""SIREN boost: multiplies the whole phase."""
+OMEGA0 = 30.0  # SIREN boost: multiplies the whole phase
 
 GAIN_LIMIT = 20.0
 """Bound of |log_gain|: beyond, a gain counts as exp(20) or exp(-20), and its gradient is zero. No scene needs densities
@@ -50,11 +49,9 @@ class CosineDensity(DensityField):
         edge: p, 0, 1 or 2.
         gain: whether there is a log_gain, of its own learning rate.
 
-    ``init.mode`` of the model settings: "opaque" (default) starts every primitive at central opacity ``init.alpha``;
-    "paper" draws the offset as the authors do, which leaves half of all chords without a gradient.
-
-    Raises:
-        ValueError: an argument is something else.
+    ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``; "paper" draws the offset
+    as
+    the authors do, which leaves half of all chords without a gradient. Raises ValueError for other arguments.
     """
 
     init_settings = ("mode", "alpha")
@@ -140,8 +137,7 @@ class CosineDensity(DensityField):
 
 
 def amplified(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """(w2, b2) (N, K) and (N, 1) times the gain exp(log_gain), (N, 1) or (N,), so that no renderer needs to know of
-    it."""
+    """Return (w2, b2), (N, K) and (N, 1), times the gain exp(log_gain), (N, 1) or (N,)."""
     if log_gain is None:
         return w2, b2
     from neuprim.core.model.densities.gain_cpu import fused_gain  # numba, loaded when first needed
@@ -191,12 +187,9 @@ def split_cosine(
 ) -> dict[str, Tensor]:
     """Children that continue their parents' f: W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m.
 
-    With a hard edge c = r, and sigma goes on unchanged inside the children. A soft edge fades within a child where its
-    parent's does not: c = r V/2V' then, V = s_1 s_2 s_3, for which both children have as much of the weight (1 -
-    |y|^2)^p together as their parent.
-
-    ``omega0`` and ``edge`` are those of the form which ``params`` lower to. Computed in float64, so that the field
-    changes by no more than the final rounding; other tensors pass through.
+    With a hard edge c = r, and sigma goes on unchanged. A soft edge fades within a child where its parent's does not:
+    c = r V/2V' then, V = s_1 s_2 s_3, and both children have as much of the weight (1 - |y|^2)^p as their parent. In
+    float64, so that the field changes by no more than the final rounding.
     """
     r, c = split_scale(old, new), split_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]

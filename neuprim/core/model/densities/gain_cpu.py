@@ -15,8 +15,7 @@ from neuprim.core.compute.operation import apply_autograd
 
 @exact_kernel
 def scale_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
-    """Of (w2, b2) (N, K) and (N, 1) times ``factor`` (N, 1): gradients of both, and of the factor, ``pulled`` (N,
-    1)."""
+    """Gradients of (w2, b2), (N, K) and (N, 1), times ``factor`` (N, 1), and of the factor, ``pulled``."""
     for n in range(b2.shape[0]):
         total = np.float64(p_b2[n, 0]) * b2[n, 0]
         g_b2[n, 0] = p_b2[n, 0] * factor[n, 0]
@@ -44,8 +43,7 @@ class _Gain(torch.autograd.Function):
 
 
 def fused_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """(w2, b2) (N, K) and (N, 1) times exp(log_gain), (N, 1), which counts as no further from 0 than ``limit``; one
-    dtype."""
+    """(w2, b2), (N, K) and (N, 1), times exp(log_gain), (N, 1), clamped to ``limit``; one dtype."""
     if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain

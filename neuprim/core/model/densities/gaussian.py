@@ -1,12 +1,11 @@
 """A true Gaussian density: the baseline of every comparison, and a density that no fast kernel knows.
 
-With y = diag(1/s) R^T (x - mu) the whitened point and c the number of standard deviations at the support's edge |y| =
-1,
+With y = diag(1/s) R^T (x - mu) the whitened point and c standard deviations at the support's edge |y| = 1,
 
     sigma(x) = kappa/m exp(-c^2 |y|^2 / 2)   inside the ellipsoid, 0 outside,   m = max(s)
 
-which is the Gaussian of 3D Gaussian splatting (Kerbl et al. 2023) as a density in space rather than a footprint on the
-screen: along a ray r(t) = o + t d the exponent is quadratic in t and the optical depth is a difference of two erf.
+which is the Gaussian of 3D Gaussian splatting (Kerbl et al. 2023) as a density in space: along a ray the exponent is
+quadratic in t and the optical depth is a difference of two erf.
 """
 
 from __future__ import annotations
@@ -32,15 +31,11 @@ _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 class GaussianDensity(DensityField):
     """sigma = kappa/m exp(-c^2 |y|^2 / 2); one parameter, log kappa, so 11 with the geometry.
 
-    The division by m makes kappa, like the cosine field's f, free of the scene's unit. ``init.mode`` of the model
-    settings: "opaque" (default) starts every primitive at central opacity ``init.alpha``, "paper" at 0.1, as 3D
+    ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``, "paper" at 0.1, as 3D
     Gaussian splatting does.
 
     Args:
-        deviations: c, standard deviations from the centre to the edge of the support, 0.5 to 10.
-
-    Raises:
-        ValueError: c is not a number in that range.
+        deviations: c, standard deviations from the centre to the edge of the support, 0.5 to 10; else ValueError.
     """
 
     init_settings = ("mode", "alpha")
@@ -74,8 +69,7 @@ class GaussianDensity(DensityField):
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
         """The line integral over a chord [t0, t1] in closed form, in float64; differentiable in every argument.
 
-        With p = (t0 + t1)/2 the chord's middle, y its whitened point, v = diag(1/s) R^T d, a = v.v and u = y.v/a the
-        ray's way from its closest approach x = y - u v to that middle,
+        With y the whitened chord middle, v = diag(1/s) R^T d, a = v.v, u = y.v/a and x = y - u v the closest approach,
 
             I = kappa/m sqrt(2/a)/c exp(-c^2 x.x / 2) B(c sqrt(a/2) u, c sqrt(a/2) (t1 - t0)/2)
 
@@ -111,11 +105,9 @@ class GaussianDensity(DensityField):
         return peak[prim] * (-0.5 * self.deviations**2 * (y * y).sum(-1)).exp()
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Each child gets half its parent's mass, the integral of sigma over space: kappa'/m' prod s' = (1/2) kappa/m
-        prod s.
+        """Each child gets half its parent's mass: kappa'/m' prod s' = (1/2) kappa/m prod s.
 
-        No Gaussian continues another inside a smaller support, so unlike the cosine field's this split changes the
-        image. What it keeps is the mass of the pair, and two children left in place are exactly their parent.
+        No Gaussian continues another inside a smaller support, so this split changes the image.
         """
         grown = (new.log_scales.double() - old.log_scales.double()).sum(-1)
         longer = new.log_length_scale.double() - old.log_length_scale.double()
@@ -126,11 +118,7 @@ class GaussianDensity(DensityField):
         }
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """See the base class; kappa is positive, so a factor below 1e-30 counts as 1e-30.
-
-        Raises:
-            ValueError: a factor is negative.
-        """
+        """See the base class; a factor below 1e-30 counts as 1e-30, a negative one is a ValueError."""
         if bool((factor < 0).any()):
             raise ValueError(f"density factor {float(factor.min())}; a Gaussian's must not be negative")
         shift = factor.to(params["log_amplitude"]).clamp_min(_FAINTEST).log()
@@ -140,11 +128,11 @@ class GaussianDensity(DensityField):
 def bell_integral(u: Tensor, w: Tensor) -> Tensor:
     """B(u, w) = integral of exp(-z^2) over [u - w, u + w], w >= 0, to a few ulp of itself; float64, differentiable.
 
-    Three exact forms, each where it does not cancel (Abramowitz and Stegun 1964, 7.1 and 22.11):
-
-    * the interval holds 0: sqrt(pi)/2 (erf(w + u) + erf(w - u)), a sum of two positive terms;
-    * it lies in one tail: sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)), because erf is all but +-1 there;
-    * it is short: the Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
+    Three exact forms, each where it does not cancel (Abramowitz and Stegun 1964, 7.1 and 22.11): where the interval
+    holds
+    0, sqrt(pi)/2 (erf(w + u) + erf(w - u)); in one tail, sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)); where it is short,
+    the
+    Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
     """
     side = u.abs()
     both = torch.erf(w + u) + torch.erf(w - u)
@@ -155,8 +143,7 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
 
 
 def _series(u: Tensor, w: Tensor) -> Tensor:
-    """The Taylor series of :func:`bell_integral` about the middle; scaled polynomials P_n = w^n H_n(u)/n! keep every
-    term small."""
+    """The Taylor series of :func:`bell_integral`; scaled polynomials P_n = w^n H_n(u)/n! keep every term small."""
     low, high = torch.ones_like(u), 2 * u * w  # P_0, P_1;  P_(n+1) = 2 (u w P_n - w^2 P_(n-1)) / (n + 1)
     total = low
     for n in range(1, 2 * _TERMS - 1, 2):

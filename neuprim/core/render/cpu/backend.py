@@ -69,8 +69,7 @@ def _array(tensor: Tensor) -> Array:
 
 
 def _arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
-    """By name and in one dtype, the widest, so that a mix does not compile kernels of its own; they compute in float64
-    in any case."""
+    """By name and in one dtype, the widest, so that a mix does not compile kernels of its own."""
     arrays = [_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]
@@ -96,7 +95,6 @@ def _view(camera: Camera, viewmat: Tensor, near: float, turns: float) -> View:
 def _prepare(
     request: Request, viewmat: Tensor, tensors: Sequence[Tensor], images: tuple[Array, int] | None = None
 ) -> _Prepared:
-    """``images``: as of :func:`~neuprim.core.render.cpu.binning.bin_primitives`."""
     camera, settings = request.camera, request.settings
     arrays, threads = _arrays_by_name(tensors), settings.threads
     parameters = Parameters(*(arrays[name] for name in PARAMETERS))
@@ -254,8 +252,7 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
 def render_slabs(
     lowered: Lowered, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and depth of each slab of the primitives, prepared as one frame; see
-    :func:`neuprim.core.render.slabs.render_slabs`."""
+    """Return opacity and depth of each slab, prepared as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means = lowered.geometry.means
     request = Request.of(lowered, camera, settings, RenderStats("cpu", len(means)))
     frame = _prepare(request, camera.viewmat, parameters_of(lowered), (slabs.numpy(), count))

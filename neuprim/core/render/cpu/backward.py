@@ -1,8 +1,7 @@
-"""Tile-wise compositing, backward: back to front, transmittance recovered by T/(1 - alpha).
+"""Compositing in the order of centres, backward: back to front, transmittance recovered by T/(1 - alpha).
 
-The optical depths of the lanes are the forward pass's, so that what reaches a lane is known before its neurons are
-evaluated. Each (tile, primitive) pair writes one gradient row; the rows of a primitive are then added in a fixed order,
-so that the result is bit-identical for any number of threads.
+The lanes' optical depths come from the forward pass. Each (tile, primitive) pair writes one gradient row; a primitive's
+rows are added in a fixed order, so that the result has the same bits for any number of threads.
 """
 
 from __future__ import annotations
@@ -70,8 +69,7 @@ def optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) of every lane from its DEPTH, with exactly the forward
-    pass's clamp and cut."""
+    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH, with the forward pass's clamp and cut."""
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
@@ -89,8 +87,7 @@ def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
-    """Three channels: recover T before this primitive, dL/d(2 FIELD HALF) and the sums, which are 16 wide and reduced
-    once per pair; dL/d RAY_COLOUR with a ``net``."""
+    """Three channels: recover T, dL/d(2 FIELD HALF), dL/d RAY_COLOUR with a ``net``, and 16-wide sums."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -151,10 +148,7 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 
 @inline
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
-    """Any channels and depth: recover T before this primitive; weights and dL/d(2 FIELD HALF).
-
-    ``cg`` holds sum_c color_c dL/drgb_c (+ z dL/dz).
-    """
+    """Any channels and depth: recover T; weights, dL/d(2 FIELD HALF); ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz)."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -176,8 +170,7 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 
 @inline
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
-    """Any channels: add w, w x error and the colours' gradients of one row to the 16-wide sums; with a ``net`` these go
-    to dL/d RAY_COLOUR, where the colour is not clamped."""
+    """Any channels: add w, w x error and the colours' gradients (with a ``net``, dL/d RAY_COLOUR) of one row."""
     st = state[base:]
     for k in range(P.TILE):
         sums[k] += w[k]
@@ -197,11 +190,7 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 @inline
 def _compact_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Move the lanes with a gradient together, and zeros behind them; returns their number. ``with_depths``: DEPTH and
-    NORM_L, too.
-
-    Many have none: rays below the cut, and those of pixels that are opaque before they get here.
-    """
+    """Move the lanes with a gradient together, zeros behind them; returns their number. Many lanes have none."""
     count = 0
     for k in range(0, n, P.TILE):
         if with_depths:
@@ -255,8 +244,9 @@ def _load_tile(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
 def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, net, edge):  # type: ignore[no-untyped-def]
     """Fill the gradient rows of every pair of tiles ``start:stop``; returns the number of evaluated lanes.
 
-    ``live``, ``first_lane``, ``depths``: see :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of
-    these tiles. The others as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    ``live``, ``first_lane``, ``depths``: :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of
+    these
+    tiles; the others as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     frame, colors, live, first_lane, depths = (
         lend_frame(frame),

@@ -34,8 +34,9 @@ class TileLists:
 def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
     """Front-to-back order; equal depths keep their index order.
 
-    Sorts unique integer keys (depth bits above, index below), which vectorised sorts handle many times faster than a
-    stable float argsort. Depths that agree to about 1e-9 of their value (1 million primitives) count as equal.
+    Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. Depths
+    that
+    agree to about 1e-9 of their value (1 million primitives) count as equal.
     """
     count = depth.shape[0]
     bits = max(int(count - 1).bit_length(), 1)
@@ -48,10 +49,9 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 
 @exact_kernel
 def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
-    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row (exact for ellipses, up to a margin of
-    1e-3 pixels); ``first[i + 1]`` is how many primitive i has.
+    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row, up to 1e-3 pixels more.
 
-    In the order of the primitives, not of their depths: what they read lies side by side.
+    ``first[i + 1]`` gets the number of primitive i. Primitives come in memory order, not in that of their depths.
     """
     rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
@@ -110,11 +110,7 @@ def _scatter(order, first, tiles, starts, ids, slots):  # type: ignore[no-untype
 def bin_primitives(
     projected: Projected, width: int, height: int, threads: int, images: tuple[Array, int] | None = None
 ) -> TileLists:
-    """Return the tile lists of one frame.
-
-    With ``images``, (N,) numbers and how many there are, each primitive is in one of several images, whose tiles follow
-    each other.
-    """
+    """Return the tile lists of a frame; with ``images``, (N,) numbers and their count, of several frames in a row."""
     count = projected.depth.shape[0]
     across, down = -(-width // P.TILE), -(-height // P.TILE)
     first = np.zeros(count + 1, np.int64)

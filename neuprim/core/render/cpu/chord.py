@@ -1,7 +1,4 @@
-"""One lane's chord, forward and backward, as numbers rather than arrays: what every loop over lanes in float32 shares.
-
-Method: "Line integral".
-"""
+"""One lane's chord in float32, forward and backward, as numbers instead of arrays (method: "Line integral")."""
 
 from __future__ import annotations
 
@@ -27,10 +24,9 @@ def ray(p):  # type: ignore[no-untyped-def]
 
 @inline_source
 def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
-    """The chord of one pixel of the tile: (du, dv, slide, e, closest point, D, 1/(e.e), tm, h, uncut, mid, half), as in
-    the layout.
+    """The chord of one pixel of the tile, named as in the layout; ``half`` is 0 where the ray misses.
 
-    fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`ray`. ``half`` is 0 where the ray misses.
+    fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`ray`.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
     y = np.floor(pixel * f(1 / P.TILE))
@@ -80,11 +76,9 @@ def weight(D, edge):  # type: ignore[no-untyped-def]
 def through_chord(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
-    """From dL/d(half, MID) and dL/d(chord middle) = q, dL/d(half e) = v to dL/d(the ray's origin m) and dL/d(its
-    direction e).
+    """From dL/d(half, MID), dL/d(chord middle) = q, dL/d(half e) = v to dL/d(origin m, direction e) of the ray.
 
-    g_tm, gD, gA: what reaches the closest approach, D = 1 - |p|^2 and a = e.e on other ways than through the chord's
-    ends.
+    g_tm, gD, gA: what reaches closest approach, D = 1 - |p|^2 and a = e.e other than through the chord's ends.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)

@@ -1,12 +1,8 @@
-"""Colour networks of the primitives (:class:`~neuprim.core.model.forms.RayNet`): the per-primitive stage in float64
-with its hand-written backward pass, and the colours of lanes.
+"""Colour networks (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and colours of lanes.
 
-The network sees the chord's middle, x~_m = local (axes q) with q the middle in whitened space, which the density's
-pixel stage leaves in the lanes anyway. So its first layer goes to whitened axes and turns once per primitive, exactly
-as the density's neurons do, and nothing here depends on the camera.
-
-RAY_COLOUR of the lanes holds colours before max(0, .), so that forward and backward clamp alike. Three channels have
-fused loops over constant offsets; other counts, and primitives drawn in float64, go unit by unit through ``V``.
+A network sees the chord's middle, which the density's pixel stage leaves in the lanes. Its first layer goes to whitened
+axes and turns once per primitive, as the density's neurons do; nothing here depends on the camera. RAY_COLOUR holds
+colours before max(0, .). Three channels have fused loops; other counts, and float64, go unit by unit through ``V``.
 """
 
 from __future__ import annotations
@@ -46,8 +42,7 @@ class Net(NamedTuple):
 
 @exact_kernel
 def _fill_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
-    """Rows ``out[n]`` (float32 or float64) of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for
-    float32 pixels."""
+    """Rows ``out[n]`` of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for float32."""
     H, C = Wx.shape[1], Wout.shape[1]
     local, axes = np.empty((3, 3)), np.empty(3)
     for n in range(start, stop):
@@ -90,11 +85,9 @@ def prepare_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> 
 def net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
-    """Chain rule from gradient rows (the networks' columns begin at ``first``) to parameters, for primitives
-    ``start:stop``.
+    """Chain rule from gradient rows, networks' columns from ``first`` on, to parameters of ``start:stop``.
 
-    Adds to ``g_log_scales`` and ``g_quats``: the first layer on whitened axes depends on the ellipsoid's axes. What
-    flows through the chord's middle is already in the density's columns.
+    Adds to ``g_log_scales`` and ``g_quats``; what flows through the chord's middle is in the density's columns already.
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)
@@ -152,8 +145,7 @@ def _rgb_unit(p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _rgb(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
-    """RAY_COLOUR += output of the two units at ``o`` and ``o2``, three channels; with ``slopes`` both units' cos and
-    d cos/d turn for the backward pass."""
+    """RAY_COLOUR += output of two units, three channels; with ``slopes`` also their cos and d cos/d turn."""
     ax, ay, az, ab, a0, a1, a2 = _rgb_unit(p, o)
     bx, by, bz, bb, b0, b1, b2 = _rgb_unit(p, o2)
     for k in range(n):
@@ -209,8 +201,7 @@ def _mix(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
-    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also what :func:`ray_colour_gradient` needs, in
-    ``V``."""
+    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also ``V`` for :func:`ray_colour_gradient`."""
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]

@@ -1,13 +1,9 @@
-"""Tile-wise compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
+"""Compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
 
-The default kernels walk a tile's primitives in one order, that of their centres. Here every pixel has its own. A first
-pass over the tile's primitives lists the hits: the pixel, the camera-z at which its ray enters, the opacity. Each
-pixel's hits are then sorted and composited front to back. The backward pass lists and composites again, walks back to
-front, which leaves dL/d(2 FIELD HALF) with every hit, and in a second pass over the primitives turns these into the
-same gradient rows, one per (tile, primitive), as the default kernel writes. Nothing can stop early before the lists are
-complete, so hidden primitives cost time.
-
-Entries that agree in float32 keep the order of the centres, and so do all chords that the near plane cuts.
+A first pass over a tile's primitives lists the hits. Each pixel's hits are sorted and composited front to back. The
+backward pass lists and composites again, walks back to front to dL/d(2 FIELD HALF) of every hit, and in a second pass
+over the primitives writes the gradient rows of the default kernel. Nothing can stop early, so hidden primitives cost
+time. Entries that agree in float32 keep the order of the centres, and so do chords that the near plane cuts.
 """
 
 from __future__ import annotations
@@ -50,13 +46,7 @@ class _Lanes(NamedTuple):
 
 
 class _Hits(NamedTuple):
-    """The hits of one tile in the order of its pairs.
-
-    Attributes:
-        values: (room, H_FLOATS), marks: (room, H_INTS), colours: (room, C) of colour networks.
-        pair_start: those of pair r lie in ``pair_start[r] : pair_start[r + 1]``.
-        listing: those of pixel j are ``listing[pixel_start[j] : pixel_start[j + 1]]``, front to back.
-    """
+    """The hits of one tile in the order of its pairs."""
 
     values: Array
     marks: Array
@@ -167,8 +157,7 @@ def _list_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # ty
 def _sort_hits(count, hits):  # type: ignore[no-untyped-def]
     """Fill ``listing`` and ``pixel_start``.
 
-    A counting sort by pixel, which keeps the order of the centres, then an insertion sort by entry: centres are nearly
-    in the right order, so few hits move far. Equal entries do not move.
+    Counting sort by pixel, which keeps the order of the centres, then a stable insertion sort: few hits move far.
     """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     begin[:] = 0
@@ -196,8 +185,7 @@ def _sort_hits(count, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` receives how many hits each pixel
-    composited. Returns the number of evaluated lanes."""
+    """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` gets the hits per pixel."""
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE
     C, tmin = colors.shape[1], frame.transmittance_min
@@ -272,8 +260,7 @@ def _uncomposite(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # 
 
 @kernel
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`. Composites anew, so that ``image.transmittance`` and
-    ``image.last`` are not read."""
+    """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`, but composites anew."""
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE
     C, neurons, with_depth = colors.shape[1], frame.neurons, image.with_depth
     color_at = P.G_NEURONS + P.PER_NEURON * neurons

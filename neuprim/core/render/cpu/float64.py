@@ -1,18 +1,13 @@
-"""The float64 pixel stage, for the few primitives that float32 cannot follow: needles and discs near the camera, fast
-neurons, and soft edges that the near plane may cut.
-
-Same interface as the float32 building blocks. What they leave in the lanes is rounded to float32 at the end, so that
-compositing and the gradient sums are shared.
+"""The float64 pixel stage, for the few primitives that float32 cannot follow; results are rounded to float32 lanes.
 
 Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from
-there to the chord's middle. Its p-th power is a polynomial q, and the mean of q cos(phase + z u) follows from the
-moments
+there to the middle. Its p-th power is a polynomial q; the mean of q cos(phase + z u) follows from the moments
 
     C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),
     dC_n/dz = -S_(n+1), dS_n/dz = C_(n+1)
 
-which are sums of spherical Bessel functions j_0 to j_5 (:mod:`neuprim.core.model.edge`). FADE is the mean of q, FIELD
-the mean of the density weighted by q over that of q, so that gradients of weights read alike for every edge.
+which are sums of spherical Bessel functions (:mod:`neuprim.core.model.edge`). FADE is the mean of q, FIELD the mean of
+the density weighted by q over that of q, so that gradients of weights are the same for every edge.
 """
 
 from __future__ import annotations
@@ -37,8 +32,7 @@ FLOAT64_SCRATCH = L.lane_array(10)
 
 @inline
 def chords_float64(S, X, n, bounds, frame, pair, with_mid, backward):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.tiles.chords` from the float64 row, for the pixels of ``bounds``; the lanes
-    beyond them are padding."""
+    """As :func:`~neuprim.core.render.cpu.tiles.chords` from the float64 row; lanes beyond ``bounds`` are padding."""
     p, depth_floor = frame.wide[frame.slots[pair.i]], frame.depth_floor
     at = 0
     for y in range(pair.y0, pair.y1):

@@ -1,8 +1,7 @@
-"""Tile-wise compositing, forward, and what it saves for the backward pass.
+"""Compositing in the order of centres, forward, and what it saves for the backward pass.
 
-Saved is the optical depth of every evaluated lane, 4 bytes each. With them the backward pass composites before it has
-evaluated a single neuron. Its lanes have to be the forward pass's own, which depend on the tile rows that were live:
-2 bytes per pair say which, and 4 where the pair's lanes begin among those of its chunk of tiles.
+Saved are the optical depth of every evaluated lane (4 bytes), and per pair its live tile rows (2 bytes) and its first
+lane in its chunk of tiles (4 bytes), so that the backward pass composites before it has evaluated a neuron.
 """
 
 from __future__ import annotations
@@ -94,8 +93,7 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def _opacity(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
-    """ALPHA of every lane: 0 below alpha_min and where the integral is not positive, at most alpha_max; its depth to
-    ``depths[at + k]``."""
+    """ALPHA: 0 below alpha_min and for integrals that are not positive, at most alpha_max; depth to ``depths``."""
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
@@ -199,14 +197,12 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 
 @kernel
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
-    """Draw tiles ``start:stop``; returns the number of evaluated lanes, and their optical depths if ``live`` and
-    ``first_lane`` (see :class:`SavedForBackward`) have room for them.
+    """Draw tiles ``start:stop``; returns the number of evaluated lanes and, if ``live`` has room, their depths.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
         colors: (N, C) colours, or the bases of the networks' colours.
-        image: what is filled.
-        net: :class:`~neuprim.core.render.cpu.colour_net.Net`; None leaves no trace of it in the compiled kernel.
+        net: :class:`~neuprim.core.render.cpu.colour_net.Net`; None leaves no trace in the compiled kernel.
         edge: one of :data:`~neuprim.core.render.cpu.trigonometry.EDGE_TYPES`.
     """
     frame, colors, live, first_lane = (

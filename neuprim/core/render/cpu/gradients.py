@@ -1,10 +1,7 @@
-"""From dL/d(2 FIELD HALF FADE) of every lane of a pair back to one gradient row: shared by both orders of compositing.
+"""From dL/d(2 FIELD HALF FADE) of every lane of a pair to its gradient row, for both orders of compositing.
 
-The optical depths are known, from the forward pass or from the lists of hits, so that FIELD is not summed over the
-neurons again: one loop per pair of neurons goes from the phases to the sums. Two paths: :func:`neuron_gradients` and
-:func:`chord_gradient` read chords from the lanes, which float64, colour networks and many neurons need;
-:func:`gradients_at_once` has a chord in registers from end to end, with at most two neurons, and neither writes nor
-reads what lies between.
+:func:`neuron_gradients` and :func:`chord_gradient` read chords from the lanes, which float64, colour networks and many
+neurons need. :func:`gradients_at_once` holds a chord in registers from end to end, with at most two neurons.
 """
 
 from __future__ import annotations
@@ -30,8 +27,7 @@ def _neuron(p, o):  # type: ignore[no-untyped-def]
 
 
 def _products(slopes):  # type: ignore[no-untyped-def]
-    """cos B, d(cos B)/d phase and cos dB/d rate of two neurons on a chord with middle q and half chord vector v, phases
-    in turns."""
+    """cos B, d(cos B)/d phase and cos dB/d rate of two neurons on a chord with middle q and half chord vector v."""
 
     @inline
     def products(edge, qx, qy, qz, vx, vy, vz, first, second):  # type: ignore[no-untyped-def]
@@ -156,8 +152,7 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
 
 @inline
 def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no-untyped-def]
-    """Chords of ``n`` lanes of a pair; in float64, where float32 is too coarse, also the three products per neuron, in
-    ``V``."""
+    """Chords of ``n`` lanes of a pair; in float64 also the three products per neuron, in ``V``."""
     slot = frame.slots[pair.i]
     if slot >= 0:
         chords_float64(S, D, n, bounds, frame, pair, False, True)
@@ -168,8 +163,7 @@ def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no
 
 @inline
 def _field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
-    """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, and the sums for b2 and log m. FIELD is what the optical depth
-    says."""
+    """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, with FIELD from the optical depth; sums for b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
         g = f(2) * S[L.GRAD + k]
@@ -185,8 +179,7 @@ def _field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def
 
 
 def _two_neurons(products):  # type: ignore[no-untyped-def]
-    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); without ``products`` from those in
-    V0 and V1."""
+    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); None: products from V0 and V1."""
 
     @inline
     def add(S, V0, V1, n, p, m, edge, out):  # type: ignore[no-untyped-def]
@@ -248,12 +241,11 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, out):  # type
 def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-def]
     """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA).
 
-    A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, the density being zero, but its
-    weight depends on
-    D = 1 - |p|^2, and on a = e.e and the closest approach where the near plane may cut the chord. In float32 no chord
-    is cut, the weight is proportional to D^p, and the ends' share through HALF is kept, as it belongs to the closed
-    form: BY_D is d FADE/dD. In float64 the ends are left out, and BY_D, BY_A and BY_TM are derivatives of the whole
-    mean FADE FIELD.
+    A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, but its weight depends on D = 1 -
+    |p|^2,
+    and on a = e.e and the closest approach where the near plane may cut the chord. In float32 no chord is cut: BY_D is
+    d FADE/dD, and the ends' share through HALF is kept. In float64 the ends are left out, and BY_D, BY_A and BY_TM are
+    derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray()

@@ -1,7 +1,6 @@
-"""Row widths and scratch memory of the numba kernels.
+"""Row widths and scratch memory of the numba kernels: arrays over lanes at constant offsets of one flat array.
 
-A *lane* is one pixel of a (tile, primitive) pair. The kernels work on arrays over lanes at constant offsets of one flat
-scratch array.
+A *lane* is one pixel of a (tile, primitive) pair.
 """
 
 from __future__ import annotations

@@ -1,10 +1,7 @@
-"""The per-primitive stage, in float64: anchors, whitening, exact bounds.
+"""The per-primitive stage, in float64: anchors, whitening, exact bounds; forward and backward.
 
-Precision is won here. Each primitive is anchored at its own projected centre, so that whitened rays are affine in the
-pixel offset and float32 never sees the distance to the camera (method: "Line integral").
-
-The anchor (depth, pixel) and the unit of t are constants of the frame: the image does not depend on their choice, so
-they carry no gradient.
+Each primitive is anchored at its own projected centre, so that whitened rays are affine in the pixel offset and float32
+never sees the distance to the camera (method: "Line integral"). Anchor and unit of t are constants without gradient.
 """
 
 from __future__ import annotations
@@ -52,8 +49,7 @@ class Parameters(NamedTuple):
 
 
 class View(NamedTuple):
-    """A camera: world-to-camera rotation and translation, intrinsics and size in pixels, near plane in scene units;
-    ``turns`` is the density's omega0 / 2 pi."""
+    """A camera: rotation and translation from world, intrinsics, size, near plane; ``turns``: omega0 / 2 pi."""
 
     R: Array
     t: Array
@@ -97,8 +93,7 @@ class Projected(NamedTuple):
 
 
 class _Scratch(NamedTuple):
-    """Memory of :func:`_wide_row`: ``work`` (10, 3), of which rows 0..2 return B, 3 the axes s/m, 4 the centre in
-    camera axes; ``waves`` (K, 4); ``rate`` (K,) returns the neurons' rates, rising."""
+    """``work`` (10, 3): rows 0..2 return B, 3 the axes s/m, 4 the centre; ``waves`` (K, 4); ``rate`` (K,) rising rates."""
 
     work: Array
     waves: Array
@@ -139,11 +134,9 @@ def _is_too_faint(most, edge, least):  # type: ignore[no-untyped-def]
 
 @strict
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
-    """r^2 of the visible extent of an ellipsoid, in units of its semi-axes: 1 for all of it, 0 for nothing
-    (:mod:`neuprim.core.render.limits`).
+    """r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
 
-    ``most``: F, positive; ``longest``: s, in units of the longest semi-axis; ``least``: from ``min_visible_depth``.
-    Rounded to float32, so that two backends whose logarithms differ in the last place agree.
+    ``most``: F; ``longest``: s, in units of the longest semi-axis. Rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -167,7 +160,7 @@ def _dot(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
-    """Fill camera-axes orientation B, axes s/m, centre c and the anchor (depth, pixel x, pixel y); returns (m, 1/|q|).
+    """Fill camera-axes orientation B, axes s/m, centre c and anchor (depth, pixel x, y); returns (m, 1/|q|).
 
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
     """
@@ -194,8 +187,7 @@ def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # typ
 
 @strict
 def _wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-untyped-def]
-    """Fill the float64 kernel row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest
-    number)."""
+    """Fill the float64 row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest number)."""
     means, log_scales, quats, W1, b1, w2, b2 = parameters
     work, waves, rate = scratch
     near, turns, K = view.near, view.turns, W1.shape[1]
@@ -243,8 +235,7 @@ def _wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-unty
 
 @strict
 def _is_finite(i, parameters, most):  # type: ignore[no-untyped-def]
-    """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes, and its quaternion
-    a rotation."""
+    """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
     for a in range(3):
@@ -258,11 +249,9 @@ def _is_finite(i, parameters, most):  # type: ignore[no-untyped-def]
 
 @strict
 def _extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no-untyped-def]
-    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends along an axis of
-    the screen, in pixels.
+    """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels.
 
-    In units of m: tangents (k +- sqrt(D))/(z^2 - S_zz), see ``screen_boxes`` of the reference; ``s22``: S_zz of the
-    whole ellipsoid.
+    Tangents as in ``screen_boxes`` of the reference, in units of m; ``s22``: S_zz of the whole ellipsoid.
     """
     z, ci, szz = c[2] / m, c[axis] / m, square * s22
     sii = square * ((B[axis, 0] * axes[0]) ** 2 + (B[axis, 1] * axes[1]) ** 2 + (B[axis, 2] * axes[2]) ** 2)
@@ -276,11 +265,10 @@ def _extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no
 
 @strict
 def _longest(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def]
-    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; at most that,
-    1.
+    """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes.
 
-    A ray's direction is e on whitened axes, and m / |e| its half chord through the centre. No point of the ellipsoid is
-    farther than m from the centre, which bounds how far a ray's slopes are from the centre's.
+    A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
+    slopes.
     """
     if row[P.TC] == 0.0:  # the anchor is not the centre
         return 1.0
@@ -306,10 +294,9 @@ def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ig
 
 @exact_kernel
 def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` for primitives ``start:stop``.
+    """Fill ``out`` for primitives ``start:stop``; silhouettes are those of rays that reach the optical depth ``least``.
 
-    ``least`` is the optical depth below which nothing is drawn; silhouettes are those of the rays that can reach it. Of
-    a primitive that cannot reach it anywhere nothing is filled but its status, an empty box and a depth of 0.
+    A primitive that cannot reach it anywhere gets a status, an empty box and a depth of 0 alone.
     """
     parameters, view = borrow_parameters(parameters), borrow_view(view)
     rows, spans, boxes, kinds, order, depth, status, in_float64 = out

@@ -12,13 +12,10 @@ from neuprim.core.render.cpu.prepare import borrow_parameters, borrow_view, came
 
 @exact_kernel
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
-    """Chain rule from gradient rows to parameters, for primitives ``start:stop``.
+    """Chain rule from gradient rows to parameters, for the ``touched`` primitives among ``start:stop``.
 
-    Args:
-        projected: of the forward pass.
-        grads: (N, gradient_width), of which rows that are not ``touched`` are left out.
-        out: :class:`Parameters` of gradients, float32; filled.
-        g_view: (N, 3, 4), filled with each primitive's part of dL/d(R | t); empty if that is not wanted.
+    Fills ``out`` (:class:`Parameters`, float32) and ``g_view`` (N, 3, 4), each one's part of dL/d(R | t); empty:
+    unwanted.
     """
     view = borrow_view(view)
     means, log_scales, quats, W1, _, _, _ = borrow_parameters(parameters)

@@ -1,7 +1,7 @@
-"""Building blocks of the pixel stage of one (tile, primitive) pair, which both passes and both orders share.
+"""Building blocks of the pixel stage of one (tile, primitive) pair, for both passes and both orders.
 
-Per pair: solve the silhouette for each pixel row, gather only the pixels inside it into a compact list of lanes, run
-chord and neurons over that list, scatter back row by row. Evaluated lanes then nearly equal true hits.
+Per pair: solve the silhouette for each pixel row, gather the pixels inside into a compact list of lanes, run chord and
+neurons over that list, scatter back row by row.
 """
 
 from __future__ import annotations
@@ -52,8 +52,7 @@ class FrameArrays(NamedTuple):
 
 
 class PairWindow(NamedTuple):
-    """Where primitive ``i`` meets the tile at pixel (tx, ty): pixels x0:x1 of its rows y0:y1, relative to the tile, and
-    the tile corner's pixel centre relative to the anchor."""
+    """Where primitive ``i`` meets the tile at (tx, ty): pixels x0:x1 of rows y0:y1; tile corner from the anchor."""
 
     i: int
     tx: int
@@ -98,8 +97,7 @@ def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def aligned(floats):  # type: ignore[no-untyped-def]
-    """Zeros that begin a cache line: numba aligns to 32 bytes, and a vector of 64 that lies across two lines costs
-    twice."""
+    """Zeros that begin a cache line; numba aligns to 32 bytes, and a vector across two lines costs twice."""
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
     return room[shift : shift + floats]
@@ -124,8 +122,7 @@ _prefetch: Any = intrinsic(_emit_prefetch)
 
 @inline
 def fetch_ahead(i, frame):  # type: ignore[no-untyped-def]
-    """Ask memory for what the next pair, of primitive ``i``, reads first: tiles meet primitives in no order that it
-    could guess."""
+    """Ask memory for what the next pair, of primitive ``i``, reads first."""
     rows, spans, boxes = frame.rows, frame.spans, frame.boxes
     row = rows.ctypes.data + i * rows.strides[0]
     for at in range(0, rows.strides[0], 64):
@@ -143,10 +140,7 @@ def prefetch_depths(depths, first, stop):  # type: ignore[no-untyped-def]
 
 @inline
 def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette; equal in the other rows.
-
-    All 16 rows at once: one vector.
-    """
+    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, all 16 rows in one vector."""
     skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
     ihy = f(1) / span[P.HY]
     low, high, top, bottom = f(pair.x0), f(pair.x1), f(pair.y0), f(pair.y1)
@@ -167,10 +161,9 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 
 @inline
 def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
-    """Gather pixels and their ray norms into lanes; ``offset[y]`` is where row y starts. Returns the lane count.
+    """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Returns the lane count.
 
-    Every row copies a whole vector, without a branch that would be guessed wrong every other time; the next row, or the
-    final padding, overwrites what stands over, so tail lanes always hold numbers of pixels of the tile.
+    Every row copies a whole vector without a branch; the next row, or the padding, overwrites what stands over.
     """
     n = 0
     for y in range(y0, y1):
@@ -188,9 +181,9 @@ def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
 
 @inline
 def chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Chord middle Q, direction E and half length of n lanes (:func:`~chord.chord`); HALF = 0 where the ray misses.
+    """Chord middle Q, direction E and half length of n lanes; HALF = 0 where the ray misses.
 
-    Where the edge is soft, no chord may be cut: such primitives are drawn in float64.
+    A soft-edged chord may not be cut: such primitives are drawn in float64.
     """
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, offset = ray(p), p[P.OFFSET]
@@ -217,8 +210,7 @@ def chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-unty
 
 
 def _values(profiles):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons, with the profiles of their range of
-    rates."""
+    """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons in one range of rates."""
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]

@@ -1,5 +1,4 @@
-"""The CUDA backend as one differentiable operation: lowered tensors in, image out, all on the tensors' device and the
-caller's stream."""
+"""The CUDA backend as one differentiable operation, on the tensors' device and the caller's stream."""
 
 from __future__ import annotations
 
@@ -111,8 +110,7 @@ def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings
 def render_slabs(
     lowered: Lowered, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and depth of each slab of the primitives, in one frame; see
-    :func:`neuprim.core.render.slabs.render_slabs`."""
+    """Return opacity and depth of each slab, in one frame; see :func:`neuprim.core.render.render_slabs`."""
     means, settings = lowered.geometry.means, replace(settings, depth=True)
     tensors = parameters_of(lowered)
     blank = torch.zeros(len(means), 1, device=means.device)

@@ -1,14 +1,11 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Compositing, backward, in two passes over what the forward pass left in the pixels' slots.
+"""Compositing, backward, over what the forward pass left in the pixels' slots.
 
-First a block a tile, a thread a pixel: it walks its hits back to front and leaves dL/dI and the weight in each slot. No
-neurons, no sums.
-
-Then a warp a (tile, primitive) pair over its hits: chord and neurons again, sums in registers, one row for the pair.
-The rows of a primitive are then added in the order of its pairs: no sum depends on which block came first, and reruns
-give the same bits. With 8 neurons the sums alone are 59 registers of a lane's 128. So over the neurons nothing is kept
-that a few operations give again: of the chord its middle, depth and closest point; of the tile both corners but in one
-number; of the pair its spans, which are in shared memory.
+First a block a tile, a thread a pixel: it walks its hits back to front and leaves dL/dI and the weight in each slot.
+Then a warp a (tile, primitive) pair: chord and neurons again, sums in registers, one row per pair. A primitive's rows
+are added in the order of its pairs, so that reruns give the same bits. With 8 neurons the sums alone are 59 registers
+of
+128, so over the neurons nothing is kept that a few operations give again.
 """
 
 from __future__ import annotations
@@ -57,8 +54,8 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
         transmittance: Floats, reached: Ints, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats,
         hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
-        """``g_transmittance`` already holds the background's share. With b what lies behind a hit, sum of w (dL/dw) and
-        the rest of the light: dL/dI = (1 - alpha) T dL/dw - b, and 0 where the opacity was clamped."""
+        """``g_transmittance`` has the background's share. With b the light behind a hit, dL/dI = (1 - alpha) T dL/dw -
+        b."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel_of_lane(lane)

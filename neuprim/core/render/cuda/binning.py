@@ -1,9 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Tile lists on the device: which primitives reach which 16 x 16 tile, front to back, and which pixels of it; the twin
-of :mod:`neuprim.core.render.cpu.binning`.
+"""Tile lists on the device, and the pixels of each pair; the twin of :mod:`neuprim.core.render.cpu.binning`.
 
-Everything is counted before it is written, and sorted by integers, so that a rerun gives the same bits. The host waits
-once, for the number of pairs.
+Everything is counted before it is written, and sorted by integers: a rerun gives the same bits. The host waits once.
 """
 
 import functools
@@ -65,11 +63,7 @@ class TileLists:
 
 
 def count_tiles(counts: Tensor, bad: Tensor) -> Counted:
-    """Running sums of what ``prepare`` counted, see there; here the host waits for the device, once a frame.
-
-    Raises:
-        BackendUnavailable: too many pairs for int32.
-    """
+    """Running sums of what ``prepare`` counted; the host waits here, once. BackendUnavailable: too many pairs."""
     ends = torch.stack(
         [torch.cumsum(row, 0, dtype=torch.int64) for row in counts]
     )  # along one row torch's scan is ten times faster
@@ -115,8 +109,7 @@ def ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.float32, box: 
 
 @wp.func
 def tile_range(e: Ellipse, ty: int):
-    """First tile and one past the last that the silhouette reaches in row ``ty`` of tiles; nothing, where they are
-    equal."""
+    """First tile and one past the last that the silhouette reaches in row ``ty`` of tiles."""
     lo, hi = e.box[0] // _TILE, (e.box[2] - 1) // _TILE + 1
     if e.bounded > 0:
         d0 = wp.max(d(wp.max(ty * _TILE, e.box[1])) + e.base, -e.hy)
@@ -142,10 +135,7 @@ def _kernels() -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Longs, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """A key tile << 32 | rank for every tile that the primitive of depth rank ``tid`` reaches; dim (N,).
-
-        ``tiles``: of each of several images, of which ``images`` says a primitive's; 0 where there is one.
-        """
+        """A key tile << 32 | rank for every tile of the primitive of depth rank ``tid``; ``tiles`` of each image, or 0."""
         rank = wp.tid()
         i = int(order[rank])
         last = int(ends[0, i])
@@ -200,10 +190,9 @@ def bin_primitives(
     camera: Camera,
     images: tuple[Tensor, int] | None = None,
 ) -> tuple[TileLists, Tensor, Tensor]:
-    """Return the tile lists of one frame, ``slots`` and ``which``; every argument as ``prepare`` and
-    :func:`count_tiles` filled it, no primitive bad.
+    """Return a frame's tile lists, ``slots`` and ``which``, from what ``prepare`` and :func:`count_tiles` filled.
 
-    ``images``: of each primitive, (N,) int32, and how many there are.
+    ``images``: the image of each primitive, (N,) int32, and their number.
     """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-camera.width // L.TILE), -(-camera.height // L.TILE)
@@ -240,12 +229,10 @@ def row_spans(
     rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, ids: Ints, tiles: Ints, size: wp.vec2i, spans: Shorts2d,
     counts: Ints,
 ):  # fmt: skip
-    """Thread n: which pixels of a tile the silhouette of pair n covers, a span start << 8 | last << 4 | first in each
-    of
-    its 16 rows, and how many pixels they have together.
+    """Thread n: the pixels of its tile that pair n covers, start << 8 | last << 4 | first for each of 16 rows.
 
-    Each pixel inside has a slot of its own, in the order of pairs, rows and pixels, where the forward pass leaves what
-    the backward pass needs: a fifth of the memory of whole tiles, and lists without gaps for the pass over pairs.
+    Each has a slot, in the order of pairs, rows and pixels, for what the backward pass needs: a fifth of whole tiles'
+    memory.
     """
     n = wp.tid()
     i = ids[n]

@@ -1,12 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Native functions of the kernels: operations of a whole block, and numbers of arrays in one instruction each.
+"""Native functions of the kernels: operations of a whole block, and array elements in one instruction each.
 
-Every thread of a block has to call the block's operations. On Warp's CPU blocks a static buffer takes the place of the
-hardware: threads take turns between two ``WP_TILE_SYNC``.
-
-An index of Warp's may be negative and its strides are read from the launch, in 64 bits: nine instructions for a row's
-span, of which two are needed. In the loops over hits indices are whole numbers from zero, and arrays are contiguous, as
-:func:`neuprim.core.compute.warp.array` asserts.
+Every thread of a block calls a block's operation; on Warp's CPU blocks a static buffer takes the hardware's place.
+Warp's indices may be negative and its strides are 64 bits: nine instructions for a row's span, of which two are needed
+in loops over hits, whose indices start at zero and whose arrays are contiguous
+(:func:`neuprim.core.compute.warp.array`).
 """
 
 # annotations are values here: Warp reads them, and cannot find what a function's own scope names in a text
@@ -38,13 +36,9 @@ def any_thread(yes: int) -> int:
 
 
 def _halving(width: int) -> str:
-    """Every step keeps half of the values and adds those of a lane's partner: 31 shuffles per 32 values instead of 160.
+    """Each step keeps half of the values and adds a partner lane's: 31 shuffles per 32 values instead of 160.
 
-    A GPU tells a thread its lane again, so that no register has to keep it; positions are 64 bits, as rows of all
-    pairs may be billions.
-
-    Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone: over two counters they
-    would not be unrolled, and the values would go to memory.
+    Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone, so that they are unrolled.
     """
     steps = ""
     for bit in (16, 8, 4, 2, 1):
@@ -86,9 +80,7 @@ def row_type(width: int) -> Any:
 
 @functools.cache
 def row_sums(width: int) -> Callable[..., Any]:
-    """A function (x, lane, out, pair) that writes the sums of ``width`` values over a warp's lanes, a block, to the row
-    of a pair; a multiple of 32.
-    """
+    """A function (x, lane, out, pair) that writes sums over a warp's lanes to a pair's row; ``width`` is 32 times n."""
     row = row_type(width)
 
     @wp.func_native(_halving(width))

@@ -1,9 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""One pixel's chord through one primitive on the device, forward and backward: the CPU's
-(:mod:`neuprim.core.render.cpu.chord`) in vectors.
+"""One pixel's chord on the device, forward and backward: :mod:`neuprim.core.render.cpu.chord` in vectors.
 
-Method: "Line integral". An optical depth is I = N_p |d| D^p half field, with field the mean of the density's numerator,
-weighted by the edge.
+An optical depth is I = N_p |d| D^p half field, with field the mean of the density's numerator, weighted by the edge.
 """
 
 from __future__ import annotations
@@ -104,8 +102,7 @@ class Pull:
 
 @wp.func
 def through(c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3):
-    """From dL/d(half, mid) and dL/d(chord middle) = gq, dL/d(half e) = gv; gD is complete, with what reaches D through
-    ``h``."""
+    """From dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD has what reaches D through ``h``, too."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     tm = g_tm + gt0 + gt1
@@ -129,8 +126,7 @@ def through_chord(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: fl
 
 @wp.func
 def pixel_of_lane(lane: int):
-    """(x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better than
-    rows."""
+    """(x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better."""
     return wp.vec2i((lane & 7) | ((lane >> 2) & 8), ((lane >> 3) & 3) | ((lane >> 4) & 12))
 
 
@@ -145,8 +141,7 @@ def slot_of_pixel(span: int, offset: int, x: int):
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """(x, y) in the tile of pixel ``s`` of pair ``n``, a row of ``spans``: the last row of pixels that starts at or
-    before it."""
+    """(x, y) in the tile of pixel ``s`` of pair ``n``: in the last row of ``spans`` that starts at or before it."""
     y = int(0)
     for b in range(4):
         if int(spans[n, y + (8 >> b)]) >> 8 <= s:

@@ -1,12 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colour networks of the primitives (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and at
-pixels; the twin of :mod:`neuprim.core.render.cpu.colour_net`.
+"""Colour networks, per primitive in float64 and at pixels; the twin of :mod:`neuprim.core.render.cpu.colour_net`.
 
-The network sees the chord's middle, which the density's pixel stage has anyway in whitened space: its first layer goes
-there, in turns, once per primitive, as the density's neurons do, and nothing here depends on the camera.
-
-A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of the gradient of a
-ray comes through the chord's middle alone; it is linear, so that it is added to the density's row by row.
+A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of a ray's gradient
+comes through the chord's middle alone; it is linear, and added to the density's row.
 """
 
 import functools
@@ -123,8 +119,7 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
         channels: int, weights: Floats2d, grads: Floats2d, first: int, g_log_scales: Vec3s, g_quats: Vec4s,
         g_Wx: Vec3s2d, g_bias: Floats2d, g_Wout: Floats3d,
     ):  # fmt: skip
-        """Thread i. ``weights``: rows whose column G_WEIGHT says whether the primitive was seen. Adds to
-        ``g_log_scales`` and ``g_quats``."""
+        """Thread i; column G_WEIGHT of ``weights`` says whether it was seen. Adds to g_log_scales and g_quats."""
         i = wp.tid()
         seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
         logs, quat = wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
@@ -205,13 +200,9 @@ def fill_wide_net(net: Net, which: Tensor, log_scales: Tensor, quats: Tensor) ->
 def net_backward(
     net: Net, parameters: Sequence[Tensor], weights: Tensor, grads: Tensor, out: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the gradients of Wx, bias and Wout in float32; adds to those of log_scales and quats in ``out``.
+    """Return the float32 gradients of Wx, bias and Wout; adds to those of log_scales and quats in ``out``.
 
-    Args:
-        parameters: of the frame.
-        weights: (N, .) gradient rows of the density's pass.
-        grads: (N, .) those of the networks' pass.
-        out: gradients of the parameters.
+    ``weights``, ``grads``: (N, .) gradient rows of the density's and of the networks' pass.
     """
     _, log_scales, quats, *_ = parameters
     _, g_log_scales, g_quats, *_ = out
@@ -324,8 +315,7 @@ def float64_hues_kernel(channels: int) -> Any:
         pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, rows: Vec4s2d, first: int, hidden: int,
         slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, size: wp.vec2i, hues: Floats2d,
     ):  # fmt: skip
-        """``mixes``: the networks' float32 rows, for their output weights; ``rows``: the primitives', with the bases
-        from column ``first``."""
+        """``mixes``: the networks' float32 rows, for output weights; ``rows``: bases from column ``first``."""
         member, lane = wp.tid()
         n = pairs[member]
         i = ids[n]

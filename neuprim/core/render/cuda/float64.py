@@ -1,15 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The pixel stage in float64, for the few primitives that float32 cannot follow: chords, opacities, gradients.
 
-Needles and discs near the camera, fast neurons, and every soft edge that the near plane may cut. The formulas are the
-CPU's (:mod:`neuprim.core.render.cpu.float64`): (1 - |y|^2)^p is a polynomial q of u in [-1, 1], and the mean of q(u)
-cos(phase + z u) follows from moments C_n (even n) and S_n (odd n) of cos and sin, sums of spherical Bessel functions
-j_0 to j_5. A hard edge is q = 1.
-
-Opacities, and where rays enter, are left in the pixels' slots before compositing. In the backward pass a hard edge has
-the gradient of its ends. A soft one has none there, the density being zero, and its weight depends on D, on a = e.e and
-on the closest approach, where the near plane may cut the chord; see
-:func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are left
+in
+the pixels' slots before compositing. Gradients of edges: :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -221,8 +215,7 @@ def through64(
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D; g_tm, gD, gA: on other ways
-    than the chord's ends."""
+    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D."""
     half = wp.float64(0.5)
     two = wp.float64(2.0)
     gt1 = half * (g_mid + g_half)

@@ -1,10 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Compositing, forward: a block a tile, a thread a pixel; and both passes where each ray has an order of its own.
 
-Rows of primitives come to shared memory in batches; a tile ends when no pixel sees light through it any more. What the
-backward pass needs goes to the pixels' slots (:func:`~neuprim.core.render.cuda.binning.row_spans`): (alpha,
-transmittance before) of every hit. Pairs of primitives that float32 cannot follow have their opacities there beforehand
-(:mod:`~neuprim.core.render.cuda.float64`).
+Rows come to shared memory in batches; a tile ends when no pixel sees light through it. (alpha, transmittance before) of
+every hit goes to its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). Float64 pairs have their opacities
+there
+beforehand (:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -32,17 +32,14 @@ def key_of(pixel: int, entry: float):
     return (wp.int64(pixel) << wp.int64(32)) | bits
 
 
-BATCH = 16
-"""Rows in shared memory at a time."""
+BATCH = 16  # rows in shared memory at a time
 
 
 @functools.cache
 def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
-    """Of a form; ``keep``: fill the slots, and take primitives in float64 from there; ``depth``: also the sum of w z.
+    """``keep``: fill the slots, and take float64 primitives from there; ``depth``: also the sum of w z.
 
-    ``listing``: composite nothing, but list every hit for :func:`composite_kernel`, with its sorting
-    key and its pair.
-    ``several``: images of one size, one after the other.
+    ``listing``: only list every hit, its key and pair, for :func:`composite_kernel`; ``several``: images in a row.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
@@ -61,8 +58,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
         limits: wp.vec4, background: Floats, size: wp.vec2i, rgb: Floats2d, transmittance: Floats, zsum: Floats,
         hits: Vec2s, depths: Floats, hues: Floats2d, reached: Ints, keys: Longs, owners: Ints,
     ):  # fmt: skip
-        """limits = (alpha_min, alpha_max, transmittance_min, -); ``net``, ``hues``: of colour networks;
-        ``reached[tile]``: the pairs before it were composited."""
+        """limits = (alpha_min, alpha_max, transmittance_min, -); pairs before ``reached[tile]`` were composited."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel_of_lane(lane)
@@ -215,8 +211,7 @@ def _begin(keys: Longs, count: int, pixel: int):
 
 @functools.cache
 def composite_kernel(form: Form, depth: bool) -> Any:
-    """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last that
-    counts."""
+    """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last."""
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
@@ -262,8 +257,7 @@ def composite_kernel(form: Form, depth: bool) -> Any:
 
 @functools.cache
 def uncomposite_kernel(form: Form, depth: bool) -> Any:
-    """Back to front: (alpha, T) of every hit becomes (dL/dI, weight), see
-    :func:`~neuprim.core.render.cuda.backward.pixels_kernel`."""
+    """Back to front: (alpha, T) becomes (dL/dI, weight), as in ``pixels_kernel``."""
     C, H = form.channels, form.hidden
     colours = L.colours(form.neurons)
 

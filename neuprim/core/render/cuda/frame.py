@@ -94,15 +94,12 @@ def prepare_frame(
     """Return everything that the pixel kernels read of one view; the host waits for the device once.
 
     Args:
-        viewmat: (4, 4) world to camera, on any device.
         palette: (N, C) colours.
         tensors: those of :data:`~neuprim.core.render.rasterize.PARAMETERS`, all on one device.
         forced: (N,) bool, primitives to draw in float64 whatever this stage finds.
-        images: (N,) int32, which of several images each primitive is drawn in, and their number; None for one.
+        images: (N,) int32, the image of each primitive, and their number; None for one.
 
-    Raises:
-        NotFinite: a primitive is not finite, or leaves the range of float32.
-        BackendUnavailable: primitives reach 2^31 tiles or more, all of them together.
+    Raises NotFinite, or BackendUnavailable where primitives reach 2^31 tiles or more.
     """
     # float64 where any is, else float32; the kernels compute in float64 in any case
     dtype = torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32

@@ -1,8 +1,6 @@
-"""Names for the columns of the kernels' arrays on the device.
+"""Columns of the kernels' arrays on the device; :mod:`neuprim.core.render.layout` says what the numbers mean.
 
-A primitive's row is a whole number of float4, so that one load of 16 bytes brings a vector and a scalar. The numbers
-are those of :mod:`neuprim.core.render.layout`, which says what they mean; only their places differ. Gradient rows have
-the same columns.
+A primitive's row is a whole number of float4: one load of 16 bytes brings a vector and a scalar.
 """
 
 from __future__ import annotations
@@ -31,19 +29,16 @@ SCALARS = {E0: "UX", EX: "UY", EY: "NEAR", XA: "OFFSET", XU: "TU", XV: "TV"}
 """The fourth number of each column. Those of REST are TC, UNIT, ANCHOR_Z and whether float32 is too coarse (0 or 1); of
 a neuron (WX, WY, WZ, PHASE)."""
 
-AMPLITUDE = 4
-"""Place of the amplitude among the five numbers of a neuron in a gradient row."""
+AMPLITUDE = 4  # place of the amplitude among the five numbers of a neuron in a gradient row
 
 WARP = 32
 
-CUT_AT = -1e30
-"""Entry of every chord that the near plane cuts: in front of all others, and equal."""
+CUT_AT = -1e30  # entry of every chord that the near plane cuts: in front of all others, and equal
 
 
 @dataclass(frozen=True)
 class Form:
-    """What a kernel is compiled for: neurons K, exponent p of the edge, channels C, and hidden units H of the colour
-    network, -1 where colours are constant."""
+    """What a kernel is compiled for: neurons K, exponent p, channels C, hidden units H (-1: constant colours)."""
 
     neurons: int
     edge: int

@@ -99,11 +99,7 @@ def _find_marked(marked: Tensor, count: int) -> Tensor:
 
 
 def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
-    """Number of slots, (pairs + 1,) first slot of each pair, and the pairs in float64; the host waits for the device.
-
-    Raises:
-        BackendUnavailable: the frame's hits are more than int32 counts.
-    """
+    """Number of slots, (pairs + 1,) first slot of each pair, float64 pairs; waits. BackendUnavailable: too many."""
     in_float64 = torch.empty(0, dtype=torch.int32, device=frame.device)
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int32, device=frame.device)
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
@@ -131,12 +127,7 @@ def forward(
     differentiable: bool,
     images: int = 1,
 ) -> Composited:
-    """Draw; of several ``images``, whose pixels come one after the other, without gradients and sorted by centres. The
-    host waits for the device if slots are kept, for their number.
-
-    Raises:
-        BackendUnavailable: the frame's hits are more than int32 counts.
-    """
+    """Draw; several ``images`` without gradients, sorted by centres. The host waits where slots are kept."""
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
 
@@ -212,8 +203,7 @@ def forward(
 def backward(
     frame: Frame, form: Form, net: Net | None, drawn: Composited, settings: RenderSettings, gradient: ImageGradient
 ) -> tuple[Tensor, Tensor | None]:
-    """Return (N, gradient_width) gradient rows, and (N, net_width) of colour networks; the slots' contents are used
-    up."""
+    """Return (N, gradient_width) gradient rows, and (N, net_width) of networks; uses up the slots' contents."""
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     a = _Arrays(frame, net, settings, drawn.spans, drawn.offsets)

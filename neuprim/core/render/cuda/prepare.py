@@ -1,11 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The per-primitive stage on the device, one thread a primitive, float64 inside: the twin of
-:mod:`neuprim.core.render.cpu.prepare`.
+"""The per-primitive stage, one thread a primitive, float64 inside: the twin of :mod:`neuprim.core.render.cpu.prepare`.
 
-Three differences of form: rows are float4 with the colours in them, neurons stay in the model's order, and TU and TV
-are 0 where a caller's ``forced`` asks for float64, not only where this stage does. It also counts each primitive's
-tiles, see
-:mod:`neuprim.core.render.cuda.binning`.
+Rows are float4 with the colours in them, and neurons stay in the model's order. It also counts each primitive's tiles.
 """
 
 import functools
@@ -91,8 +87,7 @@ def _spread(p: ProjectedPrimitive, i: int, j: int):
 
 @wp.func
 def _extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
-    """Where the silhouette of the ellipsoid that is ``square`` ** 0.5 times as large begins and ends on the screen
-    along one axis, in pixels."""
+    """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
     sii, siz = square * _spread(p, axis, axis), square * _spread(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
@@ -104,8 +99,7 @@ def _extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: 
 
 @wp.struct
 class Outline:
-    """A silhouette's row spans, see :mod:`neuprim.core.render.cpu.layout`; whether it is an ellipse, and float32 too
-    coarse for it."""
+    """A silhouette's row spans; whether it is an ellipse, and too coarse for float32."""
 
     skew: wp.float64
     xc: wp.float64
@@ -117,8 +111,7 @@ class Outline:
 
 @wp.func
 def _outline(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half
-    width from (HX, HY)."""
+    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, as row spans: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
     o = Outline()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
@@ -164,8 +157,7 @@ def _wave(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
 
 @wp.func
 def _longest(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
-    """A bound of the half chords of all rays that meet the ellipsoid, in units of its longest semi-axis; ``reach`` of
-    it along the view."""
+    """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes."""
     bound, one = d(1.0), d(1.0)
     if r.tc != d(0.0):
         z = p.centre[2]
@@ -201,8 +193,7 @@ def _is_too_faint(most: wp.float64, edge: int, least: wp.float64):
 
 @wp.func
 def _visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive; ``bound``:
-    from :func:`_longest`."""
+    """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
     square, share = d(0.0), least / (most * _choose(edge, _N0, _N1, _N2) * bound)
     if share <= _choose(edge, _W0, _W1, _W2):
         square = d(1.0)
@@ -213,13 +204,10 @@ def _visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.fl
 
 @functools.cache
 def prepare_kernel(double: bool) -> Any:
-    """Fills rows, spans, boxes, depth, status and counts of every primitive from float32 or float64 parameters; dim
-    (N,).
+    """Fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
 
     ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first
-    primitive that is not finite, its colours included; otherwise left as it is. ``least``: the optical depth below
-    which nothing is drawn; of a primitive that reaches it nowhere nothing is filled but its status, counts, an empty
-    box and a depth of 0.
+    primitive that is not finite, colours included. ``least``: the optical depth below which nothing is drawn.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 

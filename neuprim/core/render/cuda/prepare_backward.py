@@ -1,6 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The chain rule from gradient rows to parameters, one thread a primitive, float64 inside: the twin of the CPU's
-``prepare_backward``."""
+"""The chain rule from gradient rows to parameters, one thread a primitive; the CPU's ``prepare_backward``."""
 
 import functools
 from typing import Any
@@ -116,13 +115,9 @@ def _kernel(double: bool) -> Any:
 
 
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Gradients of :data:`~neuprim.core.render.rasterize.PARAMETERS` in float32, and of the upper three rows of the
-    view.
+    """Float32 gradients of the parameters, and with ``want_view`` (3, 4) float64 of (R | t).
 
-    Args:
-        frame: of the forward pass.
-        grads: (N, gradient_width) float32 rows, one per primitive; those whose weight is 0 give zeros.
-        want_view: whether dL/d(R | t) is asked for, (3, 4) float64.
+    ``grads``: (N, gradient_width) float32 rows; those whose weight is 0 give zeros.
     """
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in frame.parameters)
     g_view = torch.empty(grads.shape[0], 12, dtype=torch.float64, device=grads.device) if want_view else None

@@ -1,9 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Projection of a primitive, in float64, which the per-primitive kernels and their backward pass share.
-
-The twin of ``_frame`` and of the geometry in ``_wide_row`` of :mod:`neuprim.core.render.cpu.prepare`, which say what
-the numbers are.
-"""
+"""Projection of a primitive, in float64: the geometry of :mod:`neuprim.core.render.cpu.prepare`."""
 
 from neuprim.core.compute.warp import OPTIONS, Doubles, wp
 from neuprim.core.render.limits import ANCHOR_RADII
@@ -33,8 +29,7 @@ class View:
 
 @wp.struct
 class ProjectedPrimitive:
-    """Orientation in camera axes, rotation, axes s/m, centre in camera axes, anchor (depth, pixel x, pixel y), m and
-    1/|q|."""
+    """Orientation in camera axes, rotation, axes s/m, centre, anchor (depth, pixel x, y), m and 1/|q|."""
 
     B: wp.mat33d
     local: wp.mat33d
@@ -47,8 +42,7 @@ class ProjectedPrimitive:
 
 @wp.struct
 class Ray:
-    """A = m S^-1 B^T, and rays in whitened space: x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), G = du ex + dv ey, s
-    = du tu + dv tv."""
+    """A = m S^-1 B^T and rays in whitened space, x(t) = (xa + du xu + dv xv + s G) + t (e0 + G)."""
 
     A: wp.mat33d
     ref: wp.vec3d
@@ -83,8 +77,7 @@ def view_of(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64):
 
 @wp.func
 def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
-    """The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same
-    number."""
+    """The anchor is rounded *before* it is used, so that pixel kernels subtract the same number."""
     one, two = d(1.0), d(2.0)
     p = ProjectedPrimitive()
     n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])

@@ -1,9 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""cos and B_p of a phase in turns: the CPU's polynomials up to half a turn, recursion beyond.
+"""cos and B_p of a phase in turns: polynomials up to half a turn, recursion beyond (:mod:`neuprim.core.model.edge`).
 
-B_p(z) = (2p + 1)!! j_p(z)/z^p and B_p' = -z B_(p+1)/(2p + 3), so that the backward pass needs one more member of the
-family and nothing else. Rates v are in turns over half a chord, z = 2 pi v (:mod:`neuprim.core.model.edge`).
-Coefficients: benchmarks/fit_polynomials.py. float32 errors up to half a turn: cos 4e-7, B_0 2.6e-7, B_1 to B_3 1.1e-7.
+B_p' = -z B_(p+1)/(2p + 3): the backward pass needs one more member. Coefficients: benchmarks/fit_polynomials.py.
 """
 
 from __future__ import annotations

@@ -1,9 +1,5 @@
-"""The reference: the closed form of the method in plain torch, float64, with autograd.
-
-Every other backend is compared with this file, so it stays close to the mathematics: whitened rays, the middle of the
-chord, one (cos, sinc) pair per neuron, front-to-back compositing. It also draws densities and colours that do not lower
-to a form the kernels know.
-"""
+"""The reference: the method's closed form in plain torch, float64, with autograd; every other backend is tested against
+it."""
 
 from __future__ import annotations
 
@@ -24,8 +20,7 @@ _BLOCK = 32  # pixels on a side; bounds memory, changes nothing
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) whose derivative uses max(D, floor): gradients grow as D^-1/2 at a silhouette, and float32 cannot
-    follow."""
+    """sqrt(D) whose derivative uses max(D, floor): it grows as D^-1/2 at a silhouette."""
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:

@@ -1,5 +1,4 @@
-"""Rays of a camera for the reference backend: near limits, depth along them, an order of primitives, and exact screen
-bounds of ellipsoids (support radius 1); float64."""
+"""Rays of a camera for the reference backend, the order of primitives, and exact screen bounds of ellipsoids; float64."""
 
 from __future__ import annotations
 
@@ -42,10 +41,7 @@ class FrameRays(ABC):
 
 
 def pixel_directions(camera: Camera) -> Tensor:
-    """(H, W, 3) unit ray directions in camera axes through the pixel centres, float64.
-
-    Differentiable in the intrinsics where these are 0-d tensors.
-    """
+    """(H, W, 3) float64 unit ray directions in camera axes; differentiable in intrinsics that are tensors."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     gy, gx = torch.meshgrid(y, x, indexing="ij")
@@ -102,14 +98,11 @@ def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: floa
 
 
 def screen_boxes(geometry: Geometry, camera: Camera, near: float) -> Tensor:
-    """(N, 4) pixel-coordinate bounds (x0, y0, x1, y1) of each ellipsoid's projection, float64.
+    """(N, 4) float64 pixel bounds (x0, y0, x1, y1) of each ellipsoid's projection.
 
-    For the plane through the camera spanned by an image axis i and the optical axis, the tangents to the ellipsoid are
-    x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with k = c_i z - S_iz and D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz
-    - S_iz^2),
-    S = B diag(s^2) B^T the ellipsoid's shape in camera axes and c its centre. D is written without the cancelling c_i^2
-    z^2.
-    An ellipsoid that the near plane cuts bounds to the whole screen, one behind it to nothing (x1 < x0).
+    In the plane of image axis i and the optical axis, the tangents are x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with
+    k = c_i z - S_iz, D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2), S = B diag(s^2) B^T and centre c.
+    An ellipsoid that the near plane cuts has the whole screen, one behind it nothing (x1 < x0).
     """
     view = camera.viewmat.detach().double()
     R = view[:3, :3]

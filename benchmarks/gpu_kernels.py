@@ -35,7 +35,7 @@ from shared.tables import DOCS, Table, between_markers, make_table
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model.colours import sh_warp
-from neuprim.core.render.cuda import binning, colour_net, float64, forward, passes, prepare, prepare_backward
+from neuprim.core.render.cuda import backend, binning, colour_net, float64, forward, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import Form
 from neuprim.core.render.cuda.projection import PER_BLOCK
@@ -64,8 +64,8 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         yield "network units", colour_net._kernels(False)[0], PER_BLOCK
         yield "emit", binning._kernels()[0], PER_BLOCK
         yield "list", binning._kernels()[1], BLOCK
-        yield "spans", passes.row_spans, BLOCK
-        yield "sums", passes.sum_pairs, BLOCK
+        yield "spans", backend.row_spans, BLOCK
+        yield "sums", backend.sum_pairs, BLOCK
         yield "float64 pairs", float64.float64_opacity_kernel(False), L.WARP
         return
     if name == BESIDE:
@@ -81,14 +81,14 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         return
     form = FORMS[name]
     yield "forward", forward.forward_kernel(form, True, False), L.PIXELS
-    yield "pixels", passes.pixels_kernel(form, False), L.PIXELS
+    yield "pixels", backend.pixels_kernel(form, False), L.PIXELS
     if form.hidden > 0:
-        yield "network pairs", passes.net_pairs_kernel(form), L.WARP
+        yield "network pairs", backend.net_pairs_kernel(form), L.WARP
         return
-    yield "pairs", passes.pairs_kernel(form, False), L.WARP
-    yield "composite by entry", passes.composite_kernel(form, False), BLOCK
-    yield "uncomposite by entry", passes.uncomposite_kernel(form, False), BLOCK
-    yield "float64 pairs, backward", passes.float64_pairs_kernel(form, False), L.WARP
+    yield "pairs", backend.pairs_kernel(form, False), L.WARP
+    yield "composite by entry", backend.composite_kernel(form, False), BLOCK
+    yield "uncomposite by entry", backend.uncomposite_kernel(form, False), BLOCK
+    yield "float64 pairs, backward", backend.float64_pairs_kernel(form, False), L.WARP
 
 
 def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> Iterator[Row]:

@@ -89,17 +89,9 @@ def chord(target: Path) -> None:
 
     viewmat = look_at(torch.from_numpy(origin), torch.from_numpy(aim), torch.tensor([0.0, 0.0, 1.0]))
     K = torch.tensor([[[1.0, 0.0, 0.5], [0.0, 1.0, 0.5], [0.0, 0.0, 1.0]]])  # one pixel whose centre looks along d
-    tensors = (
-        geometry.means,
-        geometry.log_scales,
-        geometry.quats,
-        form.W1,
-        form.b1,
-        form.w2,
-        form.b2,
-        torch.ones(1, 1).double(),
-    )
-    drawn = neuprim.rasterize(*tensors, viewmat[None], K, 1, 1, omega0=OMEGA0, backend="reference", alpha_max=0.9999)
+    tensors = {**geometry.tensors(), **form.tensors(), "colors": torch.ones(1, 1).double()}
+    settings = {"backend": "reference", "alpha_max": 0.9999}
+    drawn = neuprim.rasterize(tensors, viewmat[None], K, (1, 1), omega0=OMEGA0, **settings)
     closed = -math.log1p(-float(drawn.alpha))
 
     plt.rcParams.update({"font.size": 9, "axes.spines.top": False, "axes.spines.right": False})

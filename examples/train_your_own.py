@@ -15,10 +15,17 @@ SIZE, COUNT, NEURONS, VIEWS = 32, 60, 4, 6
 
 def truth(viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
     """Images (C, H, W, 3) of a ball of radius 0.7 round the origin, coloured by its own wavy density, on white."""
-    ball = [torch.zeros(1, 3), torch.full((1, 3), 0.7).log(), torch.tensor([[1.0, 0.0, 0.0, 0.0]])]
-    waves = [torch.tensor([[[0.3, 0.1, 0.0]]]), torch.zeros(1, 1), torch.tensor([[2.0]]), torch.tensor([[1.5]])]
-    red = torch.tensor([[0.9, 0.3, 0.1]])
-    return neuprim.rasterize(*ball, *waves, red, viewmats, Ks, SIZE, SIZE, backgrounds=torch.ones(3)).rgb
+    ball = {
+        "means": torch.zeros(1, 3),
+        "log_scales": torch.full((1, 3), 0.7).log(),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "W1": torch.tensor([[[0.3, 0.1, 0.0]]]),
+        "b1": torch.zeros(1, 1),
+        "w2": torch.tensor([[2.0]]),
+        "b2": torch.tensor([[1.5]]),
+        "colors": torch.tensor([[0.9, 0.3, 0.1]]),
+    }
+    return neuprim.rasterize(ball, viewmats, Ks, (SIZE, SIZE), backgrounds=torch.ones(3)).rgb
 
 
 def train(steps: int = 200) -> list[float]:
@@ -29,7 +36,7 @@ def train(steps: int = 200) -> list[float]:
     Ks = torch.tensor([[1.5 * SIZE, 0.0, SIZE / 2], [0.0, 1.5 * SIZE, SIZE / 2], [0.0, 0.0, 1.0]]).expand(VIEWS, 3, 3)
     images = truth(viewmats, Ks)
 
-    primitives = {  # in the order of rasterize's arguments
+    primitives = {
         "means": torch.rand(COUNT, 3) - 0.5,
         "log_scales": torch.full((COUNT, 3), 0.2).log(),
         "quats": torch.randn(COUNT, 4),
@@ -54,7 +61,7 @@ def train(steps: int = 200) -> list[float]:
     )
     losses = []
     for step in range(steps):
-        frames = neuprim.rasterize(*primitives.values(), viewmats, Ks, SIZE, SIZE, backgrounds=torch.ones(3))
+        frames = neuprim.rasterize(primitives, viewmats, Ks, (SIZE, SIZE), backgrounds=torch.ones(3))
         loss = (frames.rgb - images).abs().mean()
         optimizer.zero_grad()
         loss.backward()

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Pairs
 from neuprim.core.model.primitives import Lowered
 
 

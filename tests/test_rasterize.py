@@ -36,12 +36,19 @@ def arguments(count: int = 30, seed: int = 7, cameras: list[Camera] | None = Non
     return {**scenes.tensors(count, seed=seed, **kw), "viewmats": views, "Ks": Ks, "width": WIDTH, "height": HEIGHT}
 
 
+def rasterize(width: int = WIDTH, height: int = HEIGHT, **given: Any) -> Rasterized:
+    """The call of :func:`arguments`, in which primitive tensors and other arguments are mixed."""
+    names = {"log_gain", *scenes.tensors(1)} & given.keys()
+    primitives = {name: given.pop(name) for name in sorted(names)}
+    return neuprim.rasterize(primitives, given.pop("viewmats"), given.pop("Ks"), (width, height), **given)
+
+
 @pytest.mark.parametrize("backend", BACKENDS)
 @pytest.mark.parametrize("channels", [1, 3, 7])
 def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> None:
     a = arguments(channels=channels)
     backgrounds = torch.rand(3, channels, generator=torch.Generator().manual_seed(0))
-    out = neuprim.rasterize(**a, backgrounds=backgrounds, **by(backend), depth=True, near=0.05)
+    out = rasterize(**a, backgrounds=backgrounds, **by(backend), depth=True, near=0.05)
     assert isinstance(out, Rasterized) and out.depth is not None
     assert out.rgb.shape == (3, HEIGHT, WIDTH, channels) and out.alpha.shape == out.depth.shape == (3, HEIGHT, WIDTH)
     assert out.rgb.dtype == torch.float32 and [s.backend for s in out.stats] == [backend] * 3
@@ -54,7 +61,7 @@ def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> No
             and torch.equal(out.alpha[c], one.alpha)
             and torch.equal(out.depth[c], one.depth)
         )  # type: ignore[arg-type]
-    shared = neuprim.rasterize(**a, backgrounds=backgrounds[0], **by(backend), near=0.05)
+    shared = rasterize(**a, backgrounds=backgrounds[0], **by(backend), near=0.05)
     assert (
         torch.equal(shared.rgb[0], out.rgb[0]) and not torch.equal(shared.rgb[1], out.rgb[1]) and shared.depth is None
     )
@@ -64,12 +71,12 @@ def test_equals_the_renderer_camera_by_camera(backend: str, channels: int) -> No
 def test_edges_and_gains_are_those_of_a_model(backend: str) -> None:
     a = arguments()
     log_gain = torch.linspace(-1, 1, 30)[:, None].requires_grad_()
-    hard = neuprim.rasterize(**a, **by(backend)).rgb
+    hard = rasterize(**a, **by(backend)).rgb
     for edge in (1, 2):
-        soft = neuprim.rasterize(**a, edge=edge, log_gain=log_gain, **by(backend))
+        soft = rasterize(**a, edge=edge, log_gain=log_gain, **by(backend))
         by_hand = {**a, "w2": a["w2"] * log_gain.exp(), "b2": a["b2"] * log_gain.exp()}
-        assert torch.equal(neuprim.rasterize(**by_hand, edge=edge, **by(backend)).rgb, soft.rgb)
-        assert torch.equal(neuprim.rasterize(**a, edge=edge, log_gain=log_gain[:, 0], **by(backend)).rgb, soft.rgb)
+        assert torch.equal(rasterize(**by_hand, edge=edge, **by(backend)).rgb, soft.rgb)
+        assert torch.equal(rasterize(**a, edge=edge, log_gain=log_gain[:, 0], **by(backend)).rgb, soft.rgb)
         assert not torch.allclose(soft.rgb, hard, atol=1e-2)
         (grad,) = torch.autograd.grad(soft.rgb.sum(), log_gain)
         assert float(grad.abs().max()) > 1e-3
@@ -82,7 +89,7 @@ def grads(backend: str, names: list[str], dtype: torch.dtype) -> dict[str, Tenso
         a[k] = a[k].to(dtype)
     for k in names:
         a[k] = a[k].clone().requires_grad_()
-    out = neuprim.rasterize(**a, **by(backend), alpha_min=0.0, transmittance_min=0.0)
+    out = rasterize(**a, **by(backend), alpha_min=0.0, transmittance_min=0.0)
     g = torch.Generator().manual_seed(1)
     (out.rgb * torch.randn(out.rgb.shape, generator=g).to(dtype)).sum().backward()
     return {k: a[k].grad for k in names}
@@ -109,7 +116,7 @@ def test_poses_intrinsics_and_backgrounds_against_finite_differences() -> None:
         o, i = torch.zeros_like(fx), torch.ones_like(fx)
         Ks = torch.stack([fx, o, cx, o, fy, cy, o, o, i], -1).reshape(2, 3, 3)
         knobs = {"alpha_min": 1e-9, "depth_floor": 1e-14, "near": 0.05, "depth": True, "backend": "reference"}
-        out = neuprim.rasterize(**{**a, "viewmats": viewmats, "Ks": Ks}, backgrounds=backgrounds, **knobs)
+        out = rasterize(**{**a, "viewmats": viewmats, "Ks": Ks}, backgrounds=backgrounds, **knobs)
         assert out.depth is not None
         return (torch.cat([out.rgb, out.alpha[..., None], out.depth[..., None]], -1) * w).sum()
 
@@ -129,19 +136,19 @@ def test_intrinsics_have_no_silent_zero_gradient(backend: str) -> None:
     a = arguments()
     a["Ks"].requires_grad_()
     with pytest.raises(BackendUnavailable, match=r'Ks requires a gradient.*pass backend="reference" or Ks\.detach\(\)'):
-        neuprim.rasterize(**a, backend=backend)
+        rasterize(**a, backend=backend)
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_no_cameras_and_no_primitives(backend: str) -> None:
     a = arguments(cameras=[])
     a["means"].requires_grad_()
-    none = neuprim.rasterize(**a, **by(backend), depth=True)
+    none = rasterize(**a, **by(backend), depth=True)
     assert none.rgb.shape == (0, HEIGHT, WIDTH, 3) and none.alpha.shape == (0, HEIGHT, WIDTH) and none.stats == ()
     assert none.depth is not None and none.depth.shape == (0, HEIGHT, WIDTH)
     none.rgb.sum().backward()
     assert a["means"].grad is not None and a["means"].grad.abs().max() == 0
-    empty = neuprim.rasterize(**arguments(0), **by(backend), backgrounds=torch.tensor([0.5, 0.25, 1.0]))
+    empty = rasterize(**arguments(0), **by(backend), backgrounds=torch.tensor([0.5, 0.25, 1.0]))
     assert (
         torch.equal(empty.rgb, torch.tensor([0.5, 0.25, 1.0]).expand(3, HEIGHT, WIDTH, 3))
         and empty.alpha.abs().max() == 0
@@ -151,7 +158,7 @@ def test_no_cameras_and_no_primitives(backend: str) -> None:
 def test_population_statistics_come_back_per_camera() -> None:
     a = arguments()
     a["means"].requires_grad_()
-    out = neuprim.rasterize(**a)
+    out = rasterize(**a)
     error = torch.ones(3, HEIGHT, WIDTH)
     error[1] = 0.5
     tallies = out.request_contributions(error)
@@ -204,7 +211,7 @@ BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
     "Ks last row": (changed("Ks", (0, 2, 2), 2.0), DataError,
         r"Ks\[0\] has last row \[0\.0, 0\.0, 2\.0\]; expected \[0, 0, 1\]"),
     "Ks focal": (changed("Ks", (0, 1, 1), -5.0), DataError, r"Ks\[0\] has focal lengths .*fy=-5\.0; expected positive"),
-    "width": (put("width", 0), DataError, r"width has value 0; expected a positive int"),
+    "width": (put("width", 0), DataError, r"size has value \(0, 30\); expected two positive ints"),
     "edge": (put("edge", 3), DataError, r"edge has value 3; expected 0, 1 or 2"),
     "log_gain": (put("log_gain", torch.zeros(29)), DataError,
         r"log_gain has shape \(29,\); expected \(30, 1\) or \(30,\)"),
@@ -220,8 +227,8 @@ def test_bad_input_is_named(name: str) -> None:
     change, error, message = BAD[name]
     a = {**arguments(), "omega0": 30.0, "backgrounds": None}
     change(a)
-    with pytest.raises(error, match=f"^r(asterize: .*|enderer.){message}"):
-        neuprim.rasterize(**a)
+    with pytest.raises(error, match=f"^(r(asterize: .*|enderer.))?{message}"):
+        rasterize(**a)
 
 
 # ---------------------------------------------------------------- the package, the example
@@ -235,4 +242,3 @@ def test_importing_the_package_stays_light_and_the_name_stays_a_function() -> No
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert done.returncode == 1 and "AttributeError: module 'neuprim' has no attribute 'nothing'" in done.stderr
     assert inspect.isfunction(neuprim.rasterize)
-    assert list(inspect.signature(neuprim.rasterize).parameters)[:2] == ["means", "log_scales"]

@@ -18,12 +18,11 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.metrics import psnr
-from neuprim.core.model.geometry import quaternion_to_matrix
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Pairs, quaternion_to_matrix
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import render_lowered
 from neuprim.core.render.near_plane import resolve_near
-from neuprim.core.render.reference.rays import pixel_directions, screen_boxes
+from neuprim.core.render.reference.backend import pixel_directions, screen_boxes
 from neuprim.core.settings import RenderSettings, SortOrder
 
 Keep = Literal["opacity", "density"]

@@ -13,8 +13,7 @@ from neuprim.conformance.task_under_test import EXACT, TaskUnderTest
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import View
 from neuprim.core.model.fields import ColourField, Conditions, Field, Shading
-from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Geometry, Pairs
 from neuprim.core.model.primitives import ActiveSet, Primitives
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.model.schema import ParameterSpec, Params

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, sequence, write_vdb
+from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, vdb_sequence, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.density_grid import voxels_in_box
 from neuprim.core.volumes.density_truth import DensityTruth, TruthFrame, VolumeSource
@@ -41,7 +41,7 @@ def open_ground_truth(path: str, volume: Callable[[], VolumeSource | None], worl
         return truth, "ground truth: the scene's own volumes"
     if not place.exists():
         raise DataError(f"--against {path}: no such file or folder; expected .vdb files, or scene for the scene's own")
-    frames = list(sequence(place).frames) if place.is_dir() else [VdbFrame(0, place)]
+    frames = list(vdb_sequence(place).frames) if place.is_dir() else [VdbFrame(0, place)]
     if _written_by_neuprim(frames[0].path):
         return VdbGroundTruth(frames, world), f"ground truth: {path}, written by neuprim in scene units"
     scene = volume()

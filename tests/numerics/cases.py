@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Any
 
 import torch
@@ -17,9 +18,9 @@ from tests import scenes
 DEFAULT = RenderSettings(depth=True)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Case:
-    """One frame: tensors of a model, a camera, settings (with the order), and the exponent of the density's edge."""
+    """One frame: tensors of a model, a camera, settings (with the order), and the density's edge; equal if the same."""
 
     tensors: dict[str, Tensor]
     camera: Camera
@@ -94,17 +95,18 @@ NETWORK: dict[str, tuple[Knobs, Knobs, Knobs]] = {
 """The same for colour networks. ``spread``, ``axes`` and ``denser`` change the model, see :func:`make_case`."""
 
 
+@cache
 def make_case(name: str, edge: int = 0, sort: str = "center") -> Case:
-    """Build a case by name, e.g. ``"inside"`` or ``"network: inside"``."""
+    """Build a case by name, e.g. ``"inside"`` or ``"network: inside"``; once, so that backends share its reference."""
     kind, _, rest = name.partition(": ")
     if kind == "network":
         model, view, knobs = NETWORK[rest]
         model = {"seed": 7, "hidden": 8, **model}
-        size, settings = {"width": 40, "height": 29}, RenderSettings()
+        size, settings = {"width": 36, "height": 25}, RenderSettings()
     else:
         model, view, knobs = CONSTANT[name]
         model = {"seed": 7, **model}
-        size, settings = {"width": 48, "height": 35}, DEFAULT
+        size, settings = {"width": 38, "height": 28}, DEFAULT
     spread, axes, denser = model.pop("spread", 1.0), model.pop("axes", None), model.pop("denser", 1.0)
     t = scenes.tensors(**model)
     t["means"] *= 0.1 if name == "one primitive" else spread

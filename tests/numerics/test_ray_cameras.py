@@ -13,8 +13,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
-from neuprim.core.render.reference.backend import _Prepared
-from neuprim.core.render.reference.rays import frame_rays, pixel_directions
+from neuprim.core.render.reference.backend import _Prepared, frame_rays, pixel_directions
 from tests import scenes
 
 EYE = torch.eye(4, dtype=torch.float64)

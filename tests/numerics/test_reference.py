@@ -12,7 +12,7 @@ from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
-from neuprim.core.render.reference.rays import pixel_directions
+from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
 from tests.backends import BACKENDS, FAST, by
 from tests.numerics.cases import case

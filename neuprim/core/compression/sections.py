@@ -137,7 +137,7 @@ def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarra
 
 
 def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
-    """Decode a section: (count, *shape) float32 of ``content`` of :func:`content_size` bytes, or raise CorruptSection."""
+    """Decode a section: (count, *shape) float32 of ``content``, :func:`content_size` bytes, or raise CorruptSection."""
     planes = _Planes(content)
     if section.coding == ROTATIONS:
         scheme = _rotations(section)

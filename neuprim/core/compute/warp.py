@@ -1,8 +1,7 @@
 """Warp as the kernels need it, and the only place that launches one of them.
 
 Making arrays of tensors and packing them takes longer than the kernels of a small frame, so a kernel's launch is
-recorded
-once on each device, and its arguments are written over.
+recorded once on each device, and its arguments are written over.
 """
 
 from __future__ import annotations

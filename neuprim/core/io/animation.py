@@ -20,8 +20,8 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix picks the format; atomic.
 
     GIF rounds frame times to hundredths of a second. MP4 is H.264 with even sizes (an odd last row or column is
-    repeated),
-    RGB only. Raises DataError for frames, suffix or rate, and BackendUnavailable for MP4 without the package ``av``.
+    repeated), RGB only. Raises DataError for frames, suffix or rate, and BackendUnavailable for MP4 without the package
+    ``av``.
     """
     _check_rate(path, len(frames), fps)
     shapes = sorted({tuple(f.shape) for f in frames})

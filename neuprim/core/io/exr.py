@@ -169,7 +169,7 @@ class ExrChannel:
 
 
 def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str] | None = None) -> None:
-    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``; not clamped."""
+    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``."""
     error = None if names is None else channel_name_error(names)
     if error:
         raise DataError(f"{path}: names{error}")

@@ -79,9 +79,8 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     """Structural similarity, the mean over pixels and channels of kornia's SSIM map, in -1..1 and 1 for equal images.
 
     An 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only positions where the window lies inside the
-    image
-    ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data range
-    L.
+    image ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data
+    range L.
     """
     first, second = matched(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -97,8 +96,7 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
     """Structural similarity as the tools of 3D Gaussian splatting count it, for comparing with their tables.
 
     As :func:`ssim` of values 0 to 1, but every pixel has a whole window, and beyond the image both are black. The mean
-    is
-    mostly higher. Nothing is quantised, as those tools do.
+    is mostly higher. Nothing is quantised, as those tools do.
     """
     first, second = matched(rendered, truth)
     border = SSIM_WINDOW // 2

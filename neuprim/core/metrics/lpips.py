@@ -9,14 +9,16 @@ from __future__ import annotations
 import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.metrics.image import matched
 
 
@@ -166,3 +168,25 @@ def _fitting(network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str,
     return Lpips(
         network, weights, biases, tuple(part("linear", i, 1, l.outputs, 1, 1).flatten() for i, l in enumerate(taps))
     )
+
+
+PIXELS_PER_DEGREE = 67.0  # the authors' default: a 0.7 m wide screen of 3840 pixels at 0.7 m
+
+
+def flip_available() -> bool:
+    """Whether the package ``flip-evaluator`` is installed."""
+    return find_spec("flip_evaluator") is not None
+
+
+def flip(rendered: Tensor, truth: Tensor) -> float:
+    """Mean LDR-FLIP of two (H, W, 3) display-referred sRGB images, clamped to 0..1: 0 for equal ones to 1."""
+    try:
+        from flip_evaluator import evaluate
+    except ImportError as error:
+        raise BackendUnavailable(
+            f"FLIP needs the package flip-evaluator ({error}); pip install 'neuprim[flip]'"
+        ) from error
+    first, second = (
+        np.ascontiguousarray(x.clamp(0.0, 1.0).numpy(), dtype=np.float32) for x in matched(rendered, truth)
+    )
+    return float(evaluate(second, first, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE})[1])

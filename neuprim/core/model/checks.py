@@ -6,6 +6,7 @@ any mix, dense and all on one device; strides do not matter.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Any
 
@@ -13,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.errors import FormError
+from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.fields import (
     ColourField,
     Constant,
@@ -191,3 +192,30 @@ def check_halves(
     names = ("means", "log_scales", "quats")
     rows, stored = ({name: getattr(g, name) for name in names} for g in (where, place))
     return mask, check_tensors(halves, like, who), check_tensors(rows, stored, who)
+
+
+def non_finite_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
+    """Return the error for primitive ``row``, which is not finite or leaves the range of float32."""
+    for name, value in tensors.items():
+        if not bool(torch.isfinite(value[row]).all()):
+            return NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].flatten()[:8].tolist()}")
+    if not bool(tensors["quats"][row].any()):
+        return NonFiniteError(f"quats of primitive {row} is zero; expected a non-zero quaternion")
+    scale = tensors["log_scales"][row].tolist()
+    return NonFiniteError(
+        f"log_scales of primitive {row} is {scale}: the semi-axes or weights leave the range of float32"
+    )
+
+
+def refuse_non_finite_colours(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
+    """Raise NonFiniteError for colours, which the per-primitive kernels do not read; waits for a GPU.
+
+    ``named``: all tensors of the frame; the first of them that is not finite is the cause.
+    """
+    total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
+    if math.isfinite(total):  # one number, so that a GPU is waited for once
+        return
+    for value in tensors.values():
+        bad = ~torch.isfinite(value).reshape(len(value), -1).all(dim=1)
+        if bool(bad.any()):
+            raise non_finite_error(tensors if named is None else named, int(bad.nonzero()[0]))

@@ -47,14 +47,12 @@ class ConditionSpec:
     Attributes:
         name: of the flag, and the key in a frame's conditions.
         range: lowest and highest value of every element. Numbers that are not finite are refused; beyond the range
-            there
-            is a warning, or with ``strict`` a refusal.
+            there is a warning, or with ``strict`` a refusal.
         parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
             :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()``, lists and ranges are parsed before
             (:mod:`neuprim.core.conditions`).
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
-        in_frames: (text, count) -> the text that means the same in so many frames, where the text does not say how
-            many.
+        in_frames: (text, count) -> the text that means the same in so many frames, if it does not say how many.
         place: for positions: ``parse`` of a text in the world of the user's files, (text, world) -> scene units.
     """
 
@@ -159,8 +157,7 @@ class DensityField(Field):
     """How much light a point absorbs.
 
     ``exact_split``: children continue their parent's sigma inside their own support. Where a family is too small for
-    that,
-    such as Gaussians, they must hold their parent's mass, the integral of sigma over space.
+    that, such as Gaussians, they must hold their parent's mass, the integral of sigma over space.
     """
 
     exact_split: bool = True

@@ -14,8 +14,7 @@ from torch import Tensor
 
 from neuprim.core.errors import FormError
 from neuprim.core.model.edge import EDGES, chord_integral, sinc
-from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Geometry, Pairs
 from neuprim.core.model.tensors import MOST_UNITS, Shaped, Shapes, Sizes, function_fault, labelled, number_fault
 
 # ---------------------------------------------------------------- closed forms of density
@@ -110,8 +109,7 @@ class CustomDensity(Shaped):
     """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) rows, (M, 3) ray origins and unit directions and (M,)
-    chord
-    ends in scene units, and returns the (M,) optical depths.
+    chord ends in scene units, and returns the (M,) optical depths.
     """
 
     edge: ClassVar[int] = 0
@@ -226,8 +224,7 @@ class RayNet(Shaped):
 
     with x_m the middle of the ray's chord, after the near plane's cut. One hidden layer of H cosine units, H = 0 to
     :data:`MOST_UNITS`. What does not change within a primitive (view direction, light) a field folds into ``bias``,
-    ``Wout``
-    and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
+    ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
 
     Attributes:
         Wx: (N, H, 3) on scene axes, radians per m; bias: (N, H), radians.

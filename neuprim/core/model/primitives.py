@@ -22,11 +22,11 @@ from neuprim.core.model.checks import (
     check_shape,
     check_start,
     method,
+    non_finite_error,
     source,
 )
 from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
-from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, Pairs
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Sizes, function_fault
 from neuprim.core.settings import RenderSettings
@@ -56,6 +56,27 @@ class Lowered:
         if self.rows is not None:
             check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
         self.check_frame(viewmat, background)
+
+    def check_finite(self) -> None:
+        """Raise NonFiniteError for the first primitive with a number, quaternion or scale that cannot be drawn.
+
+        The kernels check the same while they prepare a frame.
+        """
+        g = self.geometry
+        if not g.count:
+            return
+        tensors = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats}
+        tensors |= self.density.tensors() | self.colour.tensors()
+        with torch.no_grad():
+            logs = g.log_scales.double()
+            top = logs.amax(dim=-1)
+            bad = (g.quats == 0).all(dim=-1) | (top.exp() > torch.finfo(torch.float32).max) | (top.exp() == 0)
+            bad |= ((logs - top[:, None]).exp() == 0).any(dim=-1)
+            for value in tensors.values():
+                if value.numel():
+                    bad |= ~torch.isfinite(value.reshape(g.count, -1)).all(dim=1)
+            if bool(bad.any()):
+                raise non_finite_error(tensors, int(bad.nonzero()[0]))
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
         """Check what :meth:`Primitives.lower` has not checked; raises as :meth:`check`."""

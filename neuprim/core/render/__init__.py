@@ -13,13 +13,13 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
-from neuprim.core.errors import ConfigError
-from neuprim.core.model.fields import Constant, Cosine
+from neuprim.core.errors import ConfigError, NonFiniteError
+from neuprim.core.model.fields import Constant, Cosine, LoweredDensity
+from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
 from neuprim.core.render.draw import draw_samples, on_device, with_shade
 from neuprim.core.render.near_plane import resolve_near
-from neuprim.core.render.non_finite import refuse_non_finite
 from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
 from neuprim.core.settings import RenderSettings
 
@@ -35,6 +35,7 @@ __all__ = [
     "probe_backend",
     "render",
     "render_lowered",
+    "render_slabs",
 ]
 
 _PROBE_ERROR = 1e-5  # float32 with fast functions errs by less than 1e-6 here
@@ -85,7 +86,7 @@ def _draw_checked(
     settings = resolve_near(settings, lowered.geometry.means, [camera])
     backend = choose_backend(lowered, settings, camera)
     if not backend.checks:
-        refuse_non_finite(lowered)
+        lowered.check_finite()
     draw = backend.load()
     place = backend.drawing_device(settings)
     if place != lowered.kind:
@@ -127,3 +128,42 @@ def probe_backend(name: str) -> str | None:
     missed = 3.0 * math.sin(math.atan(math.hypot(aside, aside)))  # how far from the centre its ray passes
     expected = 1.0 - math.exp(-2.0 * math.sqrt(1.0 - missed**2))  # density 1 along the chord of a unit sphere
     return None if abs(middle - expected) < _PROBE_ERROR else f"drew {middle:.6f} where {expected:.6f} was expected"
+
+
+def render_slabs(
+    geometry: Geometry, density: LoweredDensity, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
+) -> tuple[Tensor, Tensor]:
+    """Return (S, H, W) opacities and mean depths of the slabs that have primitives, in their order; no gradients.
+
+    They are drawn in one frame where the backend can, else one by one: the same bits.
+
+    Args:
+        slabs: (N,) slab of each primitive, 0 to ``count`` - 1, on the primitives' device.
+        settings: with ``depth``.
+    """
+    with torch.no_grad():
+        black = Constant(torch.zeros(geometry.count, 1, device=geometry.means.device))
+        lowered = Lowered(geometry, density, black)
+        lowered.check(camera.viewmat, None)
+        backend = choose_backend(lowered, settings, camera)
+        plain = settings.sort == "center" and settings.samples == 1 and backend.drawing_device(settings) == lowered.kind
+        draw_together = backend.slabs() if plain else None
+        if draw_together is not None:
+            return draw_together(lowered, slabs, count, camera, settings)
+        order = torch.argsort(slabs, stable=True)
+        geometry, density, images = geometry[order], density.rows(order), []
+        ends = torch.bincount(slabs, minlength=count).cumsum(0).tolist()
+        for first, end in zip([0, *ends], ends, strict=False):
+            if first == end:
+                continue
+            slab = slice(first, end)
+            alone = Lowered(geometry[slab], density.rows(slab), Constant(black.rgb[slab]))
+            try:
+                output = render_lowered(alone, camera, settings)
+            except NonFiniteError:
+                lowered.check_finite()
+                raise
+            assert output.depth is not None
+            images.append((output.alpha, output.depth))
+        opacities, depths = (torch.stack(found) for found in zip(*images, strict=True))
+        return opacities, depths

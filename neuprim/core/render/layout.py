@@ -7,6 +7,10 @@ but float64 rows and gradient rows with these columns. Float32 bounds were found
 
 from __future__ import annotations
 
+import numpy as np
+
+from neuprim.core.model.edge import EDGES
+
 # ---- One primitive, as a pixel kernel sees it (method: "float64 preparation, float32 pixels").
 # The ray of pixel offset (du, dv) from the anchor pixel (UX, UY) is, in whitened space with t in units of m,
 #   x(t) = (XA + TC G) + t e,  G = du EX + dv EY,  e = E0 + G.
@@ -40,3 +44,33 @@ UNBOUNDED = 1e30  # half axes of a silhouette that is not an ellipse
 
 TILE = 16
 PIXELS = TILE * TILE
+
+VISIBLE, CULLED, NON_FINITE = 0, 1, 2
+FLOAT32_MAX = 3.0e38
+
+# ---- A primitive is drawn in float64 where one of these is exceeded.
+FLOAT64_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
+FLOAT64_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
+FLOAT64_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
+FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
+FLOAT64_RATIO = 256.0  # of the axes; for the gradients
+FLOAT64_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
+CUT = 1e-3  # of the reach: float32 may find a chord cut that float64 does not
+
+ANCHOR_RADII = 1.5  # a centre this many radii in front of the camera is its own anchor, even where the near plane cuts
+
+# ---- The visible extent of an ellipsoid. Rays close to the rim cross too little of it to reach alpha_min.
+# A chord whose point nearest to the centre has |y|^2 = 1 - D crosses (1 - |y|^2)^p with an integral of N_p D^p times
+# half its length, which is at most s D^(1/2), with s the longest half chord of the view's rays. No cosine exceeds its
+# amplitude, so an optical depth is at most F N_p s D^(p + 1/2), F = b2 + sum |w2|. Rays below the depth of alpha_min
+# count as empty in every backend; they pass outside the same ellipsoid, smaller by r = (1 - D)^(1/2). The image and
+# every gradient stay the same but for rounding.
+VISIBLE_SHARE = 0.99  # of the depth of alpha_min that a chord must be able to reach, which leaves room for float32
+MIN_RIM = 0.01  # a smaller D is not worth a smaller silhouette, and float32 knows such D least
+RIM_POWERS = (2.0, 2 / 3, 2 / 5)  # 1/(p + 1/2)
+MIN_RIM_SHARES = tuple(MIN_RIM ** (p + 0.5) for p in EDGES)  # share of the largest depth below which D < MIN_RIM
+
+
+def min_visible_depth(alpha_min: float) -> float:
+    """Return the optical depth that a chord must reach to be drawn: that of ``alpha_min``, but for rounding."""
+    return -float(np.log1p(-alpha_min)) * VISIBLE_SHARE

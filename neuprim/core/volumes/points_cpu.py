@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.rotation import rotation, rotation_backward
+from neuprim.core.model.rows import rotation, rotation_backward
 
 _PARTIAL_SUMS = 8  # groups of primitives with a sum of their own, so that results do not depend on the thread count
 _ROWS_PER_JOB, _PREPARED_ROWS_PER_JOB = 64, 1024

@@ -11,8 +11,8 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.operation import apply_autograd
-from neuprim.core.model.densities.gain_cpu import scale_backward
 from neuprim.core.model.edge import fade
+from neuprim.core.model.rows import scale_backward
 
 WINDOW_EDGE = 2  # exponent of the window in time
 

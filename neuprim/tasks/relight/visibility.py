@@ -27,8 +27,7 @@ from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.fields import LoweredDensity, Shade
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.render import RenderSettings
-from neuprim.core.render.slabs import render_slabs
+from neuprim.core.render import RenderSettings, render_slabs
 
 SIZE = 192  # pixels of the depth images, square
 LAYERS = 4  # of equal depth; more of them separate depths better and take longer

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from numba import njit
 
-from neuprim.core.compute import views
-from neuprim.core.compute.views import borrow_array, compress16, copy16
+from neuprim.core.compute import kernels
+from neuprim.core.compute.kernels import borrow_array, compress16, copy16
 
 
 def test_sixteen_floats_are_read_before_they_are_written() -> None:
@@ -29,9 +29,9 @@ def test_those_of_sixteen_floats_that_count_are_moved_together(
 ) -> None:
     """By the instruction and one by one, in place, and whatever the flags: not numbers count, and zeros of either sign
     do not."""
-    if compresses and not views._COMPRESSES:
+    if compresses and not kernels._COMPRESSES:
         pytest.skip("this version of LLVM is not asked for the instruction")
-    monkeypatch.setattr(views, "_COMPRESSES", compresses)
+    monkeypatch.setattr(kernels, "_COMPRESSES", compresses)
 
     @njit
     def keep(array: Any, at: Any, first: Any, flags: Any) -> Any:

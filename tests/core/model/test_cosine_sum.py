@@ -11,8 +11,7 @@ from neuprim.conformance.field_checks import points_inside, random_chords
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Cosine
-from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Geometry, Pairs
 from neuprim.core.model.tensors import MOST_UNITS
 from tests import scenes
 

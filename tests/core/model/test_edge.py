@@ -12,8 +12,7 @@ from neuprim.config import compose
 from neuprim.core.model.densities.cosine import CosineDensity, cosine_density
 from neuprim.core.model.edge import EDGES, NORMS, chord_integral, profile, spherical_bessel
 from neuprim.core.model.fields import Cosine
-from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Geometry, Pairs
 from neuprim.core.model.schema import InitContext
 from tests import scenes
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, RayNet
-from neuprim.core.model.pairs import Pairs
+from neuprim.core.model.geometry import Pairs
 from neuprim.core.model.primitives import Lowered
 from tests import scenes
 

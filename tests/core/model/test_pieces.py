@@ -14,8 +14,14 @@ from neuprim.core.errors import CheckpointError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Field, prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import count_numbers, nonzero_rows, removal_effect, zero_units
-from neuprim.core.model.sparse_storage import load_sparse, store_sparse
+from neuprim.core.model.prunable import (
+    count_numbers,
+    load_sparse,
+    nonzero_rows,
+    removal_effect,
+    store_sparse,
+    zero_units,
+)
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics

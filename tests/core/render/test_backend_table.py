@@ -119,7 +119,7 @@ def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: p
     K.requires_grad_()
 
     def draw() -> Any:
-        return neuprim.rasterize(**t, viewmats=camera.viewmat[None], Ks=K, width=8, height=6, backend="fake")
+        return neuprim.rasterize(t, camera.viewmat[None], K, (8, 6), backend="fake")
 
     with pytest.raises(BackendUnavailable, match=r'Ks requires a gradient, which backend="fake" .*backend="reference"'):
         draw()

@@ -130,11 +130,11 @@ def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:
     t = scenes.tensors(4)
     camera = scenes.camera(8, 6)
     K = torch.tensor([[[camera.fx, 0, camera.cx], [0, camera.fy, camera.cy], [0, 0, 1]]], dtype=torch.float64)
-    wanted = neuprim.rasterize(**t, viewmats=camera.viewmat[None], Ks=K, width=8, height=6)
+    wanted = neuprim.rasterize(t, camera.viewmat[None], K, (8, 6))
     away = {name: value.to(CARD).requires_grad_() for name, value in t.items()}
-    found = neuprim.rasterize(**away, viewmats=camera.viewmat[None].to(CARD), Ks=K.to(CARD), width=8, height=6)
+    found = neuprim.rasterize(away, camera.viewmat[None].to(CARD), K.to(CARD), (8, 6))
     assert found.rgb.device == CARD and torch.equal(found.rgb.detach().cpu(), wanted.rgb)
     found.rgb.sum().backward()
     assert away["means"].grad is not None and away["means"].grad.device == CARD
     with pytest.raises(DataError, match=r"^rasterize: W1 has device cpu; expected meta, as means has$"):
-        neuprim.rasterize(**{**away, "W1": t["W1"]}, viewmats=camera.viewmat[None], Ks=K, width=8, height=6)
+        neuprim.rasterize({**away, "W1": t["W1"]}, camera.viewmat[None], K, (8, 6))

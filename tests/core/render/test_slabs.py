@@ -11,8 +11,7 @@ from torch import Tensor
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Lowered
-from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.slabs import render_slabs
+from neuprim.core.render import RenderSettings, render_lowered, render_slabs
 from tests import scenes
 from tests.backends import BACKENDS
 
@@ -42,7 +41,7 @@ def test_each_is_what_it_is_alone(
         wanted.append(render_lowered(alone, camera, settings))
     frames = []
     genuine = render_lowered
-    monkeypatch.setattr("neuprim.core.render.slabs.render_lowered", lambda *a: frames.append(1) or genuine(*a))
+    monkeypatch.setattr("neuprim.core.render.render_lowered", lambda *a: frames.append(1) or genuine(*a))
     alphas, depths = render_slabs(low.geometry, low.density, slabs, COUNT, camera, settings)
     if backend != "reference" and sort == "center":
         assert not frames and not alphas[2].any() and not depths[2].any()

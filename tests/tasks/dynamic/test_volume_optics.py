@@ -12,7 +12,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import read_grid, scale_transform, sequence, write_vdb
+from neuprim.core.io.vdb import read_grid, scale_transform, vdb_sequence, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_cameras
 from neuprim.tasks.dynamic.volume.medium import black_body_rgb, black_body_xyz, build_medium
 from neuprim.tasks.dynamic.volume.optics import EMBERGEN_FIRE, OPTICS_PRESETS, Axis, Light, Optics
@@ -147,7 +147,7 @@ def test_normalisation(tmp_path: Path) -> None:
         )
         grid = dataclasses.replace(grid, origins=grid.origins + np.array(low, np.int32) * 8)
         write_vdb(tmp_path / f"f_{number}.vdb", [grid])
-    boxes = [b for f in sequence(tmp_path).frames if (b := read_grid(f.path, "density").world_bounds()) is not None]
+    boxes = [b for f in vdb_sequence(tmp_path).frames if (b := read_grid(f.path, "density").world_bounds()) is not None]
     bounds = np.stack([np.min(boxes, 0)[0], np.max(boxes, 0)[1]])
     norm = SceneNormalisation.from_bounds(bounds)
     scene = norm.to_scene(bounds)
@@ -176,7 +176,7 @@ def test_extinction_is_per_scene_unit() -> None:
 
 
 def test_a_real_fire_converges() -> None:
-    fire = sequence(real_folder("embergen_fire_a"))
+    fire = vdb_sequence(real_folder("embergen_fire_a"))
     position = [f.number for f in fire.frames].index(40)
     grids = {n: read_grid(fire.frames[position].path, n) for n in ("temperature", "flames")}
     boxes = [g.world_bounds() for g in grids.values() if g is not None]

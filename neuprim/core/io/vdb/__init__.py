@@ -6,8 +6,7 @@ be taken that its bytes do not pay for.
 
 from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, Grid, Tiles, scale_transform
 from neuprim.core.io.vdb.header import FileHeader, GridHeader, read_header
-from neuprim.core.io.vdb.read import LEAF_LIMIT, read_grid, read_grids
-from neuprim.core.io.vdb.sequence import Sequence, VdbFrame, sequence
+from neuprim.core.io.vdb.read import LEAF_LIMIT, VdbFrame, VdbSequence, read_grid, read_grids, vdb_sequence
 from neuprim.core.io.vdb.write import COMPRESSIONS, write_vdb
 
 __all__ = [
@@ -16,15 +15,15 @@ __all__ = [
     "LEAF_LIMIT",
     "Bounds",
     "FileHeader",
-    "VdbFrame",
     "Grid",
     "GridHeader",
-    "Sequence",
     "Tiles",
+    "VdbFrame",
+    "VdbSequence",
     "read_grid",
     "read_grids",
     "read_header",
     "scale_transform",
-    "sequence",
+    "vdb_sequence",
     "write_vdb",
 ]

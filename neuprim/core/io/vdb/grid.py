@@ -54,8 +54,7 @@ class Grid:
     """A float or vec3s grid.
 
     A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have
-    the
-    background value and are not active. Values that are not finite are kept and counted in :attr:`non_finite`.
+    the background value and are not active. Values that are not finite are kept and counted in :attr:`non_finite`.
     """
 
     name: str

@@ -10,6 +10,7 @@ p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaus
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 from typing import Annotated, Any
 
 import torch
@@ -18,7 +19,6 @@ from torch import Tensor
 from neuprim.core.model.cosine_sums import canonicalize_cosines, canonicalize_gain, prune_neurons, smaller_neuron_counts
 from neuprim.core.model.edge import EDGES, NORMS, fade
 from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
-from neuprim.core.model.footprint import gaussian_support
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
@@ -50,8 +50,7 @@ class CosineDensity(DensityField):
         gain: whether there is a log_gain, of its own learning rate.
 
     ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``; "paper" draws the offset
-    as
-    the authors do, which leaves half of all chords without a gradient. Raises ValueError for other arguments.
+    as the authors do, which leaves half of all chords without a gradient. Raises ValueError for other arguments.
     """
 
     init_settings = ("mode", "alpha")
@@ -140,7 +139,7 @@ def amplified(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, 
     """Return (w2, b2), (N, K) and (N, 1), times the gain exp(log_gain), (N, 1) or (N,)."""
     if log_gain is None:
         return w2, b2
-    from neuprim.core.model.densities.gain_cpu import fused_gain  # numba, loaded when first needed
+    from neuprim.core.model.rows import fused_gain  # numba, loaded when first needed
 
     return fused_gain(w2, b2.reshape(-1, 1), log_gain.reshape(-1, 1), GAIN_LIMIT)
 
@@ -204,3 +203,52 @@ def split_cosine(
         "w2": (params["w2"].double() * c[:, None]).to(params["w2"]),
         "b2": (params["b2"].double() * c[:, None]).to(params["b2"]),
     }
+
+
+_LOGITS = torch.linspace(-6, 6, 25, dtype=torch.float64)
+"""Of the opacities that are tabulated; beyond, the nearest counts."""
+_NODES, _FAR = 160, 5.0  # rings of the footprint, and where it ends: standard deviations
+_WIDTHS = (1.45, 4.0)  # where c is looked for
+_GOLDEN = (5**0.5 - 1) / 2
+
+
+def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[Tensor, Tensor]:
+    """(N,) c and (N,) tau, float64, of primitives for Gaussians of opacity ``alphas`` (N,), 0..1.
+
+    ``volume``: the Gaussians are densities in space, whose optical depth, not alpha, is a bell on the screen.
+    """
+    table = _table(edge, volume)
+    alphas = alphas.double().clamp(1e-9, 1 - 1e-9)
+    where = (torch.logit(alphas).clamp(float(_LOGITS[0]), float(_LOGITS[-1])) - _LOGITS[0]) / (_LOGITS[1] - _LOGITS[0])
+    row = where.floor().long().clamp(0, len(_LOGITS) - 2)
+    part = (where - row)[:, None]
+    found = table[row] * (1 - part) + table[row + 1] * part
+    return found[:, 0], -torch.log1p(-alphas) * found[:, 1].exp()
+
+
+@lru_cache
+def _table(edge: int, volume: bool) -> Tensor:
+    """(O, 2) c and log(tau / -log(1 - o)) for the tabulated opacities, by a golden section of c."""
+    r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
+    opacity = torch.sigmoid(_LOGITS)[:, None]
+    bell = (-r * r / 2).exp()
+    target = -torch.expm1(torch.log1p(-opacity) * bell) if volume else opacity * bell
+
+    def best(c: Tensor) -> tuple[Tensor, Tensor]:
+        """(O,) what is left of the squares, and log tau, for (O,) c."""
+        shape = (1 - (r / c[:, None]).square()).clamp_min(0) ** (edge + 0.5)
+        low, high = torch.full_like(c, -12.0), torch.full_like(c, 6.0)
+        for _ in range(40):
+            middle = (low + high) / 2
+            less = ((-torch.expm1(-middle.exp()[:, None] * shape) - target) * r).sum(1) < 0
+            low, high = torch.where(less, middle, low), torch.where(less, high, middle)
+        error = (-torch.expm1(-high.exp()[:, None] * shape) - target).square()
+        return (error * r).sum(1), high
+
+    low, high = (torch.full_like(_LOGITS, width) for width in _WIDTHS)
+    for _ in range(22):
+        left, right = high - _GOLDEN * (high - low), low + _GOLDEN * (high - low)
+        lower = best(left)[0] < best(right)[0]
+        low, high = torch.where(lower, low, left), torch.where(lower, right, high)
+    c = (low + high) / 2
+    return torch.stack([c, best(c)[1] - (-torch.log1p(-opacity[:, 0])).log()], 1)

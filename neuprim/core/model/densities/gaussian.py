@@ -129,10 +129,8 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
     """B(u, w) = integral of exp(-z^2) over [u - w, u + w], w >= 0, to a few ulp of itself; float64, differentiable.
 
     Three exact forms, each where it does not cancel (Abramowitz and Stegun 1964, 7.1 and 22.11): where the interval
-    holds
-    0, sqrt(pi)/2 (erf(w + u) + erf(w - u)); in one tail, sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)); where it is short,
-    the
-    Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
+    holds 0, sqrt(pi)/2 (erf(w + u) + erf(w - u)); in one tail, sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)); where it is
+    short, the Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
     """
     side = u.abs()
     both = torch.erf(w + u) + torch.erf(w - u)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.threads import parallel_for, resolve_threads
+from neuprim.core.model.checks import non_finite_error, refuse_non_finite_colours
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
@@ -21,12 +22,9 @@ from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.colour_net import Net, net_backward, prepare_net
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import Image, SavedForBackward, composite_tiles
-from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_wide
-from neuprim.core.render.cpu.prepare_backward import prepare_backward
+from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_backward, prepare_wide
 from neuprim.core.render.cpu.tiles import FrameArrays
 from neuprim.core.render.cpu.trigonometry import EDGE_TYPES
-from neuprim.core.render.limits import NON_FINITE, VISIBLE, min_visible_depth
-from neuprim.core.render.non_finite import non_finite_error, refuse_non_finite_colours
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.rasterize import (
     NET,
@@ -100,16 +98,16 @@ def _prepare(
     parameters = Parameters(*(arrays[name] for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
     projected = Projected.allocate(count, K)
-    view, least = _view(camera, viewmat, settings.near_plane, request.turns), min_visible_depth(settings.alpha_min)
+    view, least = _view(camera, viewmat, settings.near_plane, request.turns), P.min_visible_depth(settings.alpha_min)
     parallel_for(prepare, count, _PRIMITIVES_PER_CHUNK, threads, parameters, view, request.edge, least, projected)
-    bad = np.flatnonzero(projected.status == NON_FINITE)
+    bad = np.flatnonzero(projected.status == P.NON_FINITE)
     if bad.size:
         raise non_finite_error({name: torch.from_numpy(array) for name, array in arrays.items()}, int(bad[0]))
     in_float64, net_rows = projected.in_float64, None
     if "Wx" in arrays:
         net_rows, fast = prepare_net(np.arange(count), arrays, False, threads)
         in_float64 = in_float64 | fast
-    slots, which = np.full(count, -1, np.int32), np.flatnonzero(in_float64 & (projected.status == VISIBLE))
+    slots, which = np.full(count, -1, np.int32), np.flatnonzero(in_float64 & (projected.status == P.VISIBLE))
     slots[which] = np.arange(len(which), dtype=np.int32)
     wide = np.empty((len(which), projected.rows.shape[1]))
     parallel_for(

@@ -10,8 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import exact_kernel, inline, kernel
-from neuprim.core.compute.views import borrow_array, compress16, copy16, release_array
+from neuprim.core.compute.kernels import borrow_array, compress16, copy16, exact_kernel, inline, kernel, release_array
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.colour_net import ray_colour_gradient, ray_colours
@@ -245,8 +244,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
     """Fill the gradient rows of every pair of tiles ``start:stop``; returns the number of evaluated lanes.
 
     ``live``, ``first_lane``, ``depths``: :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of
-    these
-    tiles; the others as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    these tiles; the others as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     frame, colors, live, first_lane, depths = (
         lend_frame(frame),

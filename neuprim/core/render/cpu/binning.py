@@ -12,7 +12,6 @@ from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu.prepare import Projected
-from neuprim.core.render.limits import VISIBLE
 
 Array = np.ndarray[Any, Any]
 
@@ -35,8 +34,7 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
     """Front-to-back order; equal depths keep their index order.
 
     Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. Depths
-    that
-    agree to about 1e-9 of their value (1 million primitives) count as equal.
+    that agree to about 1e-9 of their value (1 million primitives) count as equal.
     """
     count = depth.shape[0]
     bits = max(int(count - 1).bit_length(), 1)
@@ -57,7 +55,7 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
     tiles, n = np.empty(4096, np.int32), 0
     for i in range(start, stop):
         before = n
-        if status[i] == VISIBLE:
+        if status[i] == P.VISIBLE:
             box = boxes[i]
             lo, hi = box[0] // P.TILE, (box[2] - 1) // P.TILE + 1
             hx, hy, skew = np.float64(spans[i, P.HX]), np.float64(spans[i, P.HY]), np.float64(spans[i, P.SKEW])

@@ -13,12 +13,11 @@ import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.model.rotation import rotation, rotation_backward
+from neuprim.core.model.rows import rotation, rotation_backward
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import phase_float64
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
-from neuprim.core.render.limits import FLOAT64_TURNS
 
 f = np.float32
 _TURNS = 1.0 / (2.0 * np.pi)
@@ -68,7 +67,7 @@ def _fill_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast)
             row[o + P.PHASE] = phase - np.rint(phase)
             for c in range(C):
                 row[o + P.NET_OUT + c] = Wout[i, c, j]
-            fast[n] |= square > FLOAT64_TURNS**2
+            fast[n] |= square > P.FLOAT64_TURNS**2
 
 
 def prepare_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:

@@ -101,33 +101,22 @@ def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _hard_neurons_float64(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron of a float64 row."""
+def _hard_neurons(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron; in ``V`` the gradients' products."""
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
         for k in range(n):
             r, s, v = _reduced(X, k, p, o)
-            sinc = sinc_turns(s * s)
+            sinc, c = sinc_turns(s * s), cos_turns(r * r)
+            if V is not None:
+                slope = dsinc_turns(s * s) * f(2) * s
             if abs(v) > 0.5:
                 sinc *= f(s / v)
-            S[L.FIELD + k] += f(p[o + P.AMPLITUDE]) * cos_turns(r * r) * sinc
-
-
-@inline
-def _hard_slopes_float64(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
-    """The same, and the three products per neuron that the gradients need."""
-    for m in range(neurons):
-        o = P.NEURONS + P.PER_NEURON * m
-        for k in range(n):
-            r, s, v = _reduced(X, k, p, o)
-            sinc, slope = sinc_turns(s * s), dsinc_turns(s * s) * f(2) * s
-            if abs(v) > 0.5:
-                sinc *= f(s / v)
-                slope = (cos_turns(s * s) - sinc) * f(1.0 / v)
-            c = cos_turns(r * r)
-            V[m, L.N_COS + k] = c * sinc
-            V[m, L.N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
-            V[m, L.N_DSINC + k] = c * slope
+                if V is not None:
+                    slope = (cos_turns(s * s) - sinc) * f(1.0 / v)
+            if V is not None:
+                V[m, L.N_COS + k], V[m, L.N_DSINC + k] = c * sinc, c * slope
+                V[m, L.N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
             S[L.FIELD + k] += f(p[o + P.AMPLITUDE]) * c * sinc
 
 
@@ -171,87 +160,57 @@ def _weight(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _soft_neurons(S, X, n, p, neurons, soft):  # type: ignore[no-untyped-def]
-    q, j, M = np.zeros(5), np.zeros(6), np.zeros(6)
-    for k in range(n):
-        mean = _weight(X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k], soft, q)
-        visible = mean > 0.0 and X[_HALF + k] > 0.0
-        S[L.FADE + k] = f(mean) if visible else f(0)
-        if not visible:
-            continue
-        total = 0.0
-        for m in range(neurons):
-            o = P.NEURONS + P.PER_NEURON * m
-            r, _, v = _reduced(X, k, p, o)
-            _moments(_PI2 * v, j, M)
-            even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]
-            total += p[o + P.AMPLITUDE] * (cos_turns(r * r) * even - TAU * r * sinc_turns(r * r) * odd)
-        S[L.FIELD + k] += f(total / mean)
-
-
-@inline
-def _soft_slopes(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
+def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
+    """The same of a soft edge, and FADE; with ``V`` also what gradients need of p q^(p - 1) and its moments."""
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
         D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]
         mean = _weight(D, shift, square, half, soft, q)
         visible = mean > 0.0 and half > 0.0
         S[L.FADE + k] = f(mean) if visible else f(0)
-        # of p q^(p - 1), whose moments with 1, u and u^2 the weight's own derivatives need
-        c0, c1, c2 = 1.0, 0.0, 0.0
-        if soft == 2:
-            c0, c1, c2 = 2.0 * (D - square * shift * shift), -4.0 * square * shift * half, -2.0 * square * half * half
-        offset = p[P.OFFSET]
-        rest[0] = offset * (c0 + c2 / 3.0)
-        rest[1] = offset * c1 / 3.0
-        rest[2] = offset * (c0 / 3.0 + c2 / 5.0)
-        total = 0.0
+        c0, c1, c2, total = 1.0, 0.0, 0.0, 0.0
+        if V is not None:
+            if soft == 2:
+                c0, c1 = 2.0 * (D - square * shift * shift), -4.0 * square * shift * half
+                c2 = -2.0 * square * half * half
+            offset = p[P.OFFSET]
+            rest[0], rest[1], rest[2] = offset * (c0 + c2 / 3.0), offset * c1 / 3.0, offset * (c0 / 3.0 + c2 / 5.0)
+            S[L.BY_D + k], S[L.BY_A + k], S[L.BY_TM + k] = f(0), f(0), f(0)
+            for m in range(neurons):
+                V[m, L.N_COS + k], V[m, L.N_SIN + k], V[m, L.N_DSINC + k] = f(0), f(0), f(0)
+        if not visible:
+            continue
         for m in range(neurons):
             o = P.NEURONS + P.PER_NEURON * m
-            V[m, L.N_COS + k], V[m, L.N_SIN + k], V[m, L.N_DSINC + k] = f(0), f(0), f(0)
-            if not visible:
-                continue
             r, _, v = _reduced(X, k, p, o)
             _moments(_PI2 * v, j, M)
             c, s, a = np.float64(cos_turns(r * r)), np.float64(TAU * r * sinc_turns(r * r)), p[o + P.AMPLITUDE]
             even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]
-            d_even, d_odd = -(q[0] * M[1] + q[2] * M[3] + q[4] * M[5]), q[1] * M[2] + q[3] * M[4]
-            V[m, L.N_COS + k] = f((c * even - s * odd) / mean)
-            V[m, L.N_SIN + k] = f(-_PI2 * (s * even + c * odd) / mean)
-            V[m, L.N_DSINC + k] = f(_PI2 * (c * d_even - s * d_odd) / mean)
             total += a * (c * even - s * odd)
-            rest[0] += a * (c * (c0 * M[0] + c2 * M[2]) - s * c1 * M[1])
-            rest[1] += a * (c * c1 * M[2] - s * (c0 * M[1] + c2 * M[3]))
-            rest[2] += a * (c * (c0 * M[2] + c2 * M[4]) - s * c1 * M[3])
-        S[L.BY_D + k], S[L.BY_A + k], S[L.BY_TM + k] = f(0), f(0), f(0)
-        if visible:
-            S[L.FIELD + k] += f(total / mean)
+            if V is not None:
+                d_even, d_odd = -(q[0] * M[1] + q[2] * M[3] + q[4] * M[5]), q[1] * M[2] + q[3] * M[4]
+                V[m, L.N_COS + k] = f((c * even - s * odd) / mean)
+                V[m, L.N_SIN + k] = f(-_PI2 * (s * even + c * odd) / mean)
+                V[m, L.N_DSINC + k] = f(_PI2 * (c * d_even - s * d_odd) / mean)
+                rest[0] += a * (c * (c0 * M[0] + c2 * M[2]) - s * c1 * M[1])
+                rest[1] += a * (c * c1 * M[2] - s * (c0 * M[1] + c2 * M[3]))
+                rest[2] += a * (c * (c0 * M[2] + c2 * M[4]) - s * c1 * M[3])
+        S[L.FIELD + k] += f(total / mean)
+        if V is not None:
             S[L.BY_D + k] = f(rest[0])
             S[L.BY_A + k] = f(-(shift * shift * rest[0] + 2.0 * shift * half * rest[1] + half * half * rest[2]))
             S[L.BY_TM + k] = f(2.0 * square * (shift * rest[0] + half * rest[1]))
 
 
 @inline
-def _soft_neurons_1(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
-    _soft_neurons(S, X, n, p, neurons, 1)
+def _soft_neurons_1(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+    _soft_neurons(S, X, V, n, p, neurons, 1)
 
 
 @inline
-def _soft_neurons_2(S, X, n, p, neurons):  # type: ignore[no-untyped-def]
-    _soft_neurons(S, X, n, p, neurons, 2)
+def _soft_neurons_2(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
+    _soft_neurons(S, X, V, n, p, neurons, 2)
 
 
-@inline
-def _soft_slopes_1(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
-    _soft_slopes(S, X, V, n, p, neurons, 1)
-
-
-@inline
-def _soft_slopes_2(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
-    _soft_slopes(S, X, V, n, p, neurons, 2)
-
-
-neurons_float64 = dispatch_by_length(_hard_neurons_float64, _soft_neurons_1, _soft_neurons_2)
-"""(edge, S, X, n, p, neurons): FADE, and FIELD += the weighted mean of every neuron of a float64 row."""
-slopes_float64 = dispatch_by_length(_hard_slopes_float64, _soft_slopes_1, _soft_slopes_2)
-"""(edge, S, X, V, n, p, neurons): the same, and what the gradients need."""
+# (edge, S, X, V, n, p, neurons): FADE, FIELD += the weighted mean of every neuron, and in V (None: not) for gradients
+neurons_float64 = dispatch_by_length(_hard_neurons, _soft_neurons_1, _soft_neurons_2)

@@ -11,8 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import inline, kernel
-from neuprim.core.compute.views import borrow_array, release_array
+from neuprim.core.compute.kernels import borrow_array, inline, kernel, release_array
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.colour_net import ray_colours

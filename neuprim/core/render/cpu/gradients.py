@@ -12,7 +12,7 @@ from neuprim.core.compute.kernels import inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import add_ray, by_depth, chord, put_ray, ray, through_chord, weight, zero_ray
-from neuprim.core.render.cpu.float64 import chords_float64, slopes_float64
+from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.tiles import chords
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
@@ -156,7 +156,7 @@ def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no
     slot = frame.slots[pair.i]
     if slot >= 0:
         chords_float64(S, D, n, bounds, frame, pair, False, True)
-        slopes_float64(edge, S, D, V, n, frame.wide[slot], frame.neurons)
+        neurons_float64(edge, S, D, V, n, frame.wide[slot], frame.neurons)
     else:
         chords(S, n, frame, pair, False, True, edge)
 
@@ -242,10 +242,9 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
     """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA).
 
     A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, but its weight depends on D = 1 -
-    |p|^2,
-    and on a = e.e and the closest approach where the near plane may cut the chord. In float32 no chord is cut: BY_D is
-    d FADE/dD, and the ends' share through HALF is kept. In float64 the ends are left out, and BY_D, BY_A and BY_TM are
-    derivatives of the whole mean FADE FIELD.
+    |p|^2, and on a = e.e and the closest approach where the near plane may cut the chord. In float32 no chord is cut:
+    BY_D is d FADE/dD, and the ends' share through HALF is kept. In float64 the ends are left out, and BY_D, BY_A and
+    BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray()

@@ -10,28 +10,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import exact_kernel, strict
-from neuprim.core.compute.views import borrow_array, release_array
+from neuprim.core.compute.kernels import borrow_array, exact_kernel, release_array, strict
 from neuprim.core.model.edge import NORMS
-from neuprim.core.model.rotation import rotation
+from neuprim.core.model.rows import rotation, rotation_backward
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.limits import (
-    ANCHOR_RADII,
-    CULLED,
-    CUT,
-    FLOAT32_MAX,
-    FLOAT64_ANCHOR,
-    FLOAT64_PIXELS,
-    FLOAT64_RADII,
-    FLOAT64_RATIO,
-    FLOAT64_RATIO_NEAR,
-    FLOAT64_TURNS,
-    MIN_RIM_SHARES,
-    NON_FINITE,
-    RIM_POWERS,
-    VISIBLE,
-)
 
 Array = np.ndarray[Any, Any]
 
@@ -73,7 +56,7 @@ class Projected(NamedTuple):
     kinds: Array  # (N, K/2) range of rates (SLOW, MEDIUM, FAST) of row neurons 2m and 2m + 1
     order: Array  # (N, K) the model's index of each row neuron; they are stored by rising rate
     depth: Array  # (N,) camera-z of the centres
-    status: Array  # (N,) VISIBLE, CULLED or NON_FINITE
+    status: Array  # (N,) P.VISIBLE, P.CULLED or P.NON_FINITE
     in_float64: Array  # (N,) whether float32 is not enough for the primitive's pixels
 
     @classmethod
@@ -93,7 +76,7 @@ class Projected(NamedTuple):
 
 
 class _Scratch(NamedTuple):
-    """``work`` (10, 3): rows 0..2 return B, 3 the axes s/m, 4 the centre; ``waves`` (K, 4); ``rate`` (K,) rising rates."""
+    """``work`` (10, 3): rows 0..2 return B, 3 the axes s/m, 4 the centre; ``waves`` (K, 4); rising ``rate`` (K,)."""
 
     work: Array
     waves: Array
@@ -141,9 +124,9 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
         return 0.0
-    if share <= MIN_RIM_SHARES[edge]:
+    if share <= P.MIN_RIM_SHARES[edge]:
         return 1.0
-    return np.float64(np.float32(1.0 - np.exp(np.log(share) * RIM_POWERS[edge])))
+    return np.float64(np.float32(1.0 - np.exp(np.log(share) * P.RIM_POWERS[edge])))
 
 
 @strict
@@ -174,7 +157,7 @@ def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # typ
         for j in range(3):
             B[i, j] = R[i, 0] * local[0, j] + R[i, 1] * local[1, j] + R[i, 2] * local[2, j]
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    if c[2] > ANCHOR_RADII * m and c[2] + m > view.near:
+    if c[2] > P.ANCHOR_RADII * m and c[2] + m > view.near:
         anchor[0] = m * np.float64(np.float32(c[2] / m))
         anchor[1] = np.float64(np.float32(fx * c[0] / c[2] + cx))
         anchor[2] = np.float64(np.float32(fy * c[1] / c[2] + cy))
@@ -314,7 +297,7 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         if _is_too_faint(most, edge, least):  # whatever its place
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
             in_float64[i], depth[i] = False, 0.0
-            status[i] = CULLED if _is_finite(i, parameters, most) else NON_FINITE
+            status[i] = P.CULLED if _is_finite(i, parameters, most) else P.NON_FINITE
             continue
         m, finite, biggest = _wide_row(i, parameters, view, scratch, order, row)
         for n in range(kinds.shape[1]):
@@ -323,25 +306,27 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         for j in range(row.shape[0]):
             rows[i, j] = row[j]
         tc = row[P.TC]
-        in_float64[i] = (K > 0 and rate[K - 1] > FLOAT64_TURNS) or max(abs(row[P.UX]), abs(row[P.UY])) > FLOAT64_PIXELS
-        in_float64[i] |= _dot(xa, xa) > FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
+        in_float64[i] = (K > 0 and rate[K - 1] > P.FLOAT64_TURNS) or max(
+            abs(row[P.UX]), abs(row[P.UY])
+        ) > P.FLOAT64_PIXELS
+        in_float64[i] |= _dot(xa, xa) > P.FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
-        in_float64[i] |= thinnest * (FLOAT64_RATIO_NEAR if tc == 0.0 else FLOAT64_RATIO) < 1.0
+        in_float64[i] |= thinnest * (P.FLOAT64_RATIO_NEAR if tc == 0.0 else P.FLOAT64_RATIO) < 1.0
         depth[i] = c[2]
         boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
         if not finite:
-            status[i] = NON_FINITE
+            status[i] = P.NON_FINITE
             continue
-        status[i] = CULLED
+        status[i] = P.CULLED
         szz = m * m * ((B[2, 0] * axes[0]) ** 2 + (B[2, 1] * axes[1]) ** 2 + (B[2, 2] * axes[2]) ** 2)
         reach = np.sqrt(szz)
         # only in float64 are there integrals of cut chords with a soft edge
-        in_float64[i] |= edge > 0 and c[2] - reach < near + CUT * reach
+        in_float64[i] |= edge > 0 and c[2] - reach < near + P.CUT * reach
         if c[2] + reach <= near:
             continue
-        if biggest > FLOAT32_MAX:
+        if biggest > P.FLOAT32_MAX:
             if m > 1.0:
-                status[i] = NON_FINITE  # a scale or weight beyond float32
+                status[i] = P.NON_FINITE  # a scale or weight beyond float32
             continue  # so small against its distance that no pixel centre can hit it
         span = spans[i]
         span[P.SKEW], span[P.XC], span[P.YC], span[P.HX], span[P.HY] = 0.0, 0.0, 0.0, P.UNBOUNDED, P.UNBOUNDED
@@ -384,16 +369,101 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
                     # needle each is many radii of its thin axis, and they cancel
                     slide = abs(row[P.TU]) * broad + abs(row[P.TV]) * tall
                     reached = np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall
-                    in_float64[i] |= slide * reached > FLOAT64_RADII
+                    in_float64[i] |= slide * reached > P.FLOAT64_RADII
                     for a in range(3):
-                        in_float64[i] |= abs(row[P.XU + a]) * broad + abs(row[P.XV + a]) * tall > FLOAT64_RADII
+                        in_float64[i] |= abs(row[P.XU + a]) * broad + abs(row[P.XV + a]) * tall > P.FLOAT64_RADII
         if in_float64[i]:  # the float64 rows do not slide
             for a in range(3):
                 rows[i, P.XU + a], rows[i, P.XV + a] = tc * ex[a], tc * ey[a]
             rows[i, P.TU], rows[i, P.TV] = 0.0, 0.0
         if x1 > x0 and y1 > y0:
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
-            status[i] = VISIBLE
+            status[i] = P.VISIBLE
     release_array(memory.work)
     release_array(memory.waves)
     release_array(memory.rate)
+
+
+@exact_kernel
+def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
+    """Chain rule from gradient rows to parameters, for the ``touched`` primitives among ``start:stop``.
+
+    Fills ``out`` (:class:`Parameters`, float32) and ``g_view`` (N, 3, 4), each one's part of dL/d(R | t); empty:
+    unwanted.
+    """
+    view = borrow_view(view)
+    means, log_scales, quats, W1, _, _, _ = borrow_parameters(parameters)
+    g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = out
+    rows, order, R, turns, K = projected.rows, projected.order, view.R, view.turns, W1.shape[1]
+    local, B, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    gA, gB, gL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
+    axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    gc, gl, gq, q = np.empty(3), np.empty(3), np.empty(4), np.empty(4)
+    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
+    for i in range(start, stop):
+        if not touched[i]:
+            continue
+        g = grads[i]
+        m, inverse = camera_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
+        tc = anchor[0] / m
+        ref[0], ref[1], ref[2] = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy, 1.0
+        for j in range(3):
+            w[j] = tc * ref[j] - c[j] / m
+            gc[j] = 0.0
+        for a in range(3):
+            gx = np.float64(g[P.XA + a])
+            row_sum = 0.0
+            for j in range(3):
+                A[a, j] = B[j, a] / axes[a]
+                gA[a, j] = g[P.E0 + a] * ref[j] + gx * w[j]
+            gA[a, 0] += g[P.EX + a] / fx
+            gA[a, 1] += g[P.EY + a] / fy
+            for j in range(3):
+                gB[j, a] = gA[a, j] / axes[a]
+                row_sum += gA[a, j] * A[a, j]
+                gc[j] -= A[a, j] * gx / m
+            gl[a] = -row_sum  # A scales with 1/s_a
+        log_m = -np.float64(g[P.G_LOG_M])  # the density's own 1/m
+        for a in range(3):
+            for j in range(3):
+                gL[a, j] = 0.0
+        for n in range(K):
+            k, o, og = order[i, n], P.NEURONS + P.PER_NEURON * n, P.G_NEURONS + P.PER_NEURON * n
+            for j in range(3):
+                gw = np.float64(g[og + P.WX + j])
+                gl[j] += gw * rows[i, o + P.WX + j]  # W on whitened axes scales with s_j/m
+                log_m -= gw * rows[i, o + P.WX + j]
+                for a in range(3):
+                    gL[a, j] += turns * axes[j] * W1[i, k, a] * gw
+            for a in range(3):
+                g_W1[i, k, a] = turns * (
+                    g[og + P.WX] * axes[0] * local[a, 0]
+                    + g[og + P.WY] * axes[1] * local[a, 1]
+                    + g[og + P.WZ] * axes[2] * local[a, 2]
+                )
+            g_b1[i, k] = turns * g[og + P.PHASE]
+            g_w2[i, k] = g[og + P.AMPLITUDE]
+        g_b2[i] = g[P.G_OFFSET]
+        first = 0
+        for j in range(1, 3):
+            if log_scales[i, j] > log_scales[i, first]:
+                first = j
+        gl[first] += log_m
+        for a in range(3):
+            g_log_scales[i, a] = gl[a]
+            g_means[i, a] = R[0, a] * gc[0] + R[1, a] * gc[1] + R[2, a] * gc[2]
+            for j in range(3):  # B = R local
+                gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
+        for j in range(4):
+            q[j] = quats[i, j]
+        rotation_backward(q, inverse, gL, gq)
+        for j in range(4):
+            g_quats[i, j] = gq[j]
+        if g_view.shape[0] > 0:
+            for a in range(3):
+                for j in range(3):
+                    value = gc[a] * means[i, j]
+                    for b in range(3):
+                        value += gB[a, b] * local[j, b]
+                    g_view[i, a, j] = value
+                g_view[i, a, 3] = gc[a]

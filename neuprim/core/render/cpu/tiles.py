@@ -13,8 +13,7 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from neuprim.core.compute.kernels import inline
-from neuprim.core.compute.views import borrow_array, copy16
+from neuprim.core.compute.kernels import borrow_array, copy16, inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import by_depth, chord, ray, weight
@@ -242,7 +241,7 @@ def field_values(S, D, n, bounds, frame, pair, with_mid, backward, edge):  # typ
     i = pair.i
     if frame.slots[i] >= 0:
         chords_float64(S, D, n, bounds, frame, pair, with_mid, backward)
-        neurons_float64(edge, S, D, n, frame.wide[frame.slots[i]], frame.neurons)
+        neurons_float64(edge, S, D, None, n, frame.wide[frame.slots[i]], frame.neurons)
     else:
         p = frame.rows[i]
         chords(S, n, frame, pair, with_mid, backward, edge)

@@ -2,21 +2,36 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute.warp import array, launch, wp
+from neuprim.core.errors import BackendUnavailable
+from neuprim.core.model.checks import non_finite_error, refuse_non_finite_colours
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.colour_net import FIRST_COLOUR, Net, fill_wide_net, net_backward, prepare_net
-from neuprim.core.render.cuda.frame import NotFinite, prepare_frame
+from neuprim.core.render.cuda.backward import pairs_kernel, pixels_kernel, sum_pairs
+from neuprim.core.render.cuda.binning import row_spans
+from neuprim.core.render.cuda.colour_net import (
+    FIRST_COLOUR,
+    Net,
+    fill_wide_net,
+    float64_hues_kernel,
+    float64_net_kernel,
+    net_backward,
+    net_pairs_kernel,
+    net_width,
+    prepare_net,
+)
+from neuprim.core.render.cuda.float64 import float64_opacity_kernel, float64_pairs_kernel
+from neuprim.core.render.cuda.forward import composite_kernel, forward_kernel, uncomposite_kernel
+from neuprim.core.render.cuda.frame import Frame, NotFinite, prepare_frame
 from neuprim.core.render.cuda.layout import Form
-from neuprim.core.render.cuda.passes import Composited, ImageGradient, backward, forward
 from neuprim.core.render.cuda.prepare_backward import prepare_backward
-from neuprim.core.render.non_finite import non_finite_error, refuse_non_finite_colours
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.rasterize import (
     NET,
@@ -53,7 +68,7 @@ class _Rasterize(torch.autograd.Function):
         settings, stats, camera = request.settings, request.stats, request.camera
         stats.pairs, stats.extra["float64"] = frame.lists.pairs, frame.wide.shape[0]
         behind = background.detach().to(frame.device, torch.float32).contiguous()
-        drawn = forward(frame, form, net, behind, settings, request.differentiable)
+        drawn = composite_frame(frame, form, net, behind, settings, request.differentiable)
         stats.extra["hits"] = drawn.hits.shape[0]
         ctx.request, ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.background = request, frame, form, net, drawn, behind
         remember_inputs(ctx, (viewmat, background, palette, *tensors))
@@ -86,7 +101,7 @@ class _Rasterize(torch.autograd.Function):
             error = asked.error.to(device, torch.float32).reshape(-1).contiguous()
         z = g_z.reshape(-1).float().contiguous() if settings.depth and g_z is not None else None
         gradient = ImageGradient(rgb, T.contiguous(), z, error)
-        grads, net_grads = backward(frame, form, net, drawn, settings, gradient)
+        grads, net_grads = gradient_rows(frame, form, net, drawn, settings, gradient)
         base = L.G_NEURONS + L.PER_NEURON * form.neurons
         colours = grads[:, base : base + form.channels]
         if net_grads is not None:
@@ -120,6 +135,241 @@ def render_slabs(
         frame = prepare_frame(request, camera.viewmat, blank, tensors, images=images)
     except NotFinite as error:
         raise non_finite_error(dict(zip(PARAMETERS, tensors, strict=True)), error.row) from None
-    drawn = forward(frame, Form(frame.neurons, request.edge, 1), None, blank.new_zeros(1), settings, False, count)
+    drawn = composite_frame(
+        frame, Form(frame.neurons, request.edge, 1), None, blank.new_zeros(1), settings, False, count
+    )
     alpha = (1 - drawn.transmittance).view(count, camera.height, camera.width).to(means.dtype)
     return alpha, mean_depth(drawn.zsum.view(alpha.shape), alpha).to(alpha.dtype)
+
+
+_MAX_HITS = 2**31
+
+_NUMBERS = {
+    torch.float32: wp.float32,
+    torch.float64: wp.float64,
+    torch.int32: wp.int32,
+    torch.int64: wp.int64,
+    torch.int16: wp.uint16,
+}
+
+
+@dataclass
+class Composited:
+    """What a forward pass leaves."""
+
+    rgb: Tensor  # (H W, C)
+    transmittance: Tensor  # (H W,)
+    zsum: Tensor  # (H W,) sum of w z, empty if no depth is wanted
+    spans: Tensor  # (pairs, 16) int16, which with the offsets say the pixels of each pair, see row_spans
+    offsets: Tensor  # (pairs + 1,) int32
+    hits: Tensor  # (slots, 2) opacity and transmittance before it, if they were kept
+    depths: Tensor  # (slots,) camera-z, if wanted
+    hues: Tensor  # (slots, C) colours before max(0, .), of colour networks
+    reached: Tensor  # (tiles,) int32, the pairs before it were composited
+    in_float64: Tensor  # (D,) int32, the pairs that are drawn in float64, rising
+    # where hits were sorted by entry:
+    order: Tensor | None = None  # (slots,) int64 slots by pixel and entry
+    begins: Tensor | None = None  # (H W + 1,) int32, first of each pixel
+    owners: Tensor | None = None  # (slots,) int32, pair of each slot
+
+
+@dataclass
+class ImageGradient:
+    """Gradients of an image, float32 and contiguous, and the error of each pixel for the contributions."""
+
+    rgb: Tensor  # (H W, C)
+    transmittance: Tensor  # (H W,), with the background's share
+    z: Tensor | None  # (H W,)
+    error: Tensor  # (H W,)
+
+
+def _numbers(tensor: Tensor) -> Any:
+    return array(tensor, _NUMBERS[tensor.dtype])
+
+
+class _Arrays:
+    """Arrays and numbers of a frame as the kernels take them."""
+
+    def __init__(self, frame: Frame, net: Net | None, settings: RenderSettings, spans: Tensor, offsets: Tensor) -> None:
+        camera, device = frame.projection.camera, frame.device
+        self.rows, self.wide, self.slots = array(frame.rows, wp.vec4), _numbers(frame.wide), _numbers(frame.slots)
+        self.starts, self.ids = _numbers(frame.lists.starts), _numbers(frame.lists.ids)
+        self.tile_of, self.spans, self.offsets = _numbers(frame.lists.tile_of), _numbers(spans), _numbers(offsets)
+        units = torch.empty(1, 1, 4, device=device) if net is None or not net.hidden else net.rows
+        self.units = array(units, wp.vec4)
+        self.lens = wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
+        self.size = wp.vec2i(camera.width, camera.height)
+        self.limits = wp.vec4(settings.alpha_min, settings.alpha_max, settings.transmittance_min, 0.0)
+
+    @property
+    def covered(self) -> tuple[Any, ...]:
+        """Primitive, tile, and pixels of every pair."""
+        return self.ids, self.tile_of, self.spans, self.offsets
+
+
+def _find_marked(marked: Tensor, count: int) -> Tensor:
+    """(count,) int32, where a mask with so many is set; the host does not wait."""
+    place = torch.where(marked, torch.cumsum(marked, 0) - 1, count)
+    numbers = torch.arange(marked.shape[0], dtype=torch.int32, device=marked.device)
+    return torch.empty(count + 1, dtype=torch.int32, device=marked.device).index_copy_(0, place, numbers)[:count]
+
+
+def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
+    """Number of slots, (pairs + 1,) first slot of each pair, float64 pairs; waits. BackendUnavailable: too many."""
+    in_float64 = torch.empty(0, dtype=torch.int32, device=frame.device)
+    offsets = torch.zeros(len(counts) + 1, dtype=torch.int32, device=frame.device)
+    ends = torch.cumsum(counts, 0, dtype=torch.int64)
+    offsets[1:] = ends
+    if frame.wide.shape[0] > 0:
+        marked = frame.slots[frame.lists.ids] >= 0
+        total, few = torch.stack((ends[-1], marked.sum())).tolist()
+        in_float64 = _find_marked(marked, few)
+    else:
+        total = int(ends[-1])
+    if total >= _MAX_HITS:
+        raise BackendUnavailable(
+            f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
+            f"image"
+        )
+    return total, offsets, in_float64
+
+
+def composite_frame(
+    frame: Frame,
+    form: Form,
+    net: Net | None,
+    background: Tensor,
+    settings: RenderSettings,
+    differentiable: bool,
+    images: int = 1,
+) -> Composited:
+    """Draw; several ``images`` without gradients, sorted by centres. The host waits where slots are kept."""
+    lists, device, camera = frame.lists, frame.device, frame.projection.camera
+    pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    spans, counts = empty(pairs, L.TILE, dtype=torch.int16), empty(pairs, dtype=torch.int32)
+    offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
+    a = _Arrays(frame, net, settings, spans, offsets)
+    silhouettes = (_numbers(frame.spans), array(frame.boxes, wp.vec4i))
+    launch(row_spans, pairs, (a.rows, *silhouettes, a.ids, a.tile_of, a.size, a.spans, _numbers(counts)), device)
+    sorts = settings.sort == "entry"
+    keep = differentiable or sorts or frame.wide.shape[0] > 0
+    total, in_float64 = 0, empty(0, dtype=torch.int32)
+    if keep and pairs:
+        total, offsets, in_float64 = _count_slots(frame, counts)
+        a.offsets = _numbers(offsets)
+    hits, depths = empty(total, 2), empty(total if settings.depth else 0)
+    hues = empty(total if net is not None else 0, form.channels)
+    if len(in_float64):
+        few, which = (len(in_float64), L.WARP), _numbers(in_float64)
+        kept = (array(hits, wp.vec2), _numbers(depths))
+        launch(
+            float64_opacity_kernel(settings.depth),
+            few,
+            (which, a.wide, a.slots, *a.covered, a.lens, a.limits, a.size, form.neurons, form.edge, *kept),
+            device,
+            L.WARP,
+        )
+        if net is not None and net.hidden:
+            wide_net, first = array(net.wide, wp.vec4d), L.colours(form.neurons)
+            launch(
+                float64_hues_kernel(form.channels),
+                few,
+                (
+                    which,
+                    a.wide,
+                    wide_net,
+                    a.units,
+                    a.rows,
+                    first,
+                    net.hidden,
+                    a.slots,
+                    *a.covered,
+                    a.size,
+                    _numbers(hues),
+                ),
+                device,
+                L.WARP,
+            )
+    pixels = images * camera.width * camera.height
+    rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
+    reached = empty(tiles, dtype=torch.int32)
+    keys, owners = empty(total if sorts else 0, dtype=torch.int64), empty(total if sorts else 0, dtype=torch.int32)
+    drawn = Composited(rgb, T, z, spans, offsets, hits, depths, hues, reached, in_float64)
+    image, slots = (_numbers(rgb), _numbers(T), _numbers(z)), (array(hits, wp.vec2), _numbers(depths), _numbers(hues))
+    tile = (a.rows, a.units, a.starts, a.ids, a.spans, a.offsets, a.lens, a.limits, _numbers(background), a.size)
+    listed = (_numbers(keys), _numbers(owners))
+    kernel = forward_kernel(form, keep, settings.depth, sorts, images > 1)
+    launch(kernel, (tiles, L.PIXELS), (*tile, *image, *slots, _numbers(reached), *listed), device, L.PIXELS)
+    if not sorts:
+        return drawn
+    keys, order = torch.sort(keys, stable=True)
+    begins = torch.empty(pixels + 1, dtype=torch.int32, device=device)
+    begins[pixels] = torch.searchsorted(keys, pixels << 32)
+    sorted_hits = (a.rows, a.ids, _numbers(keys), _numbers(order), total, _numbers(owners), a.limits)
+    written = (*reversed(slots), *image, _numbers(begins))
+    launch(composite_kernel(form, settings.depth), pixels, (*sorted_hits, _numbers(background), *written), device)
+    drawn.order, drawn.begins, drawn.owners = order, begins, owners
+    return drawn
+
+
+def gradient_rows(
+    frame: Frame, form: Form, net: Net | None, drawn: Composited, settings: RenderSettings, gradient: ImageGradient
+) -> tuple[Tensor, Tensor | None]:
+    """Return (N, gradient_width) gradient rows, and (N, net_width) of networks; uses up the slots' contents."""
+    lists, device, depth = frame.lists, frame.device, gradient.z is not None
+    pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
+    a = _Arrays(frame, net, settings, drawn.spans, drawn.offsets)
+    g_z = _numbers(torch.empty(0, device=device) if gradient.z is None else gradient.z)
+    g_rgb, g_T, error = _numbers(gradient.rgb), _numbers(gradient.transmittance), _numbers(gradient.error)
+    hits, reached, T = array(drawn.hits, wp.vec2), _numbers(drawn.reached), _numbers(drawn.transmittance)
+    depths, hues, floor = _numbers(drawn.depths), _numbers(drawn.hues), settings.depth_floor
+    if drawn.order is None or drawn.begins is None or drawn.owners is None:
+        tile = (a.rows, a.starts, a.ids, a.spans, a.offsets, a.limits, a.size)
+        images = (T, reached, g_rgb, g_T, g_z, depths, hues, hits)
+        launch(pixels_kernel(form, depth), (tiles, L.PIXELS), (*tile, *images), device, L.PIXELS)
+    else:
+        sorted_hits = (_numbers(drawn.order), _numbers(drawn.begins), _numbers(drawn.owners))
+        launch(
+            uncomposite_kernel(form, depth),
+            len(drawn.transmittance),
+            (a.rows, a.ids, *sorted_hits, a.limits, T, g_rgb, g_T, g_z, depths, hues, hits),
+            device,
+        )
+    few, which = (len(drawn.in_float64), L.WARP), _numbers(drawn.in_float64)
+    width = L.gradient_width(form.neurons, form.channels)
+    pair_rows = torch.empty(pairs, width, dtype=torch.float32, device=device)
+    out, flat_rgb = _numbers(pair_rows.view(-1)), _numbers(gradient.rgb.view(-1))
+    launch(
+        pairs_kernel(form, depth),
+        (pairs, L.WARP),
+        (a.rows, *a.covered, a.lens, floor, a.size, reached, hits, flat_rgb, g_z, error, out),
+        device,
+        L.WARP,
+    )
+    if len(drawn.in_float64):
+        wide = (which, a.wide, a.slots, *a.covered, a.lens, floor, a.size, form.neurons)
+        launch(float64_pairs_kernel(form, depth), few, (*wide, reached, hits, g_rgb, g_z, error, out), device, L.WARP)
+    grads = _sum_rows(frame, pair_rows)
+    if net is None:
+        return grads, None
+    net_rows = torch.empty(pairs, net_width(form), device=device)
+    slots = (reached, hits, hues, g_rgb, _numbers(net_rows.view(-1)))
+    launch(
+        net_pairs_kernel(form), (pairs, L.WARP), (a.rows, a.units, *a.covered, floor, a.size, *slots), device, L.WARP
+    )
+    if len(drawn.in_float64):
+        weights = (which, a.wide, array(net.wide, wp.vec4d), a.units, net.hidden, a.slots)
+        launch(float64_net_kernel(form), few, (*weights, *a.covered, floor, a.size, *slots), device, L.WARP)
+    return grads, _sum_rows(frame, net_rows)
+
+
+def _sum_rows(frame: Frame, pair_rows: Tensor) -> Tensor:
+    """(N, width) sums of the rows of each primitive's pairs."""
+    grads = torch.empty(frame.rows.shape[0], pair_rows.shape[1], dtype=torch.float32, device=frame.device)
+    lists = (_numbers(frame.lists.first), _numbers(frame.lists.slots_of))
+    launch(sum_pairs, grads.shape, (*lists, _numbers(pair_rows), _numbers(grads)), frame.device)
+    return grads

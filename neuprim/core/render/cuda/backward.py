@@ -4,8 +4,7 @@
 First a block a tile, a thread a pixel: it walks its hits back to front and leaves dL/dI and the weight in each slot.
 Then a warp a (tile, primitive) pair: chord and neurons again, sums in registers, one row per pair. A primitive's rows
 are added in the order of its pairs, so that reruns give the same bits. With 8 neurons the sums alone are 59 registers
-of
-128, so over the neurons nothing is kept that a few operations give again.
+of 128, so over the neurons nothing is kept that a few operations give again.
 """
 
 from __future__ import annotations

@@ -135,7 +135,7 @@ def _kernels() -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Longs, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """A key tile << 32 | rank for every tile of the primitive of depth rank ``tid``; ``tiles`` of each image, or 0."""
+        """A key tile << 32 | rank for every tile of the primitive of depth rank ``tid``; ``tiles`` per image, or 0."""
         rank = wp.tid()
         i = int(order[rank])
         last = int(ends[0, i])

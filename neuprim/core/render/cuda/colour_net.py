@@ -43,7 +43,6 @@ from neuprim.core.render.cuda.layout import Form
 from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
 from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, sin_turns
-from neuprim.core.render.limits import FLOAT64_TURNS
 
 FIRST_COLOUR = L.G_NEURONS
 """Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the
@@ -52,7 +51,7 @@ ray's come first."""
 d, f = wp.float64, wp.float32
 _TURNS = wp.constant(d(1.0 / (2.0 * math.pi)))
 _TWO_PI = wp.constant(d(TAU))
-_FAST = wp.constant(d(FLOAT64_TURNS**2))
+_FAST = wp.constant(d(W.FLOAT64_TURNS**2))
 
 
 @dataclass
@@ -318,8 +317,7 @@ def float64_hues_kernel(channels: int) -> Any:
         """``mixes``: the networks' float32 rows, for output weights; ``rows``: bases from column ``first``."""
         member, lane = wp.tid()
         n = pairs[member]
-        i = ids[n]
-        r = slots[i]
+        i, r = ids[n], slots[ids[n]]
         across = (size[0] + L.TILE - 1) // L.TILE
         begin = offsets[n]
         for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
@@ -353,8 +351,7 @@ def float64_net_kernel(form: Form) -> Any:
     ):  # fmt: skip
         member, lane = wp.tid()
         n = pairs[member]
-        i = ids[n]
-        r = slots[i]
+        i, r = ids[n], slots[ids[n]]
         tile = tiles[n]
         total = row_of()
         if n < reached[tile]:
@@ -364,8 +361,7 @@ def float64_net_kernel(form: Form) -> Any:
                 weight = hits[begin + s][1]
                 if weight > 0.0:
                     at = pixel_of_slot(spans, n, s)
-                    X = (tile % across) * L.TILE + at[0]
-                    Y = (tile // across) * L.TILE + at[1]
+                    X, Y = (tile % across) * L.TILE + at[0], (tile // across) * L.TILE + at[1]
                     c = chord64(wide, r, X, Y)
                     g = vecC()
                     for k in range(wp.static(C)):

@@ -2,8 +2,7 @@
 """The pixel stage in float64, for the few primitives that float32 cannot follow: chords, opacities, gradients.
 
 The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are left
-in
-the pixels' slots before compositing. Gradients of edges: :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+in the pixels' slots before compositing. Gradients of edges: :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -18,6 +17,7 @@ from neuprim.core.render.cuda.block_ops import row_sums, row_type
 from neuprim.core.render.cuda.chord import pixel_of_slot
 from neuprim.core.render.cuda.layout import CUT_AT, Form
 
+d = wp.float64
 _TWO_PI = 6.283185307179586
 vec6d = wp.types.vector(length=6, dtype=wp.float64)
 vec5d = wp.types.vector(length=5, dtype=wp.float64)
@@ -52,10 +52,9 @@ def _vector(wide: Doubles2d, r: int, c: int):
 def chord64(wide: Doubles2d, r: int, X: int, Y: int):
     """Of pixel (X, Y) and row ``r``."""
     c = Chord64()
-    zero = wp.float64(0.0)
-    one = wp.float64(1.0)
-    c.du = wp.float64(X) + wp.float64(0.5) - wide[r, W.UX]
-    c.dv = wp.float64(Y) + wp.float64(0.5) - wide[r, W.UY]
+    zero, one = d(0.0), d(1.0)
+    c.du = d(X) + d(0.5) - wide[r, W.UX]
+    c.dv = d(Y) + d(0.5) - wide[r, W.UY]
     G = c.du * _vector(wide, r, W.EX) + c.dv * _vector(wide, r, W.EY)
     c.e = _vector(wide, r, W.E0) + G
     m = _vector(wide, r, W.XA) + wide[r, W.TC] * G
@@ -68,8 +67,8 @@ def chord64(wide: Doubles2d, r: int, X: int, Y: int):
     t0 = c.tm - c.h
     c.uncut = wp.where(t0 > near, one, zero)
     t0 = wp.max(t0, near)
-    c.mid = wp.float64(0.5) * (t0 + c.tm + c.h)
-    c.half = wp.max(wp.float64(0.5) * (c.tm + c.h - t0), zero)
+    c.mid = d(0.5) * (t0 + c.tm + c.h)
+    c.half = wp.max(d(0.5) * (c.tm + c.h - t0), zero)
     c.q = c.x + (c.mid - c.tm) * c.e
     return c
 
@@ -89,20 +88,16 @@ class Weight:
 def weight_of(c: Chord64, edge: int):
     """(D - a (shift + half u)^2)^p."""
     w = Weight()
-    two = wp.float64(2.0)
-    a = wp.float64(1.0) / c.ia
-    shift = c.mid - c.tm
-    c0 = c.D - a * shift * shift
-    c1 = -two * a * shift * c.half
-    c2 = -a * c.half * c.half
+    two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
+    c0, c1, c2 = c.D - a * shift * shift, -two * a * shift * c.half, -a * c.half * c.half
     w.q = vec5d()
     if edge == 0:
-        w.q[0] = wp.float64(1.0)
+        w.q[0] = d(1.0)
     elif edge == 1:
         w.q[0] = c0
         w.q[1] = c1
         w.q[2] = c2
-        w.b0 = wp.float64(1.0)
+        w.b0 = d(1.0)
     else:
         w.q[0] = c0 * c0
         w.q[1] = two * c0 * c1
@@ -112,7 +107,7 @@ def weight_of(c: Chord64, edge: int):
         w.b0 = two * c0
         w.b1 = two * c1
         w.b2 = two * c2
-    w.mean = w.q[0] + w.q[2] / wp.float64(3.0) + w.q[4] / wp.float64(5.0)
+    w.mean = w.q[0] + w.q[2] / d(3.0) + w.q[4] / d(5.0)
     return w
 
 
@@ -120,26 +115,23 @@ def weight_of(c: Chord64, edge: int):
 def _bessel(z: wp.float64):
     """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
     j = vec6d()
-    one = wp.float64(1.0)
-    if wp.abs(z) < wp.float64(2.0):
-        square = wp.float64(0.5) * z * z
-        power = wp.float64(1.0)
+    if wp.abs(z) < d(2.0):
+        square, power = d(0.5) * z * z, d(1.0)
         for n in range(6):
-            term = wp.float64(power)
-            total = wp.float64(power)
+            term, total = d(power), d(power)
             for k in range(1, _TERMS):
-                term *= -square / wp.float64(k * (2 * n + 2 * k + 1))
+                term *= -square / d(k * (2 * n + 2 * k + 1))
                 total += term
             j[n] = total
-            power *= z / wp.float64(2 * n + 3)
+            power *= z / d(2 * n + 3)
     else:
         j[0] = wp.sin(z) / z
         j[1] = (j[0] - wp.cos(z)) / z
-        over = one / z
-        j[2] = wp.float64(3.0) * over * j[1] - j[0]
-        j[3] = wp.float64(5.0) * over * j[2] - j[1]
-        j[4] = wp.float64(7.0) * over * j[3] - j[2]
-        j[5] = wp.float64(9.0) * over * j[4] - j[3]
+        over = d(1.0) / z
+        j[2] = d(3.0) * over * j[1] - j[0]
+        j[3] = d(5.0) * over * j[2] - j[1]
+        j[4] = d(7.0) * over * j[3] - j[2]
+        j[5] = d(9.0) * over * j[4] - j[3]
     return j
 
 
@@ -147,36 +139,28 @@ def _bessel(z: wp.float64):
 def moments(z: wp.float64):
     """C_0, S_1, C_2, S_3, C_4, S_5."""
     j = _bessel(z)
-    two = wp.float64(2.0)
-    three = wp.float64(3.0)
-    eight = wp.float64(8.0)
+    two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
     M[0] = j[0]
     M[1] = j[1]
     M[2] = (j[0] - two * j[2]) / three
-    M[3] = (three * j[1] - two * j[3]) / wp.float64(5.0)
-    M[4] = (wp.float64(7.0) * j[0] - wp.float64(20.0) * j[2] + eight * j[4]) / wp.float64(35.0)
-    M[5] = (wp.float64(27.0) * j[1] - wp.float64(28.0) * j[3] + eight * j[5]) / wp.float64(63.0)
+    M[3] = (three * j[1] - two * j[3]) / d(5.0)
+    M[4] = (d(7.0) * j[0] - d(20.0) * j[2] + eight * j[4]) / d(35.0)
+    M[5] = (d(27.0) * j[1] - d(28.0) * j[3] + eight * j[5]) / d(63.0)
     return M
-
-
-@wp.func
-def neuron64(wide: Doubles2d, r: int, o: int):
-    """(WX, WY, WZ) of the unit at column ``o``."""
-    return _vector(wide, r, o)
 
 
 @wp.func
 def phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
     """At the chord's middle, in radians, of less than half a turn."""
     u = wp.dot(c.q, w) + phase
-    return wp.float64(6.283185307179586) * (u - wp.rint(u))
+    return d(_TWO_PI) * (u - wp.rint(u))
 
 
 @wp.func
 def rate64(c: Chord64, w: wp.vec3d):
     """z, radians over half a chord."""
-    return wp.float64(6.283185307179586) * c.half * wp.dot(c.e, w)
+    return d(_TWO_PI) * c.half * wp.dot(c.e, w)
 
 
 @wp.struct
@@ -216,16 +200,12 @@ def through64(
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
     """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D."""
-    half = wp.float64(0.5)
-    two = wp.float64(2.0)
-    gt1 = half * (g_mid + g_half)
-    gt0 = half * (g_mid - g_half) * c.uncut
-    tm = g_tm + gt0 + gt1
-    g_h = gt1 - gt0
-    D = gD + g_h * half * c.ia / wp.sqrt(wp.max(c.D, wp.float64(depth_floor)) * c.ia)
+    half, two = d(0.5), d(2.0)
+    gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
+    tm, g_h = g_tm + gt0 + gt1, gt1 - gt0
+    D = gD + g_h * half * c.ia / wp.sqrt(wp.max(c.D, d(depth_floor)) * c.ia)
     a = gA - (half * g_h * c.h + tm * c.tm) * c.ia
-    b = -tm * c.ia
-    m2 = -two * D
+    b, m2 = -tm * c.ia, -two * D
     out = Pull64()
     out.m = gq + m2 * c.x + b * c.e
     out.e = c.half * gv + c.mid * gq + (c.tm * m2 + b) * c.x + (two * a - b * c.tm) * c.e
@@ -236,9 +216,9 @@ def through64(
 @wp.func
 def ray_norm(lens: wp.vec4, X: int, Y: int):
     """Length of the ray direction whose camera-z is 1."""
-    x = (wp.float64(X) + wp.float64(0.5) - wp.float64(lens[2])) / wp.float64(lens[0])
-    y = (wp.float64(Y) + wp.float64(0.5) - wp.float64(lens[3])) / wp.float64(lens[1])
-    return wp.sqrt(x * x + y * y + wp.float64(1.0))
+    x = (d(X) + d(0.5) - d(lens[2])) / d(lens[0])
+    y = (d(Y) + d(0.5) - d(lens[3])) / d(lens[1])
+    return wp.sqrt(x * x + y * y + d(1.0))
 
 
 @functools.cache
@@ -256,31 +236,28 @@ def float64_opacity_kernel(depth: bool) -> Any:
         r = slots[ids[n]]
         if r >= 0:
             across = (size[0] + L.TILE - 1) // L.TILE
-            tx = (tiles[n] % across) * L.TILE
-            ty = (tiles[n] // across) * L.TILE
-            begin = offsets[n]
+            tx, ty, begin = (tiles[n] % across) * L.TILE, (tiles[n] // across) * L.TILE, offsets[n]
             for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
                 at = pixel_of_slot(spans, n, s)
-                X = tx + at[0]
-                Y = ty + at[1]
+                X, Y = tx + at[0], ty + at[1]
                 c = chord64(wide, r, X, Y)
                 w = weight_of(c, edge)
                 alpha = float(0.0)
-                if c.half > wp.float64(0.0) and w.mean > wp.float64(0.0):
+                if c.half > d(0.0) and w.mean > d(0.0):
                     total = w.mean * wide[r, W.OFFSET]
                     for k in range(neurons):
                         o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
-                        v = neuron64(wide, r, o)
+                        v = _vector(wide, r, o)
                         phase = phase64(c, v, wide[r, o + W.PHASE])
                         m = dot64(w, moments(rate64(c, v)))
                         total += wide[r, o + W.AMPLITUDE] * (wp.cos(phase) * m.even - wp.sin(phase) * m.odd)
-                    I = wp.float64(2.0) * total * c.half * ray_norm(lens, X, Y)
-                    if I > wp.float64(0.0):
-                        alpha = wp.min(float(wp.float64(1.0) - wp.exp(-I)), limits[1])
+                    I = d(2.0) * total * c.half * ray_norm(lens, X, Y)
+                    if I > d(0.0):
+                        alpha = wp.min(float(d(1.0) - wp.exp(-I)), limits[1])
                         if alpha < limits[0]:
                             alpha = 0.0
                 entry = float(CUT_AT)
-                if c.uncut > wp.float64(0.0):
+                if c.uncut > d(0.0):
                     entry = float(wide[r, W.ANCHOR_Z] + wide[r, W.UNIT] * (c.mid - c.half))
                 hits[begin + s] = wp.vec2(alpha, entry)
                 if wp.static(depth):
@@ -310,10 +287,7 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
             tile = tiles[n]
             if n < reached[tile]:
                 across = (size[0] + L.TILE - 1) // L.TILE
-                zero = wp.float64(0.0)
-                two = wp.float64(2.0)
-                turn = wp.float64(_TWO_PI)
-                begin = offsets[n]
+                zero, two, turn, begin = d(0.0), d(2.0), d(_TWO_PI), offsets[n]
                 for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
                     hit = hits[begin + s]
                     if hit[1] > 0.0:
@@ -327,25 +301,22 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
                             total[wp.static(L.G_NEURONS + 5 * K + k)] += hit[1] * g_rgb[pixel, k]
                         c = chord64(wide, r, X, Y)
                         w = weight_of(c, P)
-                        g = two * wp.float64(hit[0]) * ray_norm(lens, X, Y)  # dL/d(mean half)
+                        g = two * d(hit[0]) * ray_norm(lens, X, Y)  # dL/d(mean half)
                         gh = g * c.half
                         mean = w.mean * wide[r, W.OFFSET]
                         # moments of d q/d(1 - |y|^2) with 1, u and u^2
-                        rest0 = wide[r, W.OFFSET] * (w.b0 + w.b2 / wp.float64(3.0))
-                        rest1 = wide[r, W.OFFSET] * w.b1 / wp.float64(3.0)
-                        rest2 = wide[r, W.OFFSET] * (w.b0 / wp.float64(3.0) + w.b2 / wp.float64(5.0))
-                        gq = wp.vec3d()
-                        gv = wp.vec3d()
+                        rest0 = wide[r, W.OFFSET] * (w.b0 + w.b2 / d(3.0))
+                        rest1 = wide[r, W.OFFSET] * w.b1 / d(3.0)
+                        rest2 = wide[r, W.OFFSET] * (w.b0 / d(3.0) + w.b2 / d(5.0))
+                        gq, gv = wp.vec3d(), wp.vec3d()
                         for k in range(neurons):
                             o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
                             og = wp.static(L.G_NEURONS) + wp.static(W.PER_NEURON) * k
-                            v = neuron64(wide, r, o)
+                            v = _vector(wide, r, o)
                             phase = phase64(c, v, wide[r, o + W.PHASE])
                             M = moments(rate64(c, v))
                             m = dot64(w, M)
-                            cosine = wp.cos(phase)
-                            sine = wp.sin(phase)
-                            amplitude = wide[r, o + W.AMPLITUDE]
+                            cosine, sine, amplitude = wp.cos(phase), wp.sin(phase), wide[r, o + W.AMPLITUDE]
                             one = cosine * m.even - sine * m.odd
                             mean += amplitude * one
                             gu = -gh * amplitude * turn * (sine * m.even + cosine * m.odd)
@@ -363,20 +334,15 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
                             rest2 += amplitude * (cosine * (w.b0 * M[2] + w.b2 * M[4]) - sine * w.b1 * M[3])
                         total[L.G_OFFSET] += float(gh * w.mean)
                         total[L.G_LOG_M] += float(gh * mean)
-                        g_half = wp.dot(gv, c.e) + g * mean
-                        g_mid = wp.dot(gq, c.e)
-                        g_tm = wp.float64(0.0)
-                        gD = wp.float64(0.0)
-                        gA = wp.float64(0.0)
+                        g_half, g_mid = wp.dot(gv, c.e) + g * mean, wp.dot(gq, c.e)
+                        g_tm, gD, gA = d(0.0), d(0.0), d(0.0)
                         if wp.static(P > 0):
-                            shift = c.mid - c.tm
-                            g_half = zero
-                            g_mid = zero
+                            shift, g_half, g_mid = c.mid - c.tm, zero, zero
                             g_tm = gh * two / c.ia * (shift * rest0 + c.half * rest1)
                             gD = gh * rest0
                             gA = -gh * (shift * shift * rest0 + two * shift * c.half * rest1 + c.half * c.half * rest2)
                         if wp.static(depth):
-                            g_mid += wp.float64(hit[1] * g_z[pixel]) * wide[r, W.UNIT]
+                            g_mid += d(hit[1] * g_z[pixel]) * wide[r, W.UNIT]
                         pull = through64(c, wide[r, W.TC], depth_floor, g_half, g_mid, g_tm, gD, gA, gq, gv)
                         for k in range(3):
                             total[k] += float(pull.e[k])

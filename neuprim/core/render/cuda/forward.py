@@ -3,8 +3,7 @@
 
 Rows come to shared memory in batches; a tile ends when no pixel sees light through it. (alpha, transmittance before) of
 every hit goes to its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). Float64 pairs have their opacities
-there
-beforehand (:mod:`~neuprim.core.render.cuda.float64`).
+there beforehand (:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations

@@ -15,8 +15,7 @@ from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count_tiles
 from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
 from neuprim.core.render.cuda.projection import PER_BLOCK
-from neuprim.core.render.layout import SPAN_WIDTH
-from neuprim.core.render.limits import min_visible_depth
+from neuprim.core.render.layout import SPAN_WIDTH, min_visible_depth
 from neuprim.core.render.rasterize import Request
 
 

@@ -22,37 +22,22 @@ from neuprim.core.render.cuda.projection import (
     view_of,
     whiten,
 )
-from neuprim.core.render.limits import (
-    CULLED,
-    CUT,
-    FLOAT32_MAX,
-    FLOAT64_ANCHOR,
-    FLOAT64_PIXELS,
-    FLOAT64_RADII,
-    FLOAT64_RATIO,
-    FLOAT64_RATIO_NEAR,
-    FLOAT64_TURNS,
-    MIN_RIM_SHARES,
-    NON_FINITE,
-    RIM_POWERS,
-    VISIBLE,
-)
 
 d, f = wp.float64, wp.float32
 _VISIBLE, _CULLED, _NON_FINITE = (
-    wp.constant(wp.uint8(VISIBLE)),
-    wp.constant(wp.uint8(CULLED)),
-    wp.constant(wp.uint8(NON_FINITE)),
+    wp.constant(wp.uint8(W.VISIBLE)),
+    wp.constant(wp.uint8(W.CULLED)),
+    wp.constant(wp.uint8(W.NON_FINITE)),
 )
-_FLOAT32_MAX, _CUT = wp.constant(d(FLOAT32_MAX)), wp.constant(d(CUT))
-_RADII, _TURNS = wp.constant(d(FLOAT64_RADII)), wp.constant(d(FLOAT64_TURNS))
-_ANCHOR, _PIXELS = wp.constant(d(FLOAT64_ANCHOR**2)), wp.constant(d(FLOAT64_PIXELS))
-_RATIO, _RATIO_NEAR = wp.constant(d(FLOAT64_RATIO)), wp.constant(d(FLOAT64_RATIO_NEAR))
+_FLOAT32_MAX, _CUT = wp.constant(d(W.FLOAT32_MAX)), wp.constant(d(W.CUT))
+_RADII, _TURNS = wp.constant(d(W.FLOAT64_RADII)), wp.constant(d(W.FLOAT64_TURNS))
+_ANCHOR, _PIXELS = wp.constant(d(W.FLOAT64_ANCHOR**2)), wp.constant(d(W.FLOAT64_PIXELS))
+_RATIO, _RATIO_NEAR = wp.constant(d(W.FLOAT64_RATIO)), wp.constant(d(W.FLOAT64_RATIO_NEAR))
 _UNBOUNDED = wp.constant(d(W.UNBOUNDED))
 _E0, _EX, _EY, _XA, _XU, _XV, _REST, _NEURONS = L.E0, L.EX, L.EY, L.XA, L.XU, L.XV, L.REST, L.NEURONS
 _TILE = L.TILE
 (_N0, _N1, _N2), (_P0, _P1, _P2), (_W0, _W1, _W2) = (
-    [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, RIM_POWERS, MIN_RIM_SHARES)
+    [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, W.RIM_POWERS, W.MIN_RIM_SHARES)
 )
 
 _STORE = """

@@ -2,7 +2,7 @@
 """Projection of a primitive, in float64: the geometry of :mod:`neuprim.core.render.cpu.prepare`."""
 
 from neuprim.core.compute.warp import OPTIONS, Doubles, wp
-from neuprim.core.render.limits import ANCHOR_RADII
+from neuprim.core.render.layout import ANCHOR_RADII
 
 EXACT = {**OPTIONS, "fuse_fp": False}
 """Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and

@@ -20,7 +20,7 @@ from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, Vie
 from neuprim.core.data.dataset import PointSamples, PointSupervision
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.arrays import read_arrays
+from neuprim.core.io.plain import read_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once

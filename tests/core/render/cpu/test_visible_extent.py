@@ -15,7 +15,7 @@ from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.cpu.prepare import _is_too_faint, _visible_square
-from neuprim.core.render.limits import MIN_RIM
+from neuprim.core.render.layout import MIN_RIM
 from tests import scenes
 from tests.numerics.equivalence import assert_same_frame
 

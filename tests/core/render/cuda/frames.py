@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core.compute.warp import array
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.cuda import passes
+from neuprim.core.render.cuda import backend
 from tests import scenes
 from tests.backends import by
 from tests.numerics.equivalence import draw
@@ -85,9 +85,9 @@ def intercept(
     monkeypatch: pytest.MonkeyPatch, wrapped: Callable[[Launch, Any, Any, Sequence[Any], torch.device, int], None]
 ) -> None:
     """Have every launch of the pixel kernels go through ``wrapped(launch, kernel, dim, inputs, device, block)``."""
-    genuine = passes.launch
+    genuine = backend.launch
 
     def through(kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int = 256) -> None:
         wrapped(genuine, kernel, dim, inputs, device, block)
 
-    monkeypatch.setattr(passes, "launch", through)
+    monkeypatch.setattr(backend, "launch", through)

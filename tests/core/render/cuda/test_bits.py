@@ -13,7 +13,7 @@ from torch import Tensor
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.compute import warp
-from neuprim.core.render.cuda import backend, binning, colour_net, frame, passes, prepare_backward
+from neuprim.core.render.cuda import backend, binning, colour_net, frame, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from tests.core.render.cuda.frames import SCENES, Args, Launch, assert_same_bits, everything, intercept
 
@@ -112,7 +112,7 @@ def test_blocks_may_be_of_any_size(
         (together if one else changed).add(called)
         warp.launch(kernel, dim, inputs, device, block if one else threads)
 
-    for module in (binning, frame, colour_net, passes, prepare_backward):
+    for module in (binning, frame, colour_net, backend, prepare_backward):
         monkeypatch.setattr(module, "launch", through)
     assert_same_bits(plain[name], everything(name))
     assert {"row_spans", "sum_pairs", "_kernels", "_kernel"} <= changed  # of those made in a function, its name
@@ -139,7 +139,7 @@ def test_what_is_read_was_written(
         def __getattr__(self, name: str) -> Any:
             return getattr(torch, name)
 
-    for module in (backend, binning, frame, colour_net, passes):
+    for module in (backend, binning, frame, colour_net):
         monkeypatch.setattr(module, "torch", Torch())
     assert_same_bits(plain[name], everything(name))
     assert sum(filled) > 10000

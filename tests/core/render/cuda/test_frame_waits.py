@@ -50,14 +50,14 @@ def test_a_frame_waits_this_often(kind: str, expected: int, monkeypatch: pytest.
     t = scenes.tensors(60, 0, seed=5, **({"hidden": 3} if kind == "network" else {}))
     low, camera = scenes.lowered(t), scenes.camera(32, 32, distance=0.15 if kind == "float64" else 2.0)
     low.geometry.means.requires_grad_(kind == "gradients")
-    genuine = backend.forward
+    genuine = backend.composite_frame
 
     def reading(frame: Any, *rest: Any) -> Any:
         assert float(frame.rows.sum()) != 0.5 and len(frame.rows[frame.rows > 0]) > 0
         return genuine(frame, *rest)
 
     if kind == "reads":
-        monkeypatch.setattr(backend, "forward", reading)
+        monkeypatch.setattr(backend, "composite_frame", reading)
     with torch.set_grad_enabled(kind == "gradients"), counted(monkeypatch) as waits:
         if kind == "slabs":
             render_slabs(low, torch.arange(60) % 4, 4, camera, SETTINGS)

@@ -14,8 +14,8 @@ import torch
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
+from neuprim.core.render.cuda.backend import Composited
 from neuprim.core.render.cuda.frame import Frame
-from neuprim.core.render.cuda.passes import Composited
 from tests import scenes
 from tests.backends import by
 

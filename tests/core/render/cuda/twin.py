@@ -17,7 +17,7 @@ from neuprim.core.render.cpu.backend import _view
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_wide
 from neuprim.core.render.cuda.frame import Frame, prepare_frame
-from neuprim.core.render.limits import NON_FINITE, VISIBLE, min_visible_depth
+from neuprim.core.render.layout import NON_FINITE, VISIBLE, min_visible_depth
 from neuprim.core.render.output import RenderStats
 from neuprim.core.render.rasterize import PARAMETERS, Request
 from neuprim.core.settings import RenderSettings

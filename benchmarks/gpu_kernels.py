@@ -37,7 +37,7 @@ from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model.colours import sh_warp
 from neuprim.core.render.cuda import backend, binning, colour_net, float64, forward, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.layout import Form
+from neuprim.core.render.cuda.layout import KernelForm
 from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import kernels_warp
 from neuprim.core.volumes import density_grid_warp
@@ -48,7 +48,9 @@ PAGE = DOCS / "gpu.md"
 ARCHS = (80, 89, 90)
 EVERY, BESIDE = "every frame", "beside frames"
 NET = ", H=8"
-FORMS = {f"K={K} p={p}{NET if H > 0 else ''}": Form(K, p, 3, H) for H, K, p in product((-1, 8), (0, 2, 8, 16), (0, 2))}
+FORMS = {
+    f"K={K} p={p}{NET if H > 0 else ''}": KernelForm(K, p, 3, H) for H, K, p in product((-1, 8), (0, 2, 8, 16), (0, 2))
+}
 UNSPILLED, IN_FLOAT64 = 8, "float64"
 """Neurons up to which no kernel may spill, other than those with this in their name."""
 
@@ -59,11 +61,11 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     """(name, kernel, threads of a block) of a form, or of every frame."""
     if name == EVERY:
         yield "prepare", prepare.prepare_kernel(False), PER_BLOCK
-        yield "prepare, backward", prepare_backward._kernel(False), PER_BLOCK
+        yield "prepare, backward", prepare_backward._prepare_backward_kernel(False), PER_BLOCK
         yield "rows in float64", prepare.wide_kernel(False), PER_BLOCK
-        yield "network units", colour_net._kernels(False)[0], PER_BLOCK
-        yield "emit", binning._kernels()[0], PER_BLOCK
-        yield "list", binning._kernels()[1], BLOCK
+        yield "network units", colour_net._colour_net_kernels(False)[0], PER_BLOCK
+        yield "emit", binning._binning_kernels()[0], PER_BLOCK
+        yield "list", binning._binning_kernels()[1], BLOCK
         yield "spans", backend.row_spans, BLOCK
         yield "sums", backend.sum_pairs, BLOCK
         yield "float64 pairs", float64.float64_opacity_kernel(False), L.WARP

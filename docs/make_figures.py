@@ -24,7 +24,7 @@ import torch
 import neuprim
 from neuprim.core.cameras import look_at
 from neuprim.core.model.densities.cosine import OMEGA0, cosine_density
-from neuprim.core.model.edge import EDGES, NORMS, fade, profile
+from neuprim.core.model.edge import EDGES, NORMS, edge_profile, edge_weight
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 
@@ -50,12 +50,12 @@ def edges(target: Path) -> None:
     figure, (left, right) = plt.subplots(1, 2, figsize=(9, 3.1), layout="constrained")
     u, z = torch.linspace(-1.25, 1.25, 1001, dtype=torch.float64), torch.linspace(0, 14, 1001, dtype=torch.float64)
     for edge in EDGES:
-        weight = torch.where(u.abs() < 1, fade(u.square(), edge), torch.zeros_like(u))
+        weight = torch.where(u.abs() < 1, edge_weight(u.square(), edge), torch.zeros_like(u))
         summed = float(weight.sum() * (u[1] - u[0]))
         if abs(summed - NORMS[edge]) > 3e-3:
             sys.exit(f"N_{edge} is {NORMS[edge]}, the sum {summed}")
         left.plot(u, weight, lw=1.8, label=f"p = {edge}")
-        right.plot(z, profile(z, edge), lw=1.8, label=f"B$_{edge}$")
+        right.plot(z, edge_profile(z, edge), lw=1.8, label=f"B$_{edge}$")
     left.plot(u, (-4.5 * u.square()).exp(), color="0.6", lw=1.2, ls="--", label="Gaussian")
     left.set(xlabel="u", title="weight along a chord, (1 − u²)$^p$", xticks=[-1, -0.5, 0, 0.5, 1])
     right.axhline(0, color="0.6", lw=0.8)

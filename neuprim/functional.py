@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonFiniteError, nearest
-from neuprim.core.model.densities.cosine import amplified
+from neuprim.core.model.densities.cosine import apply_density_gain
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered
@@ -183,7 +183,7 @@ def _check_primitives(
     if colors.dim() == 3 and len(colors) != views:
         expected = f"({views}, {n}, channels), one set per camera of viewmats"
         raise _wrong("colors", f"shape {tuple(colors.shape)}", expected)
-    w2, b2 = amplified(t["w2"], t["b2"], gain)
+    w2, b2 = apply_density_gain(t["w2"], t["b2"], gain)
     palettes = list(colors.unbind()) if colors.dim() == 3 else [colors] * views
     return geometry, Cosine(t["W1"], t["b1"], w2, b2, float(omega0), edge), palettes
 

@@ -7,7 +7,7 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neuprim.core.compression import BitTable, Quantizers, canonicalize, fit_quantizers, storage_order
+from neuprim.core.compression import BitTable, Quantizers, canonical_model, fit_quantizers, storage_order
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import ColourField, DensityField, prunable_units_by_name
@@ -96,7 +96,7 @@ def gaussians(count: int = 30) -> Primitives:
 
 def stored(model: Primitives, table: BitTable) -> tuple[Primitives, Quantizers]:
     """The model before any number is rounded, folded and in the order of the file, and how its numbers are coded."""
-    whole = canonicalize(model)
+    whole = canonical_model(model)
     made = fit_quantizers(whole, table)
     rows = storage_order(whole, made)
     return Primitives(model.density, model.colour, {name: value[rows] for name, value in whole.params.items()}), made

@@ -23,7 +23,7 @@ from neuprim.core.compute import device
 from neuprim.core.render import backends
 from neuprim.core.render.backends import Backend
 from neuprim.core.render.cpu.backend import render as draw_on_processor
-from neuprim.core.render.draw import Draw, on_device
+from neuprim.core.render.draw import Draw, draw_on_device
 from neuprim.core.render.output import RenderOutput
 
 __all__ = ["CARD", "Card", "pretended"]
@@ -152,7 +152,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterato
         def load() -> Draw:
             def draw(*frame: Any) -> RenderOutput:
                 before = card.waits.copy()
-                output = on_device(draw_on_processor, torch.device("cpu"))(*frame)
+                output = draw_on_device(draw_on_processor, torch.device("cpu"))(*frame)
                 card.waits = before  # for the numbers that the pretended backend moves
                 return output
 

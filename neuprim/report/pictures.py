@@ -13,7 +13,7 @@ from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.metrics import matched
+from neuprim.core.metrics import comparable_images
 
 ERROR_SCALE = 0.2  # error at the bright end of :func:`error_map` and of the report's colour bar
 
@@ -35,7 +35,7 @@ def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> ND
     """
     if not scale > 0:
         raise ConfigError(f"scale of the error map must be positive, found {scale}")
-    first, second = matched(rendered, truth)
+    first, second = comparable_images(rendered, truth)
     error = (first - second).abs().mean(-1).numpy()
     return _color_table()[np.rint(np.clip(error / scale, 0.0, 1.0) * 255.0).astype(np.intp)]
 

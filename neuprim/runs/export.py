@@ -19,7 +19,7 @@ from neuprim.core.compression import is_compressed
 from neuprim.core.conditions import flag, named, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
-from neuprim.core.io.files import StagedOutput, refuse_existing, staged, write_json
+from neuprim.core.io.files import StagedOutput, refuse_existing, staged_output, write_json
 from neuprim.core.io.plain import load_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
@@ -69,7 +69,7 @@ def export_run(
     options, conditions = _parse_options(words, exporter, model.task.conditions)
     notes: list[str] = []
     read_conditions(model.task.conditions, conditions, notes.append)
-    with staged(final, overwrite) as output:
+    with staged_output(final, overwrite) as output:
         job = ExportJob(model, output.out, options, conditions, progress)
         with attribute_errors(source):
             report = exporter.write(job)

@@ -15,12 +15,12 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
-from neuprim.core.io.plain import finite, load_json
+from neuprim.core.io.plain import finite_number, load_json
 from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import count_numbers, nonzero_rows
+from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.backends import computing_device, device_of, with_available_device
+from neuprim.core.render.backends import best_render_device, computing_device, with_available_device
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.density_truth import VolumeSource
 from neuprim.plugins.attribution import attribute_errors
@@ -151,7 +151,7 @@ def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> Tra
 
 def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
     """The model on the device where views like this one are best drawn."""
-    return model.to(device_of(model, settings, view.camera, view.conditions))
+    return model.to(best_render_device(model, settings, view.camera, view.conditions))
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:
@@ -166,7 +166,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: {error}") from error
     if not isinstance(data, dict) or any(
-        finite(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None
+        finite_number(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None
     ):
         raise DataError(f"{path}: expected an object with metrics")
     return data
@@ -177,8 +177,8 @@ def kept_shares(model: Primitives) -> dict[str, float]:
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
     for name, unit in prunable_units_by_name(model.density, model.colour).items():
-        group, size = f"{name.partition('.')[0]}.{unit.group or unit.name}", count_numbers(unit, model.params)
-        share = float(nonzero_rows(unit, model.params).float().mean()) if model.count else 0.0
+        group, size = f"{name.partition('.')[0]}.{unit.group or unit.name}", count_unit_numbers(unit, model.params)
+        share = float(primitives_with_unit(unit, model.params).float().mean()) if model.count else 0.0
         kept[group], sizes[group] = kept.get(group, 0.0) + size * share, sizes.get(group, 0) + size
     return {group: value / sizes[group] for group, value in kept.items()}
 

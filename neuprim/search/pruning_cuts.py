@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import PrunableUnit, count_numbers, nonzero_rows, zero_units
+from neuprim.core.model.prunable import PrunableUnit, count_unit_numbers, primitives_with_unit, zero_units
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.train.sensitivity import Sensitivity
 from neuprim.search.model_quality import TrainingQuality
@@ -31,7 +31,7 @@ def _units(model: Primitives) -> dict[str, PrunableUnit]:
 def count_stored_numbers(model: Primitives) -> int:
     """Return how many numbers a file holds: all but units that are zero."""
     zeros = sum(
-        count_numbers(unit, model.params) * int((~nonzero_rows(unit, model.params)).sum())
+        count_unit_numbers(unit, model.params) * int((~primitives_with_unit(unit, model.params)).sum())
         for unit in _units(model).values()
     )
     return model.count * model.parameters_per_primitive - zeros
@@ -41,7 +41,7 @@ def zero_masks(model: Primitives) -> dict[str, Tensor]:
     """Return parameter -> (N, ...) bool of the numbers in units that are zero."""
     masks: dict[str, Tensor] = {}
     for unit in _units(model).values():
-        gone = ~nonzero_rows(unit, model.params)
+        gone = ~primitives_with_unit(unit, model.params)
         if bool(gone.any()):
             for name, place in unit.places.items():
                 mask = masks.setdefault(name, torch.zeros_like(model.params[name], dtype=torch.bool))
@@ -97,8 +97,8 @@ def cut_to_loss(
         prices: of this model, see :func:`price_cuts`.
     """
     units = _units(model)
-    present = {name: nonzero_rows(unit, model.params).cpu() for name, unit in units.items()}
-    numbers = {name: count_numbers(unit, model.params) for name, unit in units.items()}
+    present = {name: primitives_with_unit(unit, model.params).cpu() for name, unit in units.items()}
+    numbers = {name: count_unit_numbers(unit, model.params) for name, unit in units.items()}
     whole = torch.full((model.count,), float(model.parameters_per_primitive))
     for name, has in present.items():
         whole -= numbers[name] * (~has).float()

@@ -11,7 +11,7 @@ from neuprim.config import Job, RunConfig
 from neuprim.core.compression import (
     BitTable,
     Quantizers,
-    canonicalize,
+    canonical_model,
     fake_quantize,
     fit_quantizers,
     fit_quantizers_to_error,
@@ -65,7 +65,7 @@ class QuantizationSearch:
     """Quantize by one number: the squared error that rounding may add, as a share of the model's own."""
 
     def __init__(self, model: Primitives, dataset: Dataset, quality: TrainingQuality) -> None:
-        self.model = canonicalize(model)
+        self.model = canonical_model(model)
         effects = sensitivity(self.model, dataset, quality.others[:_SENSITIVITY_VIEWS], quality.settings)
         if quality.draws:
             inside = inner_sensitivity(self.model, quality.draws, threads=quality.settings.threads)
@@ -114,7 +114,7 @@ def finetune_for_table(
     data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
 ) -> QuantizedModel:
     """Train a model for the bits of a table; returns it untrained where training views are better so."""
-    whole = canonicalize(model)
+    whole = canonical_model(model)
     quantizers, quality = fit_quantizers(whole, table), TrainingQuality.of_run(data.config, data.dataset)
     before = quality(dequantize(whole, quantizers))
     progress("training for few bits", 0.0)

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.core import notices
-from neuprim.core.compute.code_cache import code_cache, weakness
+from neuprim.core.compute.code_cache import code_cache, folder_weakness
 from neuprim.core.compute.kernels import cache_directory
 from neuprim.core.notices import NeuprimWarning
 from tests.systems import posix
@@ -22,7 +22,7 @@ def test_a_folder_of_ones_own_is_taken_and_made_private(tmp_path: Path) -> None:
         assert code_cache(tmp_path / "own") == tmp_path / "own"
     finally:
         os.umask(before)
-    assert stat.S_IMODE((tmp_path / "own").stat().st_mode) == 0o700 and not weakness(tmp_path / "own")
+    assert stat.S_IMODE((tmp_path / "own").stat().st_mode) == 0o700 and not folder_weakness(tmp_path / "own")
 
 
 @posix
@@ -44,15 +44,15 @@ def test_who_may_replace_the_folder_counts_too(tmp_path: Path) -> None:
     place = tmp_path / "open" / "own"
     place.mkdir(parents=True, mode=0o700)
     (tmp_path / "open").chmod(0o777)
-    assert weakness(place) == f"others may write {tmp_path / 'open'}"
+    assert folder_weakness(place) == f"others may write {tmp_path / 'open'}"
     (tmp_path / "open").chmod(0o1777)  # as /tmp: nobody moves what is not theirs
-    assert not weakness(place)
+    assert not folder_weakness(place)
     (tmp_path / "link").symlink_to(place)
     (tmp_path / "open").chmod(0o777)
-    assert weakness(tmp_path / "link"), "where the link leads to"
+    assert folder_weakness(tmp_path / "link"), "where the link leads to"
 
 
 @posix
 def test_a_folder_of_somebody_else_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(os, "getuid", lambda: tmp_path.stat().st_uid + 1)
-    assert weakness(tmp_path) == f"belongs to user {tmp_path.stat().st_uid}"
+    assert folder_weakness(tmp_path) == f"belongs to user {tmp_path.stat().st_uid}"

@@ -270,9 +270,9 @@ def test_harmonics_do_not_read_beyond_their_tensors(change: dict[str, Any], mess
         "origin": torch.zeros(3),
         "degree": 3,
     }
-    assert sh.colors(**whole).shape == (N, 3)
+    assert sh.sh_colors(**whole).shape == (N, 3)
     with pytest.raises(FormError, match=f"^sh.colors: {message}"):
-        sh.colors(**{**whole, **change})
+        sh.sh_colors(**{**whole, **change})
 
 
 # ---------------------------------------------------------------- what is right stays right

@@ -20,7 +20,7 @@ from tests.kernels import PACKAGE, frozen_into_kernels, kernel_modules
 
 def frames() -> int:
     gc.collect()
-    return sum(type(x) is backend._Prepared for x in gc.get_objects())
+    return sum(type(x) is backend._PreparedFrame for x in gc.get_objects())
 
 
 def test_a_frame_without_gradients_keeps_nothing() -> None:

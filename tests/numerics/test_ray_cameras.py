@@ -13,7 +13,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
-from neuprim.core.render.reference.backend import _Prepared, frame_rays, pixel_directions
+from neuprim.core.render.reference.backend import _PreparedPrimitives, frame_rays, pixel_directions
 from tests import scenes
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -105,7 +105,7 @@ def test_blocks_leave_out_nothing_that_is_hit(kind: str) -> None:
     whole = render_lowered(low, camera, SETTINGS)
     assert (whole.alpha > 0.05).double().mean() > 0.1
     with torch.no_grad():
-        seen = frame_rays(camera, low.geometry, _Prepared(low, camera).center, 0.01)
+        seen = frame_rays(camera, low.geometry, _PreparedPrimitives(low, camera).center, 0.01)
         everything, corner = seen.rays, seen.block(0, 0, 16, 16)
     assert everything.directions.shape == (camera.height, camera.width, 3) and len(corner[1]) < 40
     for y, x in [(y, x) for y in range(0, camera.height, 3) for x in range(0, camera.width, 5)]:

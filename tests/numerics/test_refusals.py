@@ -86,6 +86,6 @@ def test_spherical_harmonics_that_overflow_are_refused_by_name(backend: str) -> 
     m = model()
     camera = scenes.camera(20, 20)
     way = m.params["means"][4] - camera.position.float()
-    m.params["sh_rest"][4] = 3e38 * sh.basis(way / way.norm(), 3)[1:, None].sign()  # every band adds up
+    m.params["sh_rest"][4] = 3e38 * sh.sh_basis(way / way.norm(), 3)[1:, None].sign()  # every band adds up
     with pytest.raises(NonFiniteError, match=r"of primitive 4\b"):
         render(m, camera, settings=settings(backend))

@@ -29,7 +29,7 @@ def static_model(neurons: int = 3, degree: int = 1) -> Primitives:
     task = load_task("static")
     assert task.fields is not None
     field = task.fields["SphericalHarmonics"](degree=degree)
-    n, rest = len(PLACES), sh.coefficient_count(degree) - 1
+    n, rest = len(PLACES), sh.sh_coefficient_count(degree) - 1
     params = {
         "means": PLACES.clone(),
         "log_scales": RADII.log()[:, None].repeat(1, 3),
@@ -38,7 +38,7 @@ def static_model(neurons: int = 3, degree: int = 1) -> Primitives:
         "b1": torch.randn(n, neurons, generator=generator),
         "w2": 0.05 * torch.randn(n, neurons, generator=generator),
         "b2": torch.full((n, 1), 6.0),
-        "sh_dc": sh.initial_dc(COLOURS),
+        "sh_dc": sh.initial_sh_dc(COLOURS),
     }
     if rest:
         params["sh_rest"] = 0.03 * torch.randn(n, rest, 3, generator=generator)

@@ -277,7 +277,7 @@ def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_pa
     _, tensors = checkpoint.read_tensors(out / "model.safetensors", "model")
     data = (tmp_path / "g.ply").read_bytes()
     body = np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 62)
-    own = sh.initial_dc(tensors["logit"].sigmoid()[:, [3, 2, 1]]).numpy()
+    own = sh.initial_sh_dc(tensors["logit"].sigmoid()[:, [3, 2, 1]]).numpy()
     assert len(body) and all(np.abs(own - row).max(1).min() < 1e-4 for row in body[:, 6:9])
 
 

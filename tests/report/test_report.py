@@ -17,7 +17,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.errors import DataError
-from neuprim.core.metrics import psnr, ssim, to_json
+from neuprim.core.metrics import metric_to_json, psnr, ssim
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import error_map, write_report
 from neuprim.report.run_record import read_run
@@ -66,7 +66,7 @@ def make_run(folder: Path, size: tuple[int, int] = (48, 64), lines: int = 400, n
         save(Path(f"{base}.png"), rendered)
         save(Path(f"{base}_truth.png"), truth)
         save(Path(f"{base}_error.png"), error_map(rendered, truth))
-        numbers = {**to_json("psnr", psnr(rendered, truth)), "ssim": ssim(rendered, truth)}
+        numbers = {**metric_to_json("psnr", psnr(rendered, truth)), "ssim": ssim(rendered, truth)}
         entries.append({"name": name, **numbers, "seconds": 0.021})
     frames = [Image.fromarray((scene(*size, 0.5 * k).numpy() * 255).astype(np.uint8)) for k in range(6)]
     frames[0].save(folder / "renders" / "orbit.webp", save_all=True, append_images=frames[1:])
@@ -266,8 +266,8 @@ def test_any_missing_or_wrong_field_is_a_dash(quick: Path) -> None:
 
 
 def test_infinite_psnr(quick: Path) -> None:
-    views = [{"name": "a", **to_json("psnr", math.inf), "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.9}]
-    change(quick, per_view=views, **to_json("psnr", math.inf), psnr_worst=30.0)
+    views = [{"name": "a", **metric_to_json("psnr", math.inf), "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.9}]
+    change(quick, per_view=views, **metric_to_json("psnr", math.inf), psnr_worst=30.0)
     text = Structure(page_of(quick)).text
     assert "PSNR, mean ∞ dB" in text and "a ∞ dB PSNR 1.0000 SSIM" in text and "PSNR, worst view 30.00 dB b" in text
 

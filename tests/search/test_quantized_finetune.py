@@ -10,7 +10,7 @@ import torch
 
 from neuprim.config import Job
 from neuprim.core.compression import Quantizers, bit_table, canonicalize, fit_quantizers
-from neuprim.core.compression.quantizers import Columns
+from neuprim.core.compression.quantizers import ColumnQuantizer
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, make_finetune_trainer
@@ -152,7 +152,7 @@ def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, data: Tra
 
     def width(made: Quantizers) -> float:
         scheme = made["sh_dc"]
-        assert isinstance(scheme, Columns)
+        assert isinstance(scheme, ColumnQuantizer)
         return float((scheme.high - scheme.low).double() @ (1.0 / scheme.last).double())
 
     wanted = width(rounding.fit(0.3))

@@ -14,7 +14,7 @@ import torch
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
-from neuprim.core.model.edge import profile
+from neuprim.core.model.edge import edge_profile
 from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics
@@ -51,7 +51,7 @@ def test_polynomials_are_good_to_float32(edge: int) -> None:
     truths = {
         "cos": (2 * torch.pi * v).cos(),
         "sinc": torch.special.sinc(2 * v),
-        "edge": profile(2 * torch.pi * v, edge),
+        "edge": edge_profile(2 * torch.pi * v, edge),
     }
     for name, truth in truths.items():
         value = torch.zeros_like(v)

@@ -26,10 +26,10 @@ class ViewDependentColour(ColourField):
         return {"degree": self.degree, "channels": self.channels}
 
     def parameters(self) -> list[ParameterSpec]:
-        rest, C = sh.coefficient_count(self.degree) - 1, self.channels
-        base = ParameterSpec("base", (C,), lr=2e-2, init=lambda c: sh.initial_dc(c.colors))
+        rest, C = sh.sh_coefficient_count(self.degree) - 1, self.channels
+        base = ParameterSpec("base", (C,), lr=2e-2, init=lambda c: sh.initial_sh_dc(c.colors))
         shine = ParameterSpec("shine", (rest, C), lr=2e-3, init=lambda c: torch.zeros(c.count, rest, C))
         return [base, shine] if rest else [base]
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
-        return Constant(sh.colors(geometry.means, params["base"], params.get("shine"), camera.position, self.degree))
+        return Constant(sh.sh_colors(geometry.means, params["base"], params.get("shine"), camera.position, self.degree))

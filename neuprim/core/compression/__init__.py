@@ -5,7 +5,7 @@ from neuprim.core.compression.bits import DEFAULT_LEVEL, LEVELS, BitTable, bit_t
 from neuprim.core.compression.codec import (
     Quantizers,
     StoredSize,
-    canonicalize,
+    canonical_model,
     encode_sections,
     fake_quantize,
     fit_quantizers,
@@ -13,7 +13,7 @@ from neuprim.core.compression.codec import (
     format_bits,
     storage_order,
 )
-from neuprim.core.compression.file import CONFIG, is_compressed, read_compressed, read_head, write_compressed
+from neuprim.core.compression.file import CONFIG, is_compressed, read_compressed, read_model_header, write_compressed
 from neuprim.core.compression.sections import TEXT, Section
 
 __all__ = [
@@ -26,7 +26,7 @@ __all__ = [
     "Section",
     "StoredSize",
     "bit_table",
-    "canonicalize",
+    "canonical_model",
     "encode_sections",
     "fake_quantize",
     "fit_quantizers",
@@ -34,7 +34,7 @@ __all__ = [
     "format_bits",
     "is_compressed",
     "read_compressed",
-    "read_head",
+    "read_model_header",
     "storage_order",
     "write_compressed",
 ]

@@ -36,16 +36,16 @@ class BitTable:
 _NAMED = ("means", "log_scales", "quats", "log_gain", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest")
 
 
-def _level(*bits: int, others: int) -> BitTable:
+def _level_bits(*bits: int, others: int) -> BitTable:
     return BitTable({name: (own,) for name, own in zip(_NAMED, bits, strict=True)}, others)
 
 
 LEVELS: dict[int, BitTable] = {
-    1: _level(16, 11, 11, 11, 10, 9, 9, 9, 10, 9, others=10),
-    2: _level(14, 9, 9, 9, 8, 7, 7, 7, 8, 7, others=8),
-    3: _level(13, 8, 8, 8, 7, 6, 6, 6, 7, 6, others=7),
-    4: _level(12, 7, 7, 7, 6, 5, 5, 5, 6, 5, others=5),
-    5: _level(11, 6, 6, 6, 5, 4, 4, 4, 5, 4, others=4),
+    1: _level_bits(16, 11, 11, 11, 10, 9, 9, 9, 10, 9, others=10),
+    2: _level_bits(14, 9, 9, 9, 8, 7, 7, 7, 8, 7, others=8),
+    3: _level_bits(13, 8, 8, 8, 7, 6, 6, 6, 7, 6, others=7),
+    4: _level_bits(12, 7, 7, 7, 6, 5, 5, 5, 6, 5, others=5),
+    5: _level_bits(11, 6, 6, 6, 5, 4, 4, 4, 5, 4, others=4),
 }
 """From nearly lossless (1) to very small (5). Position, shape and strength have more bits, as images depend on them."""
 
@@ -65,7 +65,7 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
             raise ConfigError(f"--bits {word}: the model has no parameter {name!r}{nearest(name, [*names, OTHERS])}")
         if name in table.exact:
             raise ConfigError(f"--bits {word}: {name} is given twice")
-        bits = _numbers(word, text, name)
+        bits = _parse_bits(word, text, name)
         if name == OTHERS:
             table = replace(
                 table, others=bits[0], exact=table.exact | {n for n in (*names, OTHERS) if n not in table.named}
@@ -75,7 +75,7 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
     return table
 
 
-def _numbers(word: str, text: str, name: str) -> tuple[int, ...]:
+def _parse_bits(word: str, text: str, name: str) -> tuple[int, ...]:
     low, high = (MIN_BITS, 16) if name == "quats" else (1, MAX_BITS if name == "means" else 16)
     several = name not in ("means", "quats", OTHERS)
     parts = text.split(",")

@@ -14,8 +14,8 @@ from neuprim.core.compression.bits import BitTable
 from neuprim.core.compression.quantizers import (
     MAX_BITS,
     MIN_BITS,
-    Columns,
-    Rotations,
+    ColumnQuantizer,
+    RotationQuantizer,
     columns_of_step,
     fit_columns,
     relative_error,
@@ -27,17 +27,17 @@ from neuprim.core.compression.sections import (
     ROTATIONS,
     Section,
     morton_encode,
-    pack,
     pack_masks,
+    pack_section,
     pack_sparse,
 )
 from neuprim.core.errors import CheckpointError, FormError
-from neuprim.core.model.checks import method
+from neuprim.core.model.checks import method_label
 from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import nonzero_rows
+from neuprim.core.model.prunable import primitives_with_unit
 
-Quantizers = dict[str, Columns | Rotations]  # parameter -> how its numbers are coded
+Quantizers = dict[str, ColumnQuantizer | RotationQuantizer]  # parameter -> how its numbers are coded
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ _MIN_MASKED = 0.02  # A piece that a smaller share of the primitives lacks has n
 _POSITION_STEPS = 50.0  # smallest number of position steps in the median of the primitives' longest semi-axes
 
 
-def canonicalize(model: Primitives) -> Primitives:
+def canonical_model(model: Primitives) -> Primitives:
     """Return the equal model in the numbers that files store, detached, on the CPU.
 
     Raises CheckpointError for numbers that cannot be stored, FormError for what a field's own code returned.
@@ -69,7 +69,7 @@ def canonicalize(model: Primitives) -> Primitives:
         wanted = {name: tuple(value.shape) for name, value in own.items()}
         if {name: tuple(value.shape) for name, value in found.items()} != wanted:
             raise FormError(
-                f"{method(field, 'canonicalize')} returned tensors of other names or shapes; expected {wanted}"
+                f"{method_label(field, 'canonicalize')} returned tensors of other names or shapes; expected {wanted}"
             )
         params |= found
     for name, value in params.items():
@@ -88,15 +88,15 @@ def canonicalize(model: Primitives) -> Primitives:
 def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
     """Return quantizers of a canonical model: ranges from its numbers, bits from the table."""
     found: Quantizers = {}
-    sparse = _sparse(model)
+    sparse = _sparse_parameters(model)
     for spec in model.specs:
         x, bits = model.params[spec.name].reshape(model.count, spec.size), table.of(spec.name, spec.shape)
         if spec.name == "quats":
-            found[spec.name] = Rotations(bits[0])
+            found[spec.name] = RotationQuantizer(bits[0])
         elif spec.fixed:
             found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
         elif spec.name == "means":
-            found[spec.name] = _positions(model, x, bits[0], spec.name in table.exact)
+            found[spec.name] = _fit_positions(model, x, bits[0], spec.name in table.exact)
         else:
             columns = fit_columns(x, bits)
             if spec.name not in table.exact and model.count:
@@ -121,7 +121,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
         error: mean squared change that one column may add.
     """
     found: Quantizers = {}
-    sparse = _sparse(model)
+    sparse = _sparse_parameters(model)
     for spec in model.specs:
         x = model.params[spec.name].reshape(model.count, spec.size)
         # An unknown effect counts as infinite: the column is stored as finely as possible.
@@ -129,7 +129,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
         steps = (12.0 * error / own).sqrt()  # infinite where nothing changes
         if spec.name == "quats":
             turn = float((12.0 * 3.0 * error / own.sum()).sqrt())  # three of four components are stored
-            found[spec.name] = Rotations(
+            found[spec.name] = RotationQuantizer(
                 min(max(round(math.log2(2**0.5 / turn + 2)), MIN_BITS), 16) if turn > 0 else 16
             )
         elif spec.fixed:
@@ -143,22 +143,24 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
     return found
 
 
-def _even_positions(x: Tensor, steps: Tensor) -> Columns:
+def _even_positions(x: Tensor, steps: Tensor) -> ColumnQuantizer:
     """Return :func:`columns_of_step` with equal bits for all axes."""
     own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
     low = own.low.double()
     step = torch.where(own.high > own.low, (own.high.double() - low) / own.last, 0.0)
-    return Columns(torch.full_like(own.bits, bits), own.low, (low + ((1 << bits) - 1) * step).float())
+    return ColumnQuantizer(torch.full_like(own.bits, bits), own.low, (low + ((1 << bits) - 1) * step).float())
 
 
-def _sparse(model: Primitives) -> set[str]:
+def _sparse_parameters(model: Primitives) -> set[str]:
     """Return the parameters of pieces that some primitives lack; their zeros must stay zeros."""
     pieces = prunable_units_by_name(model.density, model.colour).values()
-    return {name for piece in pieces if not bool(nonzero_rows(piece, model.params).all()) for name in piece.places}
+    return {
+        name for piece in pieces if not bool(primitives_with_unit(piece, model.params).all()) for name in piece.places
+    }
 
 
-def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
+def _fit_positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
     """Return columns of positions, without clipping; distant primitives raise the bits of all."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
@@ -171,7 +173,7 @@ def _positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> Columns:
 def storage_order(model: Primitives, made: Quantizers) -> Tensor:
     """Return the (N,) int64 rows of a canonical model in file order: along a Z curve through the positions' codes."""
     places = made["means"]
-    assert isinstance(places, Columns)
+    assert isinstance(places, ColumnQuantizer)
     return torch.from_numpy(
         np.argsort(morton_encode(places.codes(model.params["means"]).numpy(), int(places.bits[0])), kind="stable")
     )
@@ -184,20 +186,20 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[Section]:
         spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order])
         for spec in model.specs
     }
-    masks, mask_of = _masks(model, made, codes)
+    masks, mask_of = _prunable_masks(model, made, codes)
     sections = [pack_masks(masks)] if masks else []
     for spec in model.specs:
         scheme, own = made[spec.name], codes[spec.name].numpy()
         if spec.name in mask_of:
-            assert isinstance(scheme, Columns)
+            assert isinstance(scheme, ColumnQuantizer)
             sections.append(pack_sparse(spec.name, spec.shape, scheme, own, mask_of[spec.name], masks))
             continue
-        coding = ROTATIONS if isinstance(scheme, Rotations) else POSITIONS if spec.name == "means" else COLUMNS
-        sections.append(pack(spec.name, spec.shape, scheme, own, coding))
+        coding = ROTATIONS if isinstance(scheme, RotationQuantizer) else POSITIONS if spec.name == "means" else COLUMNS
+        sections.append(pack_section(spec.name, spec.shape, scheme, own, coding))
     return sections
 
 
-def _masks(
+def _prunable_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
     """Return bit masks of pieces that some primitives lack, and parameter -> each column's mask number (0: none)."""
@@ -205,7 +207,7 @@ def _masks(
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])
         for n, s in made.items()
-        if isinstance(s, Columns) and n != "means"
+        if isinstance(s, ColumnQuantizer) and n != "means"
     }
     masks: list[np.ndarray] = []
     mask_of: dict[str, Tensor] = {}
@@ -232,7 +234,7 @@ def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, T
     }
 
 
-def format_bits(scheme: Columns | Rotations) -> str:
+def format_bits(scheme: ColumnQuantizer | RotationQuantizer) -> str:
     """Return ``"7"``, or ``"6 to 8"`` where columns differ."""
-    bits = sorted({scheme.bits} if isinstance(scheme, Rotations) else set(scheme.bits.tolist()))
+    bits = sorted({scheme.bits} if isinstance(scheme, RotationQuantizer) else set(scheme.bits.tolist()))
     return " to ".join(map(str, bits if len(bits) < 2 else (bits[0], bits[-1])))

@@ -30,9 +30,9 @@ from neuprim.core.compression.sections import (
     CorruptSection,
     Section,
     compress_planes,
-    content_size,
-    unpack,
+    section_content_size,
     unpack_masks,
+    unpack_section,
 )
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
@@ -54,7 +54,7 @@ _MAX_SECTIONS, _MAX_DIMENSIONS, _MAX_COLUMNS, _MAX_PRIMITIVES = 4096, 4, 2**20, 
 
 
 @dataclass(frozen=True)
-class _Entry:
+class _TableEntry:
     """A row of the table: a section without content, bytes of its planes, packing, stored bytes, their checksum."""
 
     section: Section
@@ -65,10 +65,10 @@ class _Entry:
 
 
 @dataclass(frozen=True)
-class _Head:
+class _FileHead:
     header: dict[str, Any]
     count: int
-    entries: list[_Entry]
+    entries: list[_TableEntry]
 
 
 # ---------------------------------------------------------------- writing
@@ -94,13 +94,13 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     packed = [compress_planes(s.planes) for s in sections]
     numbers = count * sum(s.columns for s in sections if s.coding != TEXT)
     for i in sorted(range(len(sections)), key=lambda i: len(plain[i]) - len(packed[i])):
-        if _allowed(numbers, sum(map(len, packed))):
+        if _expansion_allowed(numbers, sum(map(len, packed))):
             break
         packed[i] = plain[i]  # a model of zeros would exceed the limit of expansion
     packings = [_PLAIN if len(a) == len(b) else _ZSTD for a, b in zip(packed, plain, strict=True)]
     stored = [s.head + data for s, data in zip(sections, packed, strict=True)]
     rows = zip(sections, packings, plain, stored, strict=True)
-    table = b"".join(_entry(section, packing, len(content), data) for section, packing, content, data in rows)
+    table = b"".join(_pack_entry(section, packing, len(content), data) for section, packing, content, data in rows)
     start = _START.pack(VERSION, len(sections), count, len(text), len(table), 0)[:-4]
     try:
         with atomic_path(path) as temporary, open(temporary, "wb") as file:
@@ -113,13 +113,13 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     return {s.name: len(data) for s, data in zip(sections, stored, strict=True)}
 
 
-def _entry(section: Section, packing: int, content: int, data: bytes) -> bytes:
+def _pack_entry(section: Section, packing: int, content: int, data: bytes) -> bytes:
     name = section.name.encode()
     dimensions = struct.pack(f"<BBB{len(section.shape)}I", section.coding, packing, len(section.shape), *section.shape)
     return bytes([len(name)]) + name + dimensions + _SIZES.pack(content, len(data), zlib.crc32(data))
 
 
-def _allowed(numbers: int, size: int) -> bool:
+def _expansion_allowed(numbers: int, size: int) -> bool:
     return 4 * numbers <= 2**20 + MAX_EXPANSION * size
 
 
@@ -135,16 +135,16 @@ def is_compressed(path: Path) -> bool:
         return False
 
 
-def read_head(path: Path) -> dict[str, Any]:
+def read_model_header(path: Path) -> dict[str, Any]:
     """Return the header without reading a section, or raise CheckpointError."""
-    with _opened(path) as file:
-        return _head(path, file).header
+    with _open_model_file(path) as file:
+        return _read_file_head(path, file).header
 
 
 def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str | None]:
     """Return header, float32 tensors by name and the run's configuration (or None), or raise CheckpointError."""
-    with _opened(path) as file:
-        head = _head(path, file)
+    with _open_model_file(path) as file:
+        head = _read_file_head(path, file)
         tensors: dict[str, Tensor] = {}
         masks: list[np.ndarray] = []
         config: str | None = None
@@ -155,21 +155,23 @@ def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str 
                 if zlib.crc32(data) != entry.checksum:
                     raise CorruptSection(f"its check sum is {zlib.crc32(data):08x}; expected {entry.checksum:08x}")
                 section = replace(section, head=data[: section.head_size])
-                if section.coding != TEXT and entry.content != (wanted := content_size(section, head.count, masks)):
+                if section.coding != TEXT and entry.content != (
+                    wanted := section_content_size(section, head.count, masks)
+                ):
                     raise CorruptSection(f"its planes have {entry.content} bytes; expected {wanted}")
-                content = _content(data[section.head_size :], entry)
+                content = _unpack_content(data[section.head_size :], entry)
                 if section.coding == TEXT:
                     config = content.decode("utf-8")
                 elif section.coding == MASKS:
                     masks = unpack_masks(section, content, head.count)
                 else:
-                    tensors[section.name] = unpack(section, content, head.count, masks)
+                    tensors[section.name] = unpack_section(section, content, head.count, masks)
             except (CorruptSection, UnicodeDecodeError) as error:
                 raise CheckpointError(f"{path}: section {section.name!r} is damaged: {error}") from error
     return head.header, tensors, config
 
 
-def _opened(path: Path) -> BinaryIO:
+def _open_model_file(path: Path) -> BinaryIO:
     try:
         return io.BytesIO(path.read_bytes())  # one snapshot: size and content agree
     except FileNotFoundError:
@@ -178,7 +180,7 @@ def _opened(path: Path) -> BinaryIO:
         raise CheckpointError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def _content(data: bytes, entry: _Entry) -> bytes:
+def _unpack_content(data: bytes, entry: _TableEntry) -> bytes:
     if entry.packing == _PLAIN:
         return data
     try:
@@ -193,7 +195,7 @@ def _content(data: bytes, entry: _Entry) -> bytes:
     return made
 
 
-def _head(path: Path, file: BinaryIO) -> _Head:
+def _read_file_head(path: Path, file: BinaryIO) -> _FileHead:
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     if (found := file.read(len(MAGIC))) != MAGIC:
@@ -224,18 +226,18 @@ def _head(path: Path, file: BinaryIO) -> _Head:
     if not isinstance(header, dict):
         raise CheckpointError(f"{path}: the header is a {type(header).__name__}; expected an object")
     try:
-        entries = _entries(table, sections, count)
-        _fit(entries, count, size, size - file.tell())
+        entries = _parse_table(table, sections, count)
+        _check_total_size(entries, count, size, size - file.tell())
     except CorruptSection as error:
         raise CheckpointError(f"{path}: {error}") from error
     if header.get("primitives") != count:
         raise CheckpointError(f"{path}: the header says {header.get('primitives')!r} primitives; expected {count}")
-    return _Head(header, count, entries)
+    return _FileHead(header, count, entries)
 
 
-def _entries(table: bytes, sections: int, count: int) -> list[_Entry]:
+def _parse_table(table: bytes, sections: int, count: int) -> list[_TableEntry]:
     file = io.BytesIO(table)
-    made: list[_Entry] = []
+    made: list[_TableEntry] = []
     names: set[str] = set()
     for number in range(sections):
         try:
@@ -254,14 +256,14 @@ def _entries(table: bytes, sections: int, count: int) -> list[_Entry]:
         if name in names:
             raise CorruptSection(f"section {name!r} is there twice")
         names.add(name)
-        made.append(_Entry(_named(name, coding, shape), content, packing, stored, checksum))
-        _check(made[-1], count)
+        made.append(_TableEntry(_checked_section(name, coding, shape), content, packing, stored, checksum))
+        _check_entry_sizes(made[-1], count)
     if file.read(1):
         raise CorruptSection(f"the table goes on after {sections} sections; expected its end")
     return made
 
 
-def _named(name: str, coding: int, shape: tuple[int, ...]) -> Section:
+def _checked_section(name: str, coding: int, shape: tuple[int, ...]) -> Section:
     if coding not in CODINGS:
         raise CorruptSection(
             f"section {name!r} has coding {coding}; expected {', '.join(f'{k} ({v})' for k, v in CODINGS.items())}"
@@ -283,7 +285,7 @@ def _named(name: str, coding: int, shape: tuple[int, ...]) -> Section:
     return section
 
 
-def _check(entry: _Entry, count: int) -> None:
+def _check_entry_sizes(entry: _TableEntry, count: int) -> None:
     """Check the sizes of a table row."""
     section, head = entry.section, entry.section.head_size
     most = MAX_TEXT if section.coding == TEXT else _MAX_PLANES * count * section.columns
@@ -304,12 +306,12 @@ def _check(entry: _Entry, count: int) -> None:
         )
 
 
-def _fit(entries: Sequence[_Entry], count: int, size: int, left: int) -> None:
+def _check_total_size(entries: Sequence[_TableEntry], count: int, size: int, left: int) -> None:
     stored = sum(entry.stored for entry in entries)
     if stored != left:
         raise CorruptSection(f"the sections take {stored} bytes by the table; {left} follow it")
     numbers = count * sum(entry.section.columns for entry in entries if entry.section.coding != TEXT)
-    if not _allowed(numbers, size):
+    if not _expansion_allowed(numbers, size):
         raise CorruptSection(
             f"stands for {count} primitives of {numbers // max(count, 1)} numbers; "
             f"expected at most {MAX_EXPANSION} times its size"

@@ -30,7 +30,7 @@ CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 
 
 @dataclass(frozen=True)
-class Columns:
+class ColumnQuantizer:
     """Uniform quantizer of C columns: ``bits`` (C,) int64, first and last value ``low`` and ``high`` (C,) float32."""
 
     bits: Tensor
@@ -57,32 +57,32 @@ class Columns:
         """Quantize and dequantize x, with straight-through gradients."""
         return self.values(self.codes(x)).to(x) + (x - x.detach())
 
-    def to(self, device: torch.device) -> Columns:
-        return Columns(self.bits.to(device), self.low.to(device), self.high.to(device))
+    def to(self, device: torch.device) -> ColumnQuantizer:
+        return ColumnQuantizer(self.bits.to(device), self.low.to(device), self.high.to(device))
 
 
-def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> Columns:
+def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
     """Fit the ends of every column of x (N, C), finite, on the CPU.
 
     ``clips``: candidate shares of the column beyond either end; the first wins a tie.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
-    best = Columns(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
+    best = ColumnQuantizer(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
     if not x.numel():
         return best
     least = torch.full((len(wanted),), torch.inf, dtype=torch.float64)
     ordered = np.sort(x.detach().double().numpy(), axis=0)
     for clip in clips:
-        low, high = (torch.from_numpy(_quantile(ordered, q).astype(np.float32)) for q in (clip, 1 - clip))
-        tried = Columns(wanted, low, high)
+        low, high = (torch.from_numpy(_column_quantile(ordered, q).astype(np.float32)) for q in (clip, 1 - clip))
+        tried = ColumnQuantizer(wanted, low, high)
         error = (tried.values(tried.codes(x)).double() - x.detach().double()).square().mean(0)
         better = error < least
         least = torch.where(better, error, least)
-        best = Columns(wanted, torch.where(better, low, best.low), torch.where(better, high, best.high))
+        best = ColumnQuantizer(wanted, torch.where(better, low, best.low), torch.where(better, high, best.high))
     return best
 
 
-def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Columns:
+def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> ColumnQuantizer:
     """Return columns of step ``steps`` (C,) that reach all of x (N, C), finite, on the CPU.
 
     Steps grow where they would need more than :data:`MAX_BITS`. ``through``: (C,) or a number that is one of the
@@ -99,10 +99,10 @@ def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Column
     bits = torch.log2(below + above + 1).ceil().clamp(min=1.0).long()
     first = through - below * steps
     last = torch.where(below + above > 0, first + ((1 << bits) - 1) * steps, first)
-    return Columns(bits, first.clamp(min=-_LARGEST).float(), last.clamp(max=_LARGEST).float())
+    return ColumnQuantizer(bits, first.clamp(min=-_LARGEST).float(), last.clamp(max=_LARGEST).float())
 
 
-def snap_to_zero(columns: Columns) -> Columns:
+def snap_to_zero(columns: ColumnQuantizer) -> ColumnQuantizer:
     """Move the ends inwards, by two steps at most, so that 0 is one of the values and decodes to exactly 0."""
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
@@ -115,10 +115,10 @@ def snap_to_zero(columns: Columns) -> Columns:
     mantissa, exponent = torch.frexp(steps)
     parts = torch.exp2((_MANTISSA - columns.bits).clamp(min=2).double())
     step = torch.ldexp((mantissa * parts).floor() / parts, exponent)
-    return Columns(columns.bits, (-code * step).float(), ((last - code) * step).float())
+    return ColumnQuantizer(columns.bits, (-code * step).float(), ((last - code) * step).float())
 
 
-def _quantile(ordered: np.ndarray, q: float) -> np.ndarray:
+def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
     """Return a quantile of sorted columns (N, C), by linear interpolation."""
     place = q * (len(ordered) - 1)
     below = int(place)
@@ -126,7 +126,7 @@ def _quantile(ordered: np.ndarray, q: float) -> np.ndarray:
     return np.asarray(ordered[below] * (1 - share) + ordered[above] * share)
 
 
-def relative_error(x: Tensor, columns: Columns) -> Tensor:
+def relative_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
     """Return the (C,) root mean squared errors over those of steps between -1 and 1 standard deviations."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
@@ -135,7 +135,7 @@ def relative_error(x: Tensor, columns: Columns) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Rotations:
+class RotationQuantizer:
     """Quantizer of unit quaternions: the three smallest components, ``bits`` each (:data:`MIN_BITS` to 16).
 
     With h = 2^(bits-1) - 1, the three are u / (h sqrt 2) for whole u from -h to h, in their order. The largest is
@@ -186,7 +186,7 @@ class Rotations:
         back = back * q.norm(dim=1, keepdim=True) * torch.where((back * q).sum(1, keepdim=True) < 0, -1.0, 1.0).to(q)
         return back + (quats - q)
 
-    def to(self, device: torch.device) -> Rotations:
+    def to(self, device: torch.device) -> RotationQuantizer:
         """Return itself; it has no tensors."""
         return self
 

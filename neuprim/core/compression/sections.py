@@ -12,7 +12,7 @@ import torch
 import zstandard
 from torch import Tensor
 
-from neuprim.core.compression.quantizers import MAX_BITS, MIN_BITS, Columns, Rotations
+from neuprim.core.compression.quantizers import MAX_BITS, MIN_BITS, ColumnQuantizer, RotationQuantizer
 
 TEXT, COLUMNS, POSITIONS, ROTATIONS, MASKS, SPARSE = range(6)
 CODINGS = {
@@ -60,16 +60,21 @@ class Section:
         return {TEXT: 0, MASKS: 0, ROTATIONS: 1}.get(self.coding, record * self.columns)
 
 
-def pack(name: str, shape: tuple[int, ...], scheme: Columns | Rotations, codes: np.ndarray, coding: int) -> Section:
+def pack_section(
+    name: str, shape: tuple[int, ...], scheme: ColumnQuantizer | RotationQuantizer, codes: np.ndarray, coding: int
+) -> Section:
     """Return the section of codes (N, C). Positions must be in file order."""
-    if isinstance(scheme, Rotations):
-        planes = [*_planes(codes[:, 0], 2), *(plane for i in (1, 2, 3) for plane in _planes(codes[:, i], scheme.bits))]
+    if isinstance(scheme, RotationQuantizer):
+        planes = [
+            *_byte_planes(codes[:, 0], 2),
+            *(plane for i in (1, 2, 3) for plane in _byte_planes(codes[:, i], scheme.bits)),
+        ]
         return Section(name, coding, shape, bytes([scheme.bits]), tuple(planes))
-    bits, head = scheme.bits.tolist(), _head(scheme)
+    bits, head = scheme.bits.tolist(), _quantizer_head(scheme)
     if coding == POSITIONS:
-        planes = _planes(np.diff(morton_encode(codes, bits[0]), prepend=np.uint64(0)), 3 * bits[0])
+        planes = _byte_planes(np.diff(morton_encode(codes, bits[0]), prepend=np.uint64(0)), 3 * bits[0])
     else:
-        planes = [plane for i, b in enumerate(bits) for plane in _planes(codes[:, i], b)]
+        planes = [plane for i, b in enumerate(bits) for plane in _byte_planes(codes[:, i], b)]
     return Section(name, coding, shape, head, tuple(planes))
 
 
@@ -83,47 +88,49 @@ def pack_masks(masks: Sequence[np.ndarray]) -> Section:
 def pack_sparse(
     name: str,
     shape: tuple[int, ...],
-    scheme: Columns,
+    scheme: ColumnQuantizer,
     codes: np.ndarray,
     mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
 ) -> Section:
     """Return the section of codes (N, C); column i has the rows of mask ``mask_of[i] - 1``, or all rows for 0."""
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
-    planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _planes(column, b)]
-    return Section(name, SPARSE, shape, _head(scheme) + b"".join(map(_MASK_NUMBER.pack, mask_of)), tuple(planes))
+    planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
+    return Section(
+        name, SPARSE, shape, _quantizer_head(scheme) + b"".join(map(_MASK_NUMBER.pack, mask_of)), tuple(planes)
+    )
 
 
-def _head(scheme: Columns) -> bytes:
+def _quantizer_head(scheme: ColumnQuantizer) -> bytes:
     return b"".join(
         _RECORD.pack(*r) for r in zip(scheme.bits.tolist(), scheme.low.tolist(), scheme.high.tolist(), strict=True)
     )
 
 
-def _planes(codes: np.ndarray, bits: int) -> list[bytes]:
+def _byte_planes(codes: np.ndarray, bits: int) -> list[bytes]:
     """Return the byte planes of codes, low bytes first."""
     return [
         ((codes >> codes.dtype.type(8 * i)) & codes.dtype.type(255)).astype(np.uint8).tobytes()
-        for i in range(_bytes(bits))
+        for i in range(_byte_count(bits))
     ]
 
 
-def _bytes(bits: int) -> int:
+def _byte_count(bits: int) -> int:
     return (bits + 7) // 8
 
 
-def content_size(section: Section, count: int, masks: Sequence[np.ndarray] = ()) -> int:
+def section_content_size(section: Section, count: int, masks: Sequence[np.ndarray] = ()) -> int:
     """Return the bytes of a section's planes, from its head, or raise CorruptSection."""
     if section.coding == MASKS:
         return section.columns * ((count + 7) // 8)
     if section.coding == ROTATIONS:
-        return count * (1 + 3 * _bytes(_rotations(section).bits))
-    bits = _records(section).bits.tolist()
+        return count * (1 + 3 * _byte_count(_rotations(section).bits))
+    bits = _column_records(section).bits.tolist()
     if section.coding == POSITIONS:
         if len(set(bits)) != 1 or len(bits) != 3:
             raise CorruptSection(f"{bits} bits; expected three columns of as many bits each")
-        return count * _bytes(3 * bits[0])
-    return sum(_bytes(b) * n for b, n in zip(bits, _counts(section, count, masks), strict=True))
+        return count * _byte_count(3 * bits[0])
+    return sum(_byte_count(b) * n for b, n in zip(bits, _column_counts(section, count, masks), strict=True))
 
 
 def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarray]:
@@ -136,19 +143,19 @@ def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarra
     return list(bits[:, :count].astype(bool))
 
 
-def unpack(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
-    """Decode a section: (count, *shape) float32 of ``content``, :func:`content_size` bytes, or raise CorruptSection."""
-    planes = _Planes(content)
+def unpack_section(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
+    """Decode (count, *shape) float32 of ``content``, :func:`section_content_size` bytes, or raise CorruptSection."""
+    planes = _PlaneReader(content)
     if section.coding == ROTATIONS:
         scheme = _rotations(section)
         codes = [planes.codes(count, 2, 3), *(planes.codes(count, scheme.bits, 2 * scheme.half) for _ in range(3))]
         return scheme.values(torch.from_numpy(np.stack(codes, 1)))
-    columns = _records(section)
+    columns = _column_records(section)
     if section.coding == POSITIONS:
-        return columns.values(torch.from_numpy(_cells(planes, count, int(columns.bits[0]))))
+        return columns.values(torch.from_numpy(_position_cells(planes, count, int(columns.bits[0]))))
     values = torch.zeros(count, section.columns)
-    for i, (of, own) in enumerate(zip(_mask_numbers(section), _counts(section, count, masks), strict=True)):
-        one = Columns(columns.bits[i : i + 1], columns.low[i : i + 1], columns.high[i : i + 1])
+    for i, (of, own) in enumerate(zip(_mask_numbers(section), _column_counts(section, count, masks), strict=True)):
+        one = ColumnQuantizer(columns.bits[i : i + 1], columns.low[i : i + 1], columns.high[i : i + 1])
         found = one.values(torch.from_numpy(planes.codes(own, int(one.bits), int(one.last))[:, None]))[:, 0]
         if of:
             values[torch.from_numpy(masks[of - 1]), i] = found
@@ -164,7 +171,7 @@ def _mask_numbers(section: Section) -> list[int]:
     return [of for (of,) in _MASK_NUMBER.iter_unpack(section.head[_RECORD.size * section.columns :])]
 
 
-def _counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[int]:
+def _column_counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[int]:
     """Return how many primitives each column has numbers of."""
     mask_of = _mask_numbers(section)
     if max(mask_of, default=0) > len(masks):
@@ -173,14 +180,14 @@ def _counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[i
     return [sizes[of] for of in mask_of]
 
 
-def _rotations(section: Section) -> Rotations:
+def _rotations(section: Section) -> RotationQuantizer:
     bits = section.head[0]
     if not MIN_BITS <= bits <= 16:
         raise CorruptSection(f"{bits} bits for rotations; expected {MIN_BITS} to 16")
-    return Rotations(bits)
+    return RotationQuantizer(bits)
 
 
-def _records(section: Section) -> Columns:
+def _column_records(section: Section) -> ColumnQuantizer:
     found = list(_RECORD.iter_unpack(section.head[: _RECORD.size * section.columns]))
     for i, (bits, low, high) in enumerate(found):
         if not 1 <= bits <= MAX_BITS:
@@ -188,21 +195,21 @@ def _records(section: Section) -> Columns:
         if not -np.inf < low <= high < np.inf:
             raise CorruptSection(f"column {i} goes from {low} to {high}; expected two finite numbers, ascending")
     bits, low, high = zip(*found, strict=True) if found else ((), (), ())
-    return Columns(
+    return ColumnQuantizer(
         torch.tensor(bits, dtype=torch.int64),
         torch.tensor(low, dtype=torch.float32),
         torch.tensor(high, dtype=torch.float32),
     )
 
 
-def _cells(planes: _Planes, count: int, bits: int) -> np.ndarray:
+def _position_cells(planes: _PlaneReader, count: int, bits: int) -> np.ndarray:
     keys = np.cumsum(planes.codes(count, 3 * bits, (1 << 3 * bits) - 1), dtype=np.int64)
     if len(keys) and (keys.min() < 0 or keys.max() >= 1 << 3 * bits):  # a step is too small to pass over both
         raise CorruptSection(f"steps along the curve leave its {3 * bits} bits")
     return morton_decode(keys.astype(np.uint64), bits)
 
 
-class _Planes:
+class _PlaneReader:
     """Reader of byte planes."""
 
     def __init__(self, content: bytes) -> None:
@@ -212,7 +219,7 @@ class _Planes:
         """Return the next (count,) int64 codes, each at most ``last``."""
         found = np.zeros(count, np.int64)
         if count:
-            for i in range(_bytes(bits)):
+            for i in range(_byte_count(bits)):
                 found |= self._bytes[self._at : self._at + count].astype(np.int64) << (8 * i)
                 self._at += count
             if found.min() < 0 or found.max() > last:
@@ -245,11 +252,11 @@ def compress_planes(planes: Sequence[bytes]) -> bytes:
     A block of a frame has one entropy table. Similar columns best share a block; others have their own.
     """
     whole = b"".join(planes)
-    cuts = ([whole], _runs(planes), planes)
-    return min([whole, *(_frame(parts, len(whole), level) for level in _ZSTD_LEVELS for parts in cuts)], key=len)
+    cuts = ([whole], _plane_runs(planes), planes)
+    return min([whole, *(_zstd_frame(parts, len(whole), level) for level in _ZSTD_LEVELS for parts in cuts)], key=len)
 
 
-def _runs(planes: Sequence[bytes]) -> list[bytes]:
+def _plane_runs(planes: Sequence[bytes]) -> list[bytes]:
     """Join neighbouring planes whose codes have equal bits."""
     made: list[list[bytes]] = []
     last = -1
@@ -262,7 +269,7 @@ def _runs(planes: Sequence[bytes]) -> list[bytes]:
     return [b"".join(run) for run in made]
 
 
-def _frame(parts: Sequence[bytes], size: int, level: int) -> bytes:
+def _zstd_frame(parts: Sequence[bytes], size: int, level: int) -> bytes:
     """Return a zstd frame with one or more blocks per part."""
     packer = zstandard.ZstdCompressor(level=level).compressobj(size=size)
     made = []

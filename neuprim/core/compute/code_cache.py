@@ -25,7 +25,7 @@ def code_cache(folder: Path) -> Path:
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         if made:
             folder.chmod(0o700)  # whatever the umask is
-        why = weakness(folder)
+        why = folder_weakness(folder)
     except OSError as error:
         why = f"cannot be used ({error.strerror or error})"
     if not why:
@@ -34,10 +34,10 @@ def code_cache(folder: Path) -> Path:
         f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. "
         "Expected a folder of yours alone"
     )
-    return _private()
+    return _private_code_folder()
 
 
-def weakness(folder: Path) -> str:
+def folder_weakness(folder: Path) -> str:
     """Return who else may change what a folder holds, in words; empty where nobody may, and on Windows."""
     if not hasattr(os, "getuid"):
         return ""
@@ -68,7 +68,7 @@ def _own_group(number: int, user: int) -> bool:
 
 
 @functools.cache
-def _private() -> Path:
+def _private_code_folder() -> Path:
     folder = tempfile.mkdtemp(prefix="neuprim-code-")  # only this user enters it
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
     return Path(folder)

@@ -56,7 +56,7 @@ def copy_from_host(tensor: Tensor, device: torch.device) -> Tensor:
     return tensor.pin_memory().to(device, non_blocking=True)
 
 
-def to_like(tensor: Tensor, like: Tensor) -> Tensor:
+def to_device_like(tensor: Tensor, like: Tensor) -> Tensor:
     """Return a few numbers on another tensor's device and of its dtype; differentiable, without waiting for a GPU."""
     return tensor.to(like, non_blocking=tensor.is_cpu)
 

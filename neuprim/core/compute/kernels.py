@@ -61,12 +61,12 @@ def kernel_sources(module: Path, package: Path = _ROOT) -> set[Path]:
         if file not in found:
             found.add(file)
             if file != package / "core" / "compute" / "kernels.py":
-                todo += _imported(file, package)
+                todo += _imported_sources(file, package)
     return found
 
 
 @functools.cache
-def _imported(file: Path, package: Path) -> set[Path]:
+def _imported_sources(file: Path, package: Path) -> set[Path]:
     names: set[str] = set()
     for base, imported, whole in _IMPORT.findall(file.read_text(encoding="utf-8")):
         words = re.findall(r"(\w+)(?: as \w+)?", re.sub(r"#.*", "", imported))
@@ -174,7 +174,25 @@ def _lent(context, array):  # type: ignore[no-untyped-def]
     return array(array), code
 
 
-def _place(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
+def _lent_tuple(context, arrays):  # type: ignore[no-untyped-def]
+    """A NamedTuple of :func:`_lent` arrays; its other parts stay as they are."""
+
+    def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
+        parts = []
+        for i, kind in enumerate(signature.return_type.types):
+            part = builder.extract_value(arguments[0], i)
+            if isinstance(kind, types.Array):
+                view = make_array(kind)(context, builder, value=part)
+                view.meminfo = context.get_constant_null(types.MemInfoPointer(types.voidptr))
+                part = view._getvalue()
+            parts.append(part)
+        made = context.make_tuple(builder, signature.return_type, parts)
+        return impl_ret_borrowed(context, builder, signature.return_type, made)
+
+    return arrays(arrays), code
+
+
+def _vector_pointer(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
     """Where the sixteen floats of an argument begin."""
     data = make_array(signature.args[array])(context, builder, value=arguments[array]).data
     return builder.bitcast(builder.gep(data, [arguments[index]]), _SIXTEEN.as_pointer())
@@ -184,7 +202,7 @@ def _copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
     """target[at : at + 16] = source[first : first + 16] of float32 arrays, which LLVM would copy one by one."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        read, written = (_place(context, builder, signature, arguments, *where) for where in ((2, 3), (0, 1)))
+        read, written = (_vector_pointer(context, builder, signature, arguments, *where) for where in ((2, 3), (0, 1)))
         builder.store(builder.load(read, align=4), written, align=4)
         return context.get_dummy_value()
 
@@ -200,10 +218,10 @@ def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         zeros, i32, i64 = ir.Constant(_SIXTEEN, [0.0] * 16), ir.IntType(32), ir.IntType(64)
         value, flag = (
-            builder.load(_place(context, builder, signature, arguments, 0, index), align=4) for index in (2, 3)
+            builder.load(_vector_pointer(context, builder, signature, arguments, 0, index), align=4) for index in (2, 3)
         )
         kept = builder.fcmp_unordered("!=", flag, zeros)
-        written = _place(context, builder, signature, arguments, 0, 1)
+        written = _vector_pointer(context, builder, signature, arguments, 0, 1)
         count = builder.zext(builder.ctpop(builder.bitcast(kept, ir.IntType(16))), i64)
         if _COMPRESSES:
             kind = ir.FunctionType(_SIXTEEN, [_SIXTEEN, kept.type, _SIXTEEN])
@@ -232,6 +250,7 @@ def _returned(context, array):  # type: ignore[no-untyped-def]
 
 
 borrow_array: Any = intrinsic(_lent)
+borrow_arrays: Any = intrinsic(_lent_tuple)
 release_array: Any = intrinsic(_returned)
 copy16: Any = intrinsic(_copy16)
 compress16: Any = intrinsic(_keep16)

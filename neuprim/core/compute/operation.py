@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 
-class _Nowhere:
+class _NoContext:
     """Takes what a forward pass saves for a backward pass that will not come."""
 
     def save_for_backward(self, *tensors: Tensor) -> None:
@@ -27,4 +27,4 @@ def apply_autograd(operation: type[torch.autograd.Function], *arguments: Any) ->
     """``operation.apply(*arguments)``, or its forward pass alone where no gradient is asked for."""
     if needs_grad(*arguments):
         return operation.apply(*arguments)
-    return operation.forward(_Nowhere(), *arguments)
+    return operation.forward(_NoContext(), *arguments)

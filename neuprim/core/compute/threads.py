@@ -70,7 +70,7 @@ def resolve_threads(threads: int) -> int:
     return threads or _limit.get() or core_count()
 
 
-def _pool(threads: int) -> ThreadPoolExecutor:
+def _thread_pool(threads: int) -> ThreadPoolExecutor:
     with _lock:
         if threads not in _pools:
             _pools[threads] = ThreadPoolExecutor(threads, thread_name_prefix="neuprim")
@@ -93,7 +93,7 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
         while (c := next(ticket)) < chunks:
             results[c] = function(c * chunk, min(count, (c + 1) * chunk), *args)
 
-    futures = [_pool(threads).submit(work) for _ in range(min(threads, chunks) - 1)]
+    futures = [_thread_pool(threads).submit(work) for _ in range(min(threads, chunks) - 1)]
     work()
     for future in futures:
         future.result()

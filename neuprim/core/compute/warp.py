@@ -41,7 +41,7 @@ Vec2s2d, Vec3s2d, Vec4s2d, Vec4is2d, Vec4ds2d = (wp.array2d(dtype=kind) for kind
 Floats3d = wp.array3d(dtype=wp.float32)
 
 
-def _start() -> None:
+def _start_warp() -> None:
     wp.config.quiet = True
     wp.config.log_level = wp.LOG_ERROR
     wp.config.enable_backward = False
@@ -50,13 +50,13 @@ def _start() -> None:
     wp.init()
 
 
-_start()
+_start_warp()
 
 
 _Bare: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))
 
 
-class _Array:
+class _KernelArray:
     """A tensor that a kernel takes as an array of ``dtype``, which may hold the numbers of the last dimension."""
 
     __slots__ = ("dtype", "tensor")
@@ -67,17 +67,17 @@ class _Array:
 
 def array(tensor: Tensor, dtype: Any) -> Any:
     """Return a contiguous tensor as an argument of a kernel; ``dtype`` may take the numbers of the last dimension."""
-    return _Array(tensor, dtype)
+    return _KernelArray(tensor, dtype)
 
 
 @functools.cache
-def _bytes(dtype: Any) -> int:
+def _dtype_bytes(dtype: Any) -> int:
     return int(wp.types.type_size_in_bytes(dtype))
 
 
-def _describe(given: _Array, into: Any) -> None:
+def _fill_descriptor(given: _KernelArray, into: Any) -> None:
     """Write a tensor's address, shape and strides into a descriptor."""
-    tensor, whole = given.tensor, _bytes(given.dtype)
+    tensor, whole = given.tensor, _dtype_bytes(given.dtype)
     assert tensor.is_contiguous(), "arrays of kernels are contiguous"
     shape, size = tensor.shape, tensor.element_size()
     ndim = len(shape)
@@ -91,22 +91,22 @@ def _describe(given: _Array, into: Any) -> None:
         step *= shape[k]
 
 
-def _packed(value: Any) -> Any:
+def _pack_argument(value: Any) -> Any:
     """An argument as Warp takes it, of its own memory."""
     if value is None:
         return _Bare()
-    if isinstance(value, _Array):
+    if isinstance(value, _KernelArray):
         made = _Bare()
-        _describe(value, made)
+        _fill_descriptor(value, made)
         return made
     return type(value)(*value) if isinstance(value, ctypes.Array) else value
 
 
-class _Recorded:
+class _RecordedLaunch:
     """A kernel's launch on one device, whose arguments are written over."""
 
     def __init__(self, kernel: Any, dims: tuple[int, ...], inputs: Sequence[Any], device: Any, block: int) -> None:
-        packed = [_packed(value) for value in inputs]
+        packed = [_pack_argument(value) for value in inputs]
         self.command = wp.launch(kernel, dim=dims, inputs=packed, device=device, block_dim=block, record_cmd=True)
         self.dims, self.packed = dims, packed
         self.arguments = list(self.command.params[1:])
@@ -116,8 +116,8 @@ class _Recorded:
             self.command.set_dim(dims)
             self.dims = dims
         for value, own in zip(inputs, self.arguments, strict=True):
-            if type(value) is _Array:
-                _describe(value, own)
+            if type(value) is _KernelArray:
+                _fill_descriptor(value, own)
             elif value is None:
                 own.data = 0
             elif isinstance(value, ctypes.Array):
@@ -127,12 +127,12 @@ class _Recorded:
         self.command.launch(stream)
 
 
-_recorded: dict[tuple[Any, int, int], _Recorded] = {}
+_recorded: dict[tuple[Any, int, int], _RecordedLaunch] = {}
 _streams: dict[tuple[int, int], Any] = {}
 _turn = threading.Lock()  # a recorded launch has one set of arguments
 
 
-def _stream(device: torch.device) -> Any:
+def _torch_stream(device: torch.device) -> Any:
     """The caller's stream."""
     index = torch.cuda.current_device() if device.index is None else device.index
     key = (index, torch._C._cuda_getCurrentRawStream(index))
@@ -141,7 +141,7 @@ def _stream(device: torch.device) -> Any:
     return _streams[key]
 
 
-def launch(
+def launch_kernel(
     kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK
 ) -> None:
     """Run a kernel on the caller's stream; nothing where ``dim`` is empty."""
@@ -150,12 +150,12 @@ def launch(
     dims = (dim,) if isinstance(dim, int) else tuple(dim)
     if 0 in dims:
         return
-    stream = _stream(device) if device.type == "cuda" else None
+    stream = _torch_stream(device) if device.type == "cuda" else None
     key = (kernel, -1 if stream is None else stream.device.ordinal, block)
     with _turn:
         recorded = _recorded.get(key)
         if recorded is None:
-            recorded = _recorded[key] = _Recorded(
+            recorded = _recorded[key] = _RecordedLaunch(
                 kernel, dims, inputs, "cpu" if stream is None else stream.device, block
             )
         recorded.launch(dims, inputs, stream)

@@ -88,12 +88,12 @@ def is_exr(path: Path, required: bool = False) -> bool:
 def exr_channels(path: Path) -> tuple[str, ...]:
     """Names of all channels of an OpenEXR file, alphabetically; raises DataError as :func:`read_exr_layout`."""
     is_exr(path, required=True)
-    return tuple(_read_header(path)[0])
+    return tuple(_read_exr_header(path)[0])
 
 
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
     """From the header: names of the wanted channels, or of the only R, G, B(, A); width; height; or DataError."""
-    channels, width, height = _read_header(path)
+    channels, width, height = _read_exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
         prefixes = [n[:-1] for n in channels if n.endswith("R") and {n[:-1] + "G", n[:-1] + "B"} <= channels.keys()]
@@ -108,7 +108,7 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
     return names, width, height
 
 
-def _read_header(path: Path) -> tuple[dict[str, Any], int, int]:
+def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
     """Channels by name, width and height."""
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
@@ -193,7 +193,7 @@ def write_exr_layers(
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
         raise DataError(f"{path}: channels to write have shapes {shapes}; expected one (H, W)")
-    stored = {name: _stored_values(f"{path}: channel {name}", channel) for name, channel in channels.items()}
+    stored = {name: _exr_values(f"{path}: channel {name}", channel) for name, channel in channels.items()}
     header = {**(attributes or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with checked_atomic_path(path) as temporary:
         try:
@@ -203,7 +203,7 @@ def write_exr_layers(
             raise DataError(f"{path}: cannot be written ({error})") from None
 
 
-def _stored_values(where: str, channel: ExrChannel) -> np.ndarray:
+def _exr_values(where: str, channel: ExrChannel) -> np.ndarray:
     values = channel.values.detach().cpu().float().numpy()
     bad = np.argwhere(~np.isfinite(values))
     if len(bad):

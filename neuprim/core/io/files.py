@@ -246,7 +246,7 @@ class StagedOutput:
 
 
 @contextmanager
-def staged(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
+def staged_output(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
     """Yield a :class:`StagedOutput` that is deleted after the block; errors name final paths, not staged ones."""
     existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:

@@ -67,23 +67,23 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
     with refuse_out_of_memory(path):
         if is_exr(path, required=channels is not None):
             names, width, height = read_exr_layout(path, channels)
-            _check_size(path, width, height, size)
+            _check_image_size(path, width, height, size)
             return read_exr(path, names, width, height)
         with _open_image(path) as image:
             mode = _lossless_mode(path, image)
-            _check_size(path, image.width, image.height, size)
-            return torch.from_numpy(_decode(path, image, mode))
+            _check_image_size(path, image.width, image.height, size)
+            return torch.from_numpy(_decode_image(path, image, mode))
 
 
 def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """(H, W) bool from a PNG, JPEG or WebP: True where any colour channel is not zero; raises as read_image."""
     with refuse_out_of_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
-        _check_size(path, image.width, image.height, size)
-        return torch.from_numpy(_decode(path, image, "RGB").any(axis=-1))
+        _check_image_size(path, image.width, image.height, size)
+        return torch.from_numpy(_decode_image(path, image, "RGB").any(axis=-1))
 
 
-def _check_size(path: Path, width: int, height: int, size: tuple[int, int] | None) -> None:
+def _check_image_size(path: Path, width: int, height: int, size: tuple[int, int] | None) -> None:
     if size is not None and (width, height) != tuple(size):
         raise DataError(f"{path}: image is {width}x{height}; expected {size[0]}x{size[1]}")
 
@@ -147,7 +147,7 @@ def _exif_orientation(image: Image.Image) -> int:
     return orientation if isinstance(orientation, int) and 1 <= orientation <= 8 else 1
 
 
-def _decode(path: Path, image: Image.Image, mode: str) -> np.ndarray:
+def _decode_image(path: Path, image: Image.Image, mode: str) -> np.ndarray:
     try:
         image.load()
         return np.array(image if image.mode == mode else image.convert(mode))

@@ -13,12 +13,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError, cut
-from neuprim.core.io.plain import finite, load_json
+from neuprim.core.io.plain import finite_number, load_json
 
 _MISSING = object()
 
 
-def _describe(value: Any) -> str:
+def _describe_json(value: Any) -> str:
     """A short description of a JSON value for messages."""
     if isinstance(value, list):
         return f"a list of {len(value)}"
@@ -48,7 +48,7 @@ class JsonReader:
         except (ValueError, RecursionError) as error:  # also bad UTF-8 and numbers of thousands of digits
             raise DataError(f"{path}: not valid JSON ({error})") from None
         if not isinstance(value, dict):
-            raise DataError(f"{path}: top level is {_describe(value)}; expected an object")
+            raise DataError(f"{path}: top level is {_describe_json(value)}; expected an object")
         return cls(value, str(path))
 
     def has(self, key: str) -> bool:
@@ -58,14 +58,14 @@ class JsonReader:
     def fail(self, key: str, expected: str) -> DataError:
         """The error for a field that is missing or wrong."""
         value = self.values.get(key, _MISSING)
-        actual = "is missing" if value is _MISSING else f"is {_describe(value)}"
+        actual = "is missing" if value is _MISSING else f"is {_describe_json(value)}"
         return DataError(f"{self.where}: {key} {actual}; expected {expected}")
 
     def number(
         self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf
     ) -> float:
         """A finite number strictly between ``low`` and ``high``."""
-        value = finite(self.values.get(key))
+        value = finite_number(self.values.get(key))
         if value is None or not low < value < high:
             raise self.fail(key, expected)
         return value
@@ -100,9 +100,9 @@ class JsonReader:
 
         def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
             if not shape:
-                number = finite(value)
+                number = finite_number(value)
                 if number is None:
-                    raise DataError(f"{self.where}: {key}{place} is {_describe(value)}; expected a finite number")
+                    raise DataError(f"{self.where}: {key}{place} is {_describe_json(value)}; expected a finite number")
                 return number
             if not isinstance(value, list) or len(value) != shape[0]:
                 raise self.fail(key, expected)
@@ -129,5 +129,5 @@ class JsonReader:
             raise self.fail(key, "a non-empty list of objects")
         for i, item in enumerate(value):
             if not isinstance(item, dict):
-                raise DataError(f"{self.where}: {key}[{i}] is {_describe(item)}; expected an object")
+                raise DataError(f"{self.where}: {key}[{i}] is {_describe_json(item)}; expected an object")
             yield JsonReader(item, f"{self.where}: {key}[{i}]")

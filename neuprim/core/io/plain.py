@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _MAX_DIGITS = 20  # of a whole number of 64 bits
 
 
-def finite(value: object) -> float | None:
+def finite_number(value: object) -> float | None:
     """A number of a file as a float; None for text, true, a list, NaN, 1e400 and the like."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
@@ -44,7 +44,7 @@ def load_json(text: str | bytes, infinite: bool = False) -> Any:
 
 def load_yaml(text: str) -> Any:
     """Parse YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
-    loader = _Loader(text)
+    loader = _PlainYamlLoader(text)
     try:
         return loader.get_single_data()
     finally:
@@ -68,7 +68,7 @@ def _refuse_constant(text: str) -> float:
     raise ValueError(f"{text} is no finite number")
 
 
-class _Loader(yaml.SafeLoader):
+class _PlainYamlLoader(yaml.SafeLoader):
     """``yaml.SafeLoader`` with the limits of this module."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
@@ -92,13 +92,13 @@ class _Loader(yaml.SafeLoader):
 
 
 for _kind in ("int", "float"):
-    _Loader.add_constructor(f"tag:yaml.org,2002:{_kind}", _Loader.number)
+    _PlainYamlLoader.add_constructor(f"tag:yaml.org,2002:{_kind}", _PlainYamlLoader.number)
 
 
 ArrayType = tuple[Any, tuple[int | None, ...]]  # dtype and shape; None for any length
 
 
-def read_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.ndarray]:
+def read_npz_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.ndarray]:
     """Read the named arrays of an uncompressed file of ``numpy.savez``; raises DataError before memory is allocated."""
     damaged = (OSError, ValueError, KeyError, EOFError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile)
     try:
@@ -106,14 +106,14 @@ def read_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.nda
         with zipfile.ZipFile(path) as archive:
             entries = {entry.filename: entry for entry in archive.infolist()}
             return {
-                name: _read_array(archive, entries.get(f"{name}.npy"), name, array_type, size)
+                name: _read_npz_array(archive, entries.get(f"{name}.npy"), name, array_type, size)
                 for name, array_type in wanted.items()
             }
     except damaged as error:
         raise DataError(f"{path}: damaged ({' '.join(str(error).split()) or type(error).__name__})") from error
 
 
-def _read_array(
+def _read_npz_array(
     archive: zipfile.ZipFile, entry: zipfile.ZipInfo | None, name: str, array_type: ArrayType, size: int
 ) -> np.ndarray:
     import numpy as np

@@ -83,14 +83,14 @@ def read_ply(path: Path) -> PlyVertices:
     """Read the vertices of a file; raises DataError for a missing or damaged one."""
     try:
         with open(path, "rb") as file:
-            return read_elements(file, path.stat().st_size, path, ("vertex",))["vertex"]
+            return read_ply_elements(file, path.stat().st_size, path, ("vertex",))["vertex"]
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error})") from error
 
 
-def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
+def read_ply_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
     """Read the ``wanted`` elements that a file of ``size`` bytes has; raises DataError."""
-    order, elements, comments = _read_header(file, path)
+    order, elements, comments = _read_ply_header(file, path)
     result: dict[str, PlyElement] = {}
     missing = set(wanted) & {element.name for element in elements}
     for element in elements:
@@ -107,7 +107,7 @@ def read_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) 
     return result
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader], tuple[str, ...]]:
+def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader], tuple[str, ...]]:
     """Byte order ("" for ASCII), elements, comments."""
     order: str | None = None
     elements: list[_ElementHeader] = []
@@ -172,7 +172,7 @@ def _parse_property(words: list[str], path: Path) -> tuple[str, str, str]:
 _Values = tuple[np.ndarray, dict[str, PlyList]]
 
 
-def _describe(element: _ElementHeader) -> str:
+def _describe_rows(element: _ElementHeader) -> str:
     return {"vertex": "vertices", "face": "faces"}.get(element.name, f"rows of {element.name[:40]}")
 
 
@@ -203,7 +203,7 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
                 return rows, {name: PlyList(np.full(count, size), table[name].reshape(-1)) for name, size in lists}
             file.seek(start)
         elif not any(length for _, _, length in fields):
-            found = f"{count} {_describe(element)} of {dtype.itemsize} bytes; only {left} bytes follow"
+            found = f"{count} {_describe_rows(element)} of {dtype.itemsize} bytes; only {left} bytes follow"
             raise DataError(f"{path}: {found}; expected a complete file")
     return _read_row_by_row(file, path, element, order, left)
 
@@ -240,7 +240,9 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
             sizes[i].append(size)
             place += size * width
             if place > len(data) or size < 0:
-                raise DataError(f"{path}: {element.count} {_describe(element)} announced; the file ends in row {row}")
+                raise DataError(
+                    f"{path}: {element.count} {_describe_rows(element)} announced; the file ends in row {row}"
+                )
     file.seek(start + place)
     octets = np.frombuffer(data, np.uint8)
     scalars = [(name, order + kind) for name, kind, length in element.fields if not length]
@@ -260,7 +262,7 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
 def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        found = f"{count} {_describe(element)} of {len(fields)} numbers; only {left} bytes follow"
+        found = f"{count} {_describe_rows(element)} of {len(fields)} numbers; only {left} bytes follow"
         raise DataError(f"{path}: {found}; expected a complete file")
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
@@ -275,20 +277,20 @@ def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) 
             table, lists = _read_ascii_lists(file, element)
     except (ValueError, IndexError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise DataError(f"{path}: {_describe(element)} are not numbers ({reason})") from error
+        raise DataError(f"{path}: {_describe_rows(element)} are not numbers ({reason})") from error
     if table.shape != (count, len(scalars)):
-        found = f"{table.shape[0]} {_describe(element)} of {table.shape[1]} numbers"
+        found = f"{table.shape[0]} {_describe_rows(element)} of {table.shape[1]} numbers"
         raise DataError(f"{path}: {found}; expected {count} of {len(scalars)}")
     rows = np.zeros(count, [(name, "<" + kind) for name, kind in scalars])
     for i, (name, kind) in enumerate(scalars):
-        rows[name] = _cast(table[:, i], name, kind, path)
+        rows[name] = _cast_column(table[:, i], name, kind, path)
     for name, kind, length in fields:
         if length:
-            lists[name] = PlyList(lists[name].sizes, _cast(lists[name].values, name, kind, path))
+            lists[name] = PlyList(lists[name].sizes, _cast_column(lists[name].values, name, kind, path))
     return rows, lists
 
 
-def _cast(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
+def _cast_column(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
     info = None if kind[0] == "f" else np.iinfo(kind)
     if info is not None and not ((values >= info.min) & (values <= info.max)).all():
         raise DataError(f"{path}: {name} has values outside its type; expected {info.min} to {info.max}")

@@ -3,25 +3,25 @@
 from neuprim.core.metrics.image import (
     SSIM_SIGMA,
     SSIM_WINDOW,
-    from_json,
-    matched,
-    means,
+    comparable_images,
+    mean_metrics,
+    metric_from_json,
+    metric_to_json,
     psnr,
     psnr_gain,
     ssim,
     ssim_3dgs,
-    to_json,
 )
 
 __all__ = [
     "SSIM_SIGMA",
     "SSIM_WINDOW",
-    "from_json",
-    "matched",
-    "means",
+    "metric_from_json",
+    "comparable_images",
+    "mean_metrics",
     "psnr",
     "psnr_gain",
     "ssim",
     "ssim_3dgs",
-    "to_json",
+    "metric_to_json",
 ]

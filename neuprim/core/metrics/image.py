@@ -1,7 +1,7 @@
 """Image quality of one rendered view against its truth: PSNR and SSIM.
 
 Float images (H, W, C) are compared as they are: nothing is clipped, quantised or converted. Sums are in float64. JSON
-has no infinity: files hold ``{"psnr": null, "psnr_infinite": true}`` (:func:`to_json`, :func:`from_json`).
+has no infinity: files hold ``{"psnr": null, "psnr_infinite": true}`` (:func:`metric_to_json`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ SSIM_WINDOW = 11  # taps of the Gaussian window per axis (Wang et al. 2004)
 SSIM_SIGMA = 1.5  # standard deviation of that window in pixels; kornia fixes it
 
 
-def matched(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """Return both images as detached float64 (H, W, C) on the CPU, or raise DataError or NonFiniteError."""
     images = {"rendered": rendered, "truth": truth}
     for name, image in images.items():
@@ -50,7 +50,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
     ``mask``: (H, W) bool of pixels that count; ``peak``: the value that counts as full signal.
     """
-    first, second = matched(rendered, truth)
+    first, second = comparable_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
         raise DataError(f"peak must be a positive number, found {peak}")
     squares = (first - second).square()
@@ -68,7 +68,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
 def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
     """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: without exposure."""
-    first, second = matched(rendered, truth)
+    first, second = comparable_images(rendered, truth)
     counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
     square = first[counted].square().sum(0)
     gain = torch.where(square > 0, (first * second)[counted].sum(0) / square.clamp_min(1e-300), torch.ones_like(square))
@@ -82,7 +82,7 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     image ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data
     range L.
     """
-    first, second = matched(rendered, truth)
+    first, second = comparable_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
         raise DataError(f"peak must be a positive number, found {peak}")
     fitting = min(first.shape[0], first.shape[1])
@@ -98,18 +98,18 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
     As :func:`ssim` of values 0 to 1, but every pixel has a whole window, and beyond the image both are black. The mean
     is mostly higher. Nothing is quantised, as those tools do.
     """
-    first, second = matched(rendered, truth)
+    first, second = comparable_images(rendered, truth)
     border = SSIM_WINDOW // 2
     first, second = (pad(image.permute(2, 0, 1)[None], (border,) * 4) for image in (first, second))
     return ssim_map(first, second, window_size=SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item()
 
 
-def to_json(key: str, value: float) -> dict[str, float | bool | None]:
+def metric_to_json(key: str, value: float) -> dict[str, float | bool | None]:
     """Return the entries for ``value`` under ``key``: infinity becomes ``null`` and ``<key>_infinite: true``."""
     return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
 
 
-def means(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
+def mean_metrics(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
     """JSON-able means of numbers by name over the views that have them, by the rules of ``TaskSpec.metrics``."""
     result: dict[str, Any] = {}
     for name in sorted({key for v in views for key in v}):
@@ -117,16 +117,16 @@ def means(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
         values, (kind, _, part) = [v[name] for v in having], name.partition("_")
         if kind == "mse":
             error = float(np.average(values, weights=[v.get(f"pixels_{part}", 1.0) for v in having]))
-            result |= to_json(f"psnr_pooled_{part}", -10.0 * math.log10(error) if error > 0 else math.inf)
+            result |= metric_to_json(f"psnr_pooled_{part}", -10.0 * math.log10(error) if error > 0 else math.inf)
         elif kind == "pixels":
             result[name] = int(sum(values))
         else:
-            result |= to_json(name, float(np.mean(values)))
+            result |= metric_to_json(name, float(np.mean(values)))
     return result
 
 
-def from_json(entries: Mapping[str, object], key: str) -> float | None:
-    """The number that :func:`to_json` stored under ``key``; None where it is missing, not a number or NaN."""
+def metric_from_json(entries: Mapping[str, object], key: str) -> float | None:
+    """The number that :func:`metric_to_json` stored under ``key``; None where it is missing, not a number or NaN."""
     if entries.get(f"{key}_infinite") is True:
         return math.inf
     value = entries.get(key)
@@ -137,8 +137,8 @@ def from_json(entries: Mapping[str, object], key: str) -> float | None:
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
     """Summarise metrics.json in one line: mean of inexact views, worst view, views worse than a black image."""
-    worst, bad = from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"]
-    values = [value for entry in metrics["per_view"] if (value := from_json(entry, "psnr")) is not None]
+    worst, bad = metric_from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"]
+    values = [value for entry in metrics["per_view"] if (value := metric_from_json(entry, "psnr")) is not None]
     wrong = [value for value in values if math.isfinite(value)]
     exact = f", {len(values) - len(wrong)} exact" if len(wrong) < len(values) else ""
     mean = sum(wrong) / len(wrong) if wrong else math.inf

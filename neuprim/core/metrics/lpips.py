@@ -19,7 +19,7 @@ from torch import Tensor
 from torch.nn.functional import conv2d, max_pool2d
 
 from neuprim.core.errors import BackendUnavailable, DataError
-from neuprim.core.metrics.image import matched
+from neuprim.core.metrics.image import comparable_images
 
 
 class _Layer(NamedTuple):
@@ -85,7 +85,7 @@ class Lpips:
         files = sorted(f for f in where.iterdir() if f.suffix in _SUFFIXES) if where.is_dir() else [where]
         if not files:
             raise DataError(f"{where}: no weights in it; expected files that end in {', '.join(_SUFFIXES)}")
-        return _made({key: value for file in files for key, value in _read(file).items()}, where)
+        return _lpips_of_weights({key: value for file in files for key, value in _read_weights(file).items()}, where)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> float:
         """The distance as published: of (H, W, 3) values clamped to 0..1 and mapped to -1..1; DataError below
@@ -98,7 +98,7 @@ class Lpips:
 
     def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:
         """Both as (1, 3, H, W) float32 of 0..1."""
-        images = [image.clamp(0.0, 1.0).permute(2, 0, 1)[None].float() for image in matched(rendered, truth)]
+        images = [image.clamp(0.0, 1.0).permute(2, 0, 1)[None].float() for image in comparable_images(rendered, truth)]
         if images[0].shape[1] != 3 or min(images[0].shape[2:]) < self.least:
             raise DataError(
                 f"LPIPS: images of shape {tuple(rendered.shape)}; expected at least ({self.least}, {self.least}, 3)"
@@ -121,7 +121,7 @@ class Lpips:
                 yield x / (x.square().sum(1, keepdim=True).sqrt() + _EPS)
 
 
-def _read(file: Path) -> Mapping[str, Any]:
+def _read_weights(file: Path) -> Mapping[str, Any]:
     try:
         if file.suffix == ".safetensors":
             from safetensors.torch import load_file
@@ -136,7 +136,7 @@ def _read(file: Path) -> Mapping[str, Any]:
     return found
 
 
-def _made(found: Mapping[str, Any], where: Path) -> Lpips:
+def _lpips_of_weights(found: Mapping[str, Any], where: Path) -> Lpips:
     parts: dict[tuple[str, int], Tensor] = {}
     for key, value in found.items():
         for pattern in (_CONVOLUTION, _LINEAR):
@@ -146,14 +146,16 @@ def _made(found: Mapping[str, Any], where: Path) -> Lpips:
     indices = {index for name, index in parts if name == "weight"}
     for network, layers in _NETWORKS.items():
         if indices == {layer.number for layer in layers}:
-            return _fitting(network, layers, parts, where)
+            return _checked_weights(network, layers, parts, where)
     raise DataError(
         f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or "
         f"net.sliceM.N"
     )
 
 
-def _fitting(network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str, int], Tensor], where: Path) -> Lpips:
+def _checked_weights(
+    network: str, layers: tuple[_Layer, ...], parts: Mapping[tuple[str, int], Tensor], where: Path
+) -> Lpips:
     def part(name: str, index: int, *shape: int) -> Tensor:
         value = parts.get((name, index))
         if value is None or tuple(value.shape) != shape or not bool(torch.isfinite(value).all()):
@@ -187,6 +189,6 @@ def flip(rendered: Tensor, truth: Tensor) -> float:
             f"FLIP needs the package flip-evaluator ({error}); pip install 'neuprim[flip]'"
         ) from error
     first, second = (
-        np.ascontiguousarray(x.clamp(0.0, 1.0).numpy(), dtype=np.float32) for x in matched(rendered, truth)
+        np.ascontiguousarray(x.clamp(0.0, 1.0).numpy(), dtype=np.float32) for x in comparable_images(rendered, truth)
     )
     return float(evaluate(second, first, "LDR", applyMagma=False, parameters={"ppd": PIXELS_PER_DEGREE})[1])

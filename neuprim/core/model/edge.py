@@ -29,7 +29,7 @@ _SERIES_BELOW, _TERMS = (
 )  # upward recursion loses digits as z^-n; the series' last term is below 1e-17 of the first
 
 
-def fade(square: Tensor, edge: int) -> Tensor:
+def edge_weight(square: Tensor, edge: int) -> Tensor:
     """(1 - u^2)^p from u^2, 0 outside the support; 1 everywhere for p = 0."""
     if edge == 0:
         return torch.ones_like(square)
@@ -67,7 +67,7 @@ def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
     return found
 
 
-def legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
+def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
     """a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), p = 1 or 2."""
     if edge == 1:
         return [c0 + c2 / 3, c1, 2 * c2 / 3]
@@ -82,7 +82,7 @@ def chord_integral(
 
     p = 1 or 2; ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
     """
-    a = legendre(*quadratic, edge)
+    a = edge_legendre(*quadratic, edge)
     total = offset * a[0]
     if z.shape[1]:
         j = spherical_bessel(z, 2 * edge)
@@ -94,7 +94,7 @@ def chord_integral(
     return total
 
 
-def profile(z: Tensor, order: int) -> Tensor:
+def edge_profile(z: Tensor, order: int) -> Tensor:
     """B_order(z) = (2 order + 1)!! j_order(z)/z^order, 1 at 0; float64, differentiable."""
     if order == 0:
         return sinc(z)

@@ -15,13 +15,21 @@ from torch import Tensor
 from neuprim.core.errors import FormError
 from neuprim.core.model.edge import EDGES, chord_integral, sinc
 from neuprim.core.model.geometry import Geometry, Pairs
-from neuprim.core.model.tensors import MOST_UNITS, Shaped, Shapes, Sizes, function_fault, labelled, number_fault
+from neuprim.core.model.tensors import (
+    MOST_UNITS,
+    ShapedTensors,
+    Shapes,
+    Sizes,
+    function_fault,
+    labelled_fault,
+    number_fault,
+)
 
 # ---------------------------------------------------------------- closed forms of density
 
 
 @dataclass(frozen=True)
-class Cosine(Shaped):
+class Cosine(ShapedTensors):
     """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
 
     p = 0 is the paper's; 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`). ``first + second`` is a sum of
@@ -50,7 +58,7 @@ class Cosine(Shaped):
     def fault(self, sizes: Sizes) -> str | None:
         if type(self.edge) is not int or self.edge not in EDGES:
             return f"edge has value {self.edge!r}; expected 0, 1 or 2"
-        return super().fault(sizes) or labelled("omega0", number_fault(self.omega0))
+        return super().fault(sizes) or labelled_fault("omega0", number_fault(self.omega0))
 
     def __add__(self, other: Cosine) -> Cosine:
         """f + g, exactly: the neurons of both side by side, with the first omega0 (the second if that is 0).
@@ -105,7 +113,7 @@ class Cosine(Shaped):
 
 
 @dataclass(frozen=True)
-class CustomDensity(Shaped):
+class CustomDensity(ShapedTensors):
     """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) rows, (M, 3) ray origins and unit directions and (M,)
@@ -116,7 +124,7 @@ class CustomDensity(Shaped):
     line_integral: Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], Tensor]
 
     def fault(self, sizes: Sizes) -> str | None:
-        return labelled("line_integral", function_fault(self.line_integral))
+        return labelled_fault("line_integral", function_fault(self.line_integral))
 
     def rows(self, index: Tensor | slice) -> CustomDensity:
         """That of some primitives, (M,) int64 or first:end."""
@@ -145,7 +153,7 @@ LoweredDensity = Cosine | CustomDensity
 
 
 @dataclass(frozen=True)
-class Constant(Shaped):
+class Constant(ShapedTensors):
     """One colour per primitive and view: rgb (N, C), any channel count."""
 
     per_primitive: ClassVar[bool] = True
@@ -179,7 +187,7 @@ class Constant(Shaped):
 
 
 @dataclass(frozen=True)
-class CustomColour(Shaped):
+class CustomColour(ShapedTensors):
     """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``radiance(prim, x, d)`` takes (M,) rows, (M, 3) chord middles in scene units and unit directions, returns (M, C).
@@ -194,7 +202,7 @@ class CustomColour(Shaped):
         if isinstance(self.channels, bool) or not isinstance(self.channels, int) or self.channels < 1:
             return f"channels has value {self.channels!r}; expected a whole number of at least 1"
         sizes["C"] = (self.channels, "channels")
-        return labelled("radiance", function_fault(self.radiance))
+        return labelled_fault("radiance", function_fault(self.radiance))
 
     def scaled(self, factors: Tensor) -> CustomColour:
         """The same times (N,) factors, at least 0."""
@@ -217,7 +225,7 @@ class CustomColour(Shaped):
 
 
 @dataclass(frozen=True)
-class RayNet(Shaped):
+class RayNet(ShapedTensors):
     """A colour network per primitive, evaluated where each pixel's ray passes through it.
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.schema import InitContext, ParameterSpec
-from neuprim.core.model.tensors import Shaped, Shapes
+from neuprim.core.model.tensors import ShapedTensors, Shapes
 
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
@@ -24,7 +24,7 @@ def quaternion_to_matrix(quats: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Geometry(Shaped):
+class Geometry(ShapedTensors):
     """N ellipsoids of hard support (radius 1 in whitened space).
 
     Attributes:
@@ -68,11 +68,11 @@ class Geometry(Shaped):
         return Geometry(self.means[rows], self.log_scales[rows], self.quats[rows])
 
 
-def _semi_axes(ctx: InitContext) -> Tensor:
+def _initial_log_scales(ctx: InitContext) -> Tensor:
     return (ctx.scales[:, None].repeat(1, 3) if ctx.axes is None else ctx.axes).float().log()
 
 
-def _orientation(ctx: InitContext) -> Tensor:
+def _initial_quats(ctx: InitContext) -> Tensor:
     if ctx.quats is not None:
         return ctx.quats.float()
     q = torch.zeros(ctx.count, 4)
@@ -82,8 +82,8 @@ def _orientation(ctx: InitContext) -> Tensor:
 
 GEOMETRY_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("means", (3,), 7e-4, lambda c: c.means.float(), lr_unit="extent"),
-    ParameterSpec("log_scales", (3,), 2e-2, _semi_axes),
-    ParameterSpec("quats", (4,), 1e-2, _orientation),
+    ParameterSpec("log_scales", (3,), 2e-2, _initial_log_scales),
+    ParameterSpec("quats", (4,), 1e-2, _initial_quats),
 )
 """Every model starts with these ten numbers per primitive."""
 

@@ -12,18 +12,18 @@ from torch import Tensor
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.checks import (
+    check_active_rows,
     check_channels,
     check_colour,
     check_density,
+    check_field_result,
     check_geometry,
-    check_result,
-    check_rows,
+    check_initial_tensor,
     check_shading,
-    check_shape,
-    check_start,
-    method,
+    check_tensor_shape,
+    field_label,
+    method_label,
     non_finite_error,
-    source,
 )
 from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, Pairs
@@ -54,7 +54,7 @@ class Lowered:
         check_density(self.density, sizes, density)
         check_colour(self.colour, sizes, colour)
         if self.rows is not None:
-            check_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
+            check_active_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
         self.check_frame(viewmat, background)
 
     def check_finite(self) -> None:
@@ -84,9 +84,9 @@ class Lowered:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
             channels = self.colour.channels
-            check_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
+            check_tensor_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
         if viewmat is not None:
-            check_shape("viewmat", viewmat, (4, 4))
+            check_tensor_shape("viewmat", viewmat, (4, 4))
         self._check_devices(viewmat)
 
     def _check_devices(self, viewmat: Tensor | None) -> None:
@@ -115,7 +115,7 @@ class Lowered:
 
     def owner(self, kind: Literal["density", "colour"]) -> str:
         """Whose form it is, for messages: ``"density field Waves"``."""
-        return source(kind, None if self.fields is None else self.fields[kind == "colour"])
+        return field_label(kind, None if self.fields is None else self.fields[kind == "colour"])
 
     def source(self, kind: Literal["density", "colour"]) -> str:
         """The same with the form: ``"density field Waves lowered to Cosine"``."""
@@ -124,17 +124,21 @@ class Lowered:
     def center_colors(self, position: Tensor) -> Tensor:
         """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
         found = self.colour.at_centers(self.geometry, position)
-        return check_result(found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance")
+        return check_field_result(
+            found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance"
+        )
 
     def optical_depth(self, pairs: Pairs) -> Tensor:
         """(M,) float64 integrals of sigma along chords, unclamped."""
         found = self.density.optical_depth(pairs)
-        return check_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
+        return check_field_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
 
     def chord_colours(self, pairs: Pairs) -> Tensor:
         """(M, C) float64 colours that are seen along chords."""
         found = self.colour.chord_colours(pairs)
-        return check_result(found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance").double()
+        return check_field_result(
+            found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance"
+        ).double()
 
 
 @dataclass(frozen=True)
@@ -152,7 +156,7 @@ class ActiveSet:
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
         """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
-        return check_result(found, (len(prim),), method(self.field, "density"))
+        return check_field_result(found, (len(prim),), method_label(self.field, "density"))
 
 
 class Primitives:
@@ -184,8 +188,8 @@ class Primitives:
     def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
         """Fresh primitives from the specs' own initialisers; raises FormError for other shapes."""
         own = [("starting points", spec) for spec in GEOMETRY_SPECS]
-        own += [(method(field, "parameters"), spec) for field in (density, colour) for spec in field.parameters()]
-        return cls(density, colour, {spec.name: check_start(spec, context, who) for who, spec in own})
+        own += [(method_label(field, "parameters"), spec) for field in (density, colour) for spec in field.parameters()]
+        return cls(density, colour, {spec.name: check_initial_tensor(spec, context, who) for who, spec in own})
 
     @property
     def count(self) -> int:
@@ -235,7 +239,7 @@ class Primitives:
         check_colour(colour, sizes, names[1])
         check_channels(sizes["C"][0], self.colour)
         found = self.colour.shade(geometry, density, conditions, settings or RenderSettings()) if shaded else None
-        shading = check_shading(found, geometry.count, method(self.colour, "shade"))
+        shading = check_shading(found, geometry.count, method_label(self.colour, "shade"))
         if shading.primitives is not None:
             colour = colour.scaled(shading.primitives)
         return Lowered(geometry, density, colour, active.rows, shading.pixels, names)
@@ -251,7 +255,7 @@ class Primitives:
         try:
             density = self.density.lower(active.own, active.geometry, active.conditions)
         except FormError as error:  # of a sum of forms, which knows no field
-            raise FormError(f"{method(self.density, 'lower')}: {error}") from error
+            raise FormError(f"{method_label(self.density, 'lower')}: {error}") from error
         check_density(density, sizes, type(self.density).__name__)
         return density, sizes
 
@@ -278,10 +282,10 @@ class Primitives:
         rows = self.density.active_rows(self.of(self.density), conditions)
         params = self.params
         if rows is not None:
-            from neuprim.core.model.rows import take_rows  # numba, loaded when first needed
+            from neuprim.core.model.rows import take_primitive_rows  # numba, loaded when first needed
 
-            check_rows(rows, self.count, f"{method(self.density, 'active_rows')} returned")
-            params = take_rows(params, rows)
+            check_active_rows(rows, self.count, f"{method_label(self.density, 'active_rows')} returned")
+            params = take_primitive_rows(params, rows)
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}
             conditions = {name: value.to(dtype) for name, value in conditions.items()}
@@ -289,7 +293,7 @@ class Primitives:
         stored = Geometry(params["means"], params["log_scales"], params["quats"])
         moved = self.density.move(own, stored, conditions)
         if moved is not stored:
-            check_geometry(moved, method(self.density, "move"), stored.count)
+            check_geometry(moved, method_label(self.density, "move"), stored.count)
         return ActiveSet(self.density, conditions, rows, params, own, stored, moved)
 
     def to(self, device: torch.device) -> Primitives:

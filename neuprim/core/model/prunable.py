@@ -34,7 +34,7 @@ class PrunableUnit:
         return {name: params[name][(slice(None), *place)] for name, place in self.places.items()}
 
 
-def count_numbers(unit: PrunableUnit, params: Params) -> int:
+def count_unit_numbers(unit: PrunableUnit, params: Params) -> int:
     """Count the numbers of a unit in one primitive."""
     return sum(math.prod(value.shape[1:]) for value in unit.of(params).values())
 
@@ -42,7 +42,7 @@ def count_numbers(unit: PrunableUnit, params: Params) -> int:
 def removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
     """Return (N,) first-order changes, when the unit becomes zero, of the sum whose gradients are given."""
     slopes = unit.of(gradients)
-    parts = [_flatten(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
+    parts = [_flat_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
     total = parts[0]
     for part in parts[1:]:
         total = total + part
@@ -60,12 +60,12 @@ def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params)
     return found
 
 
-def nonzero_rows(unit: PrunableUnit, params: Params) -> Tensor:
+def primitives_with_unit(unit: PrunableUnit, params: Params) -> Tensor:
     """Return (N,) bool of the primitives for which some number of the unit is not zero."""
-    return torch.stack([_flatten(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
+    return torch.stack([_flat_rows(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
 
 
-def _flatten(value: Tensor) -> Tensor:
+def _flat_rows(value: Tensor) -> Tensor:
     """(N, numbers of a primitive), also for N = 0."""
     return value.reshape(len(value), math.prod(value.shape[1:]))
 
@@ -73,7 +73,7 @@ def _flatten(value: Tensor) -> Tensor:
 _MASK, _NUMBERS = "|there", "|numbers"
 
 
-def store_sparse(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
+def sparse_parameters(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
     """Return the tensors of a file and the names of sparse parameters; ``specs`` are those of the fields."""
     stored, sparse = dict(params), []
     for name in (spec.name for spec in specs):
@@ -87,7 +87,7 @@ def store_sparse(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[s
     return stored, sparse
 
 
-def load_sparse(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
+def dense_parameters(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
     """Return the dense tensors of a model file with sparse parameters ``names``; ``where``: the file, for messages.
 
     Raises CheckpointError where the tensors do not fit the fields or each other.
@@ -104,9 +104,13 @@ def load_sparse(stored: Params, names: object, specs: Sequence[ParameterSpec], w
     found = {name: value for name, value in stored.items() if not name.endswith((_MASK, _NUMBERS))}
     for name in names:
         size = len(means) * math.prod(shapes[name])
-        bits = _check(stored.get(name + _MASK), ((size + 7) // 8,), torch.uint8, f"{where}: {name + _MASK}")
+        bits = _check_stored_tensor(
+            stored.get(name + _MASK), ((size + 7) // 8,), torch.uint8, f"{where}: {name + _MASK}"
+        )
         mask = torch.from_numpy(np.unpackbits(bits.numpy(), count=size, bitorder="little").astype(bool))
-        numbers = _check(stored.get(name + _NUMBERS), (int(mask.sum()),), torch.float32, f"{where}: {name + _NUMBERS}")
+        numbers = _check_stored_tensor(
+            stored.get(name + _NUMBERS), (int(mask.sum()),), torch.float32, f"{where}: {name + _NUMBERS}"
+        )
         if name in found:
             raise CheckpointError(
                 f"{where}: {name} is there twice, as {name} and as {name + _NUMBERS}; expected one of them"
@@ -118,7 +122,7 @@ def load_sparse(stored: Params, names: object, specs: Sequence[ParameterSpec], w
     return found
 
 
-def _check(tensor: Tensor | None, shape: tuple[int, ...], dtype: torch.dtype, what: str) -> Tensor:
+def _check_stored_tensor(tensor: Tensor | None, shape: tuple[int, ...], dtype: torch.dtype, what: str) -> Tensor:
     if tensor is None or tuple(tensor.shape) != shape or tensor.dtype != dtype:
         shown = "missing" if tensor is None else f"{tensor.dtype} {tuple(tensor.shape)}"
         raise CheckpointError(f"{what} is {shown}; expected {dtype} {shape}")

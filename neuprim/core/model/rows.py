@@ -17,7 +17,7 @@ from neuprim.core.compute.threads import parallel_for
 _FEW = 4096  # below, without a gradient, torch is done before a kernel would have begun with the last tensor
 
 
-def take_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
+def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
     """Rows (M,) int64, ascending, of ``tensors`` (N, ...), float32 or float64; differentiable, once. Not checked."""
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
@@ -25,14 +25,14 @@ def take_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
 
 
 @exact_kernel
-def _take(rows, whole, taken):  # type: ignore[no-untyped-def]
+def _take_rows_kernel(rows, whole, taken):  # type: ignore[no-untyped-def]
     for n in range(rows.shape[0]):
         for j in range(whole.shape[1]):
             taken[n, j] = whole[rows[n], j]
 
 
 @exact_kernel
-def _put(rows, taken, whole):  # type: ignore[no-untyped-def]
+def _put_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
     """Writes every row of ``whole``: zeros where there is none of ``taken``."""
     row = 0
     for n in range(rows.shape[0]):
@@ -64,7 +64,9 @@ class _Rows(torch.autograd.Function):
         ctx.rows, ctx.shapes = rows.numpy(), [x.shape for x in tensors]
         taken = [torch.empty((len(rows), *x.shape[1:]), dtype=x.dtype) for x in tensors]
         _each(
-            _take, ctx.rows, [(x.detach().contiguous().numpy(), y.numpy()) for x, y in zip(tensors, taken, strict=True)]
+            _take_rows_kernel,
+            ctx.rows,
+            [(x.detach().contiguous().numpy(), y.numpy()) for x, y in zip(tensors, taken, strict=True)],
         )
         return tuple(taken)
 
@@ -82,12 +84,12 @@ class _Rows(torch.autograd.Function):
         for g, whole in known:
             if not g.numel():
                 whole.zero_()  # nothing lives, or nothing is there
-        _each(_put, ctx.rows, [(g.numpy(), whole.numpy()) for g, whole in known])
+        _each(_put_rows_kernel, ctx.rows, [(g.numpy(), whole.numpy()) for g, whole in known])
         return (None, *made)
 
 
 @strict
-def rotation(q, out):  # type: ignore[no-untyped-def]
+def fill_rotation(q, out):  # type: ignore[no-untyped-def]
     w, x, y, z = (
         np.float64(q[0]),
         np.float64(q[1]),
@@ -124,7 +126,7 @@ def rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
 
 
 @exact_kernel
-def scale_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
+def gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
     """Gradients of (w2, b2), (N, K) and (N, 1), times ``factor`` (N, 1), and of the factor, ``pulled``."""
     for n in range(b2.shape[0]):
         total = np.float64(p_b2[n, 0]) * b2[n, 0]
@@ -148,7 +150,7 @@ class _Gain(torch.autograd.Function):
         w2, b2, log_gain, gain = ctx.saved_tensors
         g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, gain))
         given = (x.detach().contiguous().numpy() for x in (w2, b2, gain, p_w2, p_b2))
-        scale_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
+        gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
         return g_w2, g_b2, (pulled * gain).masked_fill_(log_gain.abs() > ctx.limit, 0.0), None
 
 

@@ -60,21 +60,21 @@ def tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: 
         fault = tensor_fault(value)
         if fault is None:
             for shape in shapes:
-                if _fits(value.shape, shape, name, sizes):
+                if _fits_shape(value.shape, shape, name, sizes):
                     break
             else:
-                fault = f"shape {tuple(value.shape)}; expected {_expected(shapes, sizes)}"
+                fault = f"shape {tuple(value.shape)}; expected {_expected_shapes(shapes, sizes)}"
         if fault is not None:
             return f"{name} has {fault}"
     return None
 
 
-def labelled(name: str, fault: str | None) -> str | None:
+def labelled_fault(name: str, fault: str | None) -> str | None:
     """``"NAME has FAULT"``."""
     return None if fault is None else f"{name} has {fault}"
 
 
-def _fits(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
+def _fits_shape(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
     if len(found) != len(shape):
         return False
     fresh: Sizes | None = None
@@ -96,7 +96,7 @@ def _fits(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
     return True
 
 
-def _expected(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
+def _expected_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
     """In numbers where all are known, else in letters with what is known of them."""
     letters = list(dict.fromkeys(d for d in shapes[0] if isinstance(d, str)))
     known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
@@ -119,7 +119,7 @@ Shapes = Mapping[str, tuple[Shape, ...]]
 """Name of a tensor -> the shapes it may have, in letters that the tensors of a frame share."""
 
 
-class Shaped:
+class ShapedTensors:
     """A bundle of tensors with a row per primitive, which knows what shapes they must have."""
 
     shapes: ClassVar[Shapes] = {}

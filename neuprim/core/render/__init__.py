@@ -18,7 +18,7 @@ from neuprim.core.model.fields import Constant, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Lowered, Primitives
 from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
-from neuprim.core.render.draw import draw_samples, on_device, with_shade
+from neuprim.core.render.draw import draw_on_device, draw_samples, draw_shaded
 from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
 from neuprim.core.settings import RenderSettings
@@ -90,11 +90,11 @@ def _draw_checked(
     draw = backend.load()
     place = backend.drawing_device(settings)
     if place != lowered.kind:
-        draw = on_device(draw, device.current_device(place))
+        draw = draw_on_device(draw, device.current_device(place))
     if background is not None:
         background = background.to(lowered.geometry.means.device, non_blocking=background.is_cpu)
     if lowered.shade is not None:
-        draw = with_shade(draw)
+        draw = draw_shaded(draw)
     if settings.samples == 1:
         output = draw(lowered, camera, background, settings)
     elif isinstance(camera, RayCamera):

@@ -29,12 +29,12 @@ REFERENCE = "reference"  # draws every form, in float64; the others are compared
 _FEW = 64  # primitives that stand for a model, as only its forms count
 
 
-def _no_reason(*_: Any) -> None:
+def _no_backend_fault(*_: Any) -> None:
     return None
 
 
 @functools.cache
-def _processor_name() -> str:
+def _cpu_backend_name() -> str:
     return f"cpu ({platform.processor() or platform.machine()})"
 
 
@@ -44,16 +44,16 @@ class Backend:
 
     name: str
     load: Callable[[], Draw]  # imports it and returns its :data:`~neuprim.core.render.draw.Draw`
-    unsupported: Callable[[Lowered, AnyCamera | None], str | None] = _no_reason
+    unsupported: Callable[[Lowered, AnyCamera | None], str | None] = _no_backend_fault
     """What it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
     "cannot draw"; None if it can."""
-    device_name: Callable[[], str] = _processor_name
-    missing: Callable[[], str | None] = _no_reason
+    device_name: Callable[[], str] = _cpu_backend_name
+    missing: Callable[[], str | None] = _no_backend_fault
     """Why this machine lacks what it needs, such as a package; None if it has it. Cheap."""
     checks: bool = False  # whether it refuses numbers that are not finite while it prepares a frame
     differentiates_intrinsics: bool = False
     devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it draws tensors of, its own first
-    slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_reason
+    slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_backend_fault
     """Loads and returns what draws the slabs of a set of primitives in one frame; None without."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
@@ -62,7 +62,7 @@ class Backend:
 
     def computing_on(self, settings: RenderSettings) -> str:
         """Return what it computes on under these settings, for a run's numbers."""
-        return self.device_name() if self.drawing_device(settings) == self.devices[0] else _processor_name()
+        return self.device_name() if self.drawing_device(settings) == self.devices[0] else _cpu_backend_name()
 
     def unavailable(self, device: str | None = None) -> str | None:
         """Return why this machine cannot run it on a kind of device, None: its own; None if it can."""
@@ -102,7 +102,7 @@ def _gpu_name() -> str:
     return "cuda (no GPU)" if hardware.cuda_unavailable() else f"cuda ({torch.cuda.get_device_name()})"
 
 
-def _loader(folder: str, function: str = "render") -> Callable[[], Any]:
+def _backend_loader(folder: str, function: str = "render") -> Callable[[], Any]:
     def load() -> Any:
         return getattr(importlib.import_module(f"neuprim.core.render.{folder}.backend"), function)
 
@@ -112,16 +112,22 @@ def _loader(folder: str, function: str = "render") -> Callable[[], Any]:
 TABLE: tuple[Backend, ...] = (
     Backend(
         "cuda",
-        _loader("cuda"),
+        _backend_loader("cuda"),
         unsupported_by_kernels,
         _gpu_name,
         _warp_missing,
         checks=True,
         devices=(hardware.CUDA, hardware.CPU),
-        slabs=_loader("cuda", "render_slabs"),
+        slabs=_backend_loader("cuda", "render_slabs"),
     ),
-    Backend("cpu", _loader("cpu"), unsupported_by_kernels, checks=True, slabs=_loader("cpu", "render_slabs")),
-    Backend(REFERENCE, _loader("reference"), differentiates_intrinsics=True),
+    Backend(
+        "cpu",
+        _backend_loader("cpu"),
+        unsupported_by_kernels,
+        checks=True,
+        slabs=_backend_loader("cpu", "render_slabs"),
+    ),
+    Backend(REFERENCE, _backend_loader("reference"), differentiates_intrinsics=True),
 )
 """Fastest first."""
 
@@ -187,7 +193,7 @@ def check_backend_device(settings: RenderSettings) -> None:
         )
 
 
-def check_device(settings: RenderSettings) -> None:
+def check_render_device(settings: RenderSettings) -> None:
     """Raise :class:`BackendUnavailable` for a GPU that is not there."""
     if settings.device == hardware.CUDA:
         reason = gpu_unavailable() if settings.backend == AUTO else hardware.cuda_unavailable()
@@ -209,9 +215,11 @@ def with_available_device(settings: RenderSettings) -> RenderSettings:
     return replace(settings, device="auto") if gone else settings
 
 
-def device_of(model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions) -> torch.device:
-    """Return the device where a run keeps its tensors to draw frames like this one; raises as :func:`check_device`."""
-    check_device(settings)
+def best_render_device(
+    model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions
+) -> torch.device:
+    """Return the device where a run keeps its tensors to draw frames like this one."""
+    check_render_device(settings)
     if settings.device != AUTO:
         return hardware.current_device(settings.device)
     if settings.backend != AUTO:  # a first frame without a GPU says why it is not drawn
@@ -239,7 +247,7 @@ def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera
 
     Raises BackendUnavailable if the named one cannot, and ConfigError if there is none of the name.
     """
-    check_device(settings)
+    check_render_device(settings)
     reasons = []
     for backend in candidate_backends(settings, lowered.kind):
         device = backend.drawing_device(settings)

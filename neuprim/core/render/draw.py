@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device
-from neuprim.core.model.checks import check_result
+from neuprim.core.model.checks import check_field_result
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render.output import RenderOutput, mean_depth
 from neuprim.core.settings import RenderSettings
@@ -26,13 +26,13 @@ def draw_samples(
     """Draw ``settings.samples`` squared rays per pixel: means of rgb and alpha, and of depth weighted by alpha."""
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
-    alpha = _pool(fine.alpha, n)
-    depth = None if fine.depth is None else mean_depth(_pool(fine.depth * fine.alpha, n), alpha)
+    alpha = _average_samples(fine.alpha, n)
+    depth = None if fine.depth is None else mean_depth(_average_samples(fine.depth * fine.alpha, n), alpha)
     fine.stats.samples = n  # contributions are per pixel; pairs and extra count the work really done
-    return RenderOutput(_pool(fine.rgb, n), alpha, depth, fine.stats)
+    return RenderOutput(_average_samples(fine.rgb, n), alpha, depth, fine.stats)
 
 
-def _pool(image: Tensor, n: int) -> Tensor:
+def _average_samples(image: Tensor, n: int) -> Tensor:
     """Means over n x n pixels of (n H, n W) or (n H, n W, C)."""
     h, w = image.shape[0] // n, image.shape[1] // n
     return image.reshape(h, n, w, n, *image.shape[2:]).mean((1, 3))
@@ -41,9 +41,9 @@ def _pool(image: Tensor, n: int) -> Tensor:
 def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
     """Return the (H, W, 3) float64 scene points at a depth image (H, W); no gradient."""
     depth = depth.detach().double()
-    view = device.to_like(camera.viewmat.detach(), depth)
+    view = device.to_device_like(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
-        local = device.to_like(camera.directions.detach(), depth) * depth[..., None]
+        local = device.to_device_like(camera.directions.detach(), depth) * depth[..., None]
     else:
         x = (torch.arange(camera.width, dtype=torch.float64, device=depth.device) + 0.5 - camera.cx) / camera.fx
         y = (torch.arange(camera.height, dtype=torch.float64, device=depth.device) + 0.5 - camera.cy) / camera.fy
@@ -51,7 +51,7 @@ def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
     return (local - view[:3, 3]) @ view[:3, :3]
 
 
-def with_shade(draw: Draw) -> Draw:
+def draw_shaded(draw: Draw) -> Draw:
     """Return a draw function that multiplies the frame, not its background, by ``lowered.shade`` at the mean depth."""
 
     def shaded(
@@ -64,7 +64,7 @@ def with_shade(draw: Draw) -> Draw:
         factor = torch.ones_like(output.alpha, requires_grad=False)
         points = unproject_depth(output.depth, camera)[hit]
         values = lowered.shade(points)
-        factor[hit] = check_result(values, (len(points),), f"{lowered.owner('colour')}: shade").to(factor)
+        factor[hit] = check_field_result(values, (len(points),), f"{lowered.owner('colour')}: shade").to(factor)
         rgb = output.rgb * factor[..., None]
         if background is not None:
             rgb = rgb + ((1 - factor) * (1 - output.alpha))[..., None] * background.to(rgb)
@@ -73,7 +73,7 @@ def with_shade(draw: Draw) -> Draw:
     return shaded
 
 
-def on_device(draw: Draw, place: torch.device) -> Draw:
+def draw_on_device(draw: Draw, place: torch.device) -> Draw:
     """Return a draw function that draws on another device and moves the frame back; differentiable."""
 
     def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:

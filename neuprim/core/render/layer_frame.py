@@ -109,13 +109,13 @@ class LayerFrame:
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
         """-log of the transmittance, in thinner and thinner media for the pixels that are opaque."""
         T = transmittance(1.0)
-        found, opaque, factor = _depth(T), T <= _CLEAR, 1.0
+        found, opaque, factor = _depth_of_transmittance(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
             if not bool(opaque.any()):
                 break
             factor *= _WEAKEN
             T = transmittance(factor)
-            found, opaque = torch.where(opaque, _depth(T) / factor, found), opaque & (T <= _CLEAR)
+            found, opaque = torch.where(opaque, _depth_of_transmittance(T) / factor, found), opaque & (T <= _CLEAR)
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
@@ -131,7 +131,7 @@ class LayerFrame:
             return render_lowered(lowered, self.camera, settings)
 
 
-def _depth(transmittance: Tensor) -> Tensor:
+def _depth_of_transmittance(transmittance: Tensor) -> Tensor:
     """Optical depth, float64; of what float32 calls 0, that of its smallest number."""
     return -transmittance.clamp_min(torch.finfo(transmittance.dtype).tiny).double().log()
 

@@ -27,7 +27,7 @@ NET = ("Wx", "bias", "Wout")
 
 
 @dataclass(frozen=True)
-class Request:
+class RasterRequest:
     """One frame to draw: what is not a tensor."""
 
     camera: Camera
@@ -38,13 +38,15 @@ class Request:
     differentiable: bool = False  # whether a backward pass may follow
 
     @classmethod
-    def of(cls, lowered: Lowered, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: bool) -> Request:
+    def of(
+        cls, lowered: Lowered, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: bool
+    ) -> RasterRequest:
         density = lowered.density
         assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
         return cls(camera, density.omega0 / (2 * math.pi), density.edge, settings, stats, *rest)
 
 
-def parameters_of(lowered: Lowered) -> tuple[Tensor, ...]:
+def primitive_tensors(lowered: Lowered) -> tuple[Tensor, ...]:
     """Return the tensors of :data:`PARAMETERS`."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
@@ -69,9 +71,9 @@ def rasterize(
         palette = colour.rgb
     if background is None:
         background = torch.zeros(palette.shape[1], device=palette.device)
-    tensors = (camera.viewmat, background, palette, *parameters_of(lowered), *net)
+    tensors = (camera.viewmat, background, palette, *primitive_tensors(lowered), *net)
     stats = RenderStats(name, lowered.geometry.count)
-    request = Request.of(lowered, camera, settings, stats, needs_grad(*tensors))
+    request = RasterRequest.of(lowered, camera, settings, stats, needs_grad(*tensors))
     rgb, transmittance, zsum = apply_autograd(operation, request, *tensors)
     dtype = lowered.geometry.means.dtype
     alpha = 1 - transmittance
@@ -79,13 +81,13 @@ def rasterize(
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 
-def remember_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Keep dtypes and devices for :func:`gradients_like`, and let gradients that nobody asks for be None."""
+def remember_input_types(ctx: Any, inputs: Sequence[Tensor]) -> None:
+    """Keep dtypes and devices for :func:`input_gradients`, and let gradients that nobody asks for be None."""
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
     ctx.set_materialize_grads(False)  # a depth image without a gradient costs the backward pass nothing
 
 
-def gradients_like(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
+def input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
     """Return what ``backward`` returns: a gradient for each input, from that of (R | t), (3, 4), and the others."""
     full = None
     if view is not None:

@@ -24,7 +24,7 @@ from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.backends import device_of
+from neuprim.core.render.backends import best_render_device
 from neuprim.core.render.near_plane import resolve_near, scene_extent
 from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
@@ -128,7 +128,7 @@ class Trainer:
         self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
         self.extent = scene_extent(dataset.extent, model.params["means"], cameras)
-        self.device = device_of(model, self.renderer, cameras[0], train.view(0).conditions)
+        self.device = best_render_device(model, self.renderer, cameras[0], train.view(0).conditions)
         model.params = model.to(self.device).params
         self.prefetcher: Prefetcher | None = None
         if self.device.type == device.CUDA:

@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
 
 d, f = wp.float64, wp.float32
 
@@ -150,7 +150,7 @@ def fill_density_grid(
             own = (end - plane, *tiles[1:])
             starts, ids = _list_primitives(low, wide, counts, own, *some)
             lists = array(starts, wp.int32), array(ids, wp.int32)
-            launch(
+            launch_kernel(
                 _add_kernel(), (len(starts) - 1, _THREADS),
                 (*lists, wp.vec2i(own[1], own[2]), first, rows, *prims, edge, array(part, f)), where,
                 _THREADS,

@@ -14,7 +14,7 @@ from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
-from neuprim.core.model.edge import NORMS, profile
+from neuprim.core.model.edge import NORMS, edge_profile
 from neuprim.core.model.fields import ColourField, ConditionSpec, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
@@ -136,7 +136,9 @@ def invisible_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
         form = density.lower(params, geometry, {"time": time})
         assert isinstance(form, Cosine)
         rate = form.omega0 * (form.W1.double() @ axes)  # (N, K, 3)
-        waves = (form.w2.double() * torch.cos(form.omega0 * form.b1.double()))[:, :, None] * profile(rate, form.edge)
+        waves = (form.w2.double() * torch.cos(form.omega0 * form.b1.double()))[:, :, None] * edge_profile(
+            rate, form.edge
+        )
         depth = NORMS[form.edge] * reach * (form.b2.double().reshape(-1, 1) + waves.sum(1))
         most_opaque = torch.maximum(most_opaque, 1.0 - torch.exp(-depth.clamp_min(0.0).amax(1)))
     return float((most_opaque < _MIN_OPACITY).double().mean())

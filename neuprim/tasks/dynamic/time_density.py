@@ -27,10 +27,10 @@ from neuprim.core.model.cosine_sums import canonicalize_cosines, prune_neurons
 from neuprim.core.model.densities.cosine import (
     OMEGA0,
     CosineDensity,
-    amplified,
+    apply_density_gain,
     cosine_density,
     split_cosine,
-    split_scale,
+    split_density_scale,
 )
 from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.geometry import Geometry
@@ -191,10 +191,10 @@ class TimeDensity(DensityField):
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
             b2 = params["b2"]
-            cosines = params["offset_cos"] @ device.to_like(angle.cos(), b2)
-            sines = params["offset_sin"] @ device.to_like(angle.sin(), b2)
+            cosines = params["offset_cos"] @ device.to_device_like(angle.cos(), b2)
+            sines = params["offset_sin"] @ device.to_device_like(angle.sin(), b2)
             changed["b2"] = b2 + (cosines + sines)[:, None]
-        w2, b2 = amplified(changed["w2"], changed["b2"], changed.get("log_gain"))
+        w2, b2 = apply_density_gain(changed["w2"], changed["b2"], changed.get("log_gain"))
         if "window" in self.parts:
             w2, b2 = apply_window(w2, b2, params["window_center"], params["log_window"], xi)
         if self.seams:
@@ -209,7 +209,7 @@ class TimeDensity(DensityField):
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
         children = split_cosine(params, old, new, self.static.omega0, self.static.edge)
         if "offset" in self.parts:
-            scale = split_scale(old, new, self.static.edge)
+            scale = split_density_scale(old, new, self.static.edge)
             for name in _OFFSETS:
                 children[name] = params[name] * scale.to(params["b2"])[:, None]
         return children

@@ -11,8 +11,8 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.operation import apply_autograd
-from neuprim.core.model.edge import fade
-from neuprim.core.model.rows import scale_backward
+from neuprim.core.model.edge import edge_weight
+from neuprim.core.model.rows import gain_backward
 
 WINDOW_EDGE = 2  # exponent of the window in time
 
@@ -45,7 +45,7 @@ class _Window(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         tau = log_window.exp()
         u = (xi.to(b2) - center) / tau
-        weight = fade(u.square(), WINDOW_EDGE)
+        weight = edge_weight(u.square(), WINDOW_EDGE)
         ctx.save_for_backward(w2, b2, tau, u, weight)
         return w2 * weight, b2 * weight
 
@@ -54,8 +54,8 @@ class _Window(torch.autograd.Function):
         w2, b2, tau, u, weight = ctx.saved_tensors
         g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, weight))
         given = (x.detach().contiguous().numpy() for x in (w2, b2, weight, p_w2, p_b2))
-        scale_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
-        g_u = pulled.mul_(fade(u.square(), WINDOW_EDGE - 1)).mul_(u).mul_(-2.0 * WINDOW_EDGE)
+        gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
+        g_u = pulled.mul_(edge_weight(u.square(), WINDOW_EDGE - 1)).mul_(u).mul_(-2.0 * WINDOW_EDGE)
         return g_w2, g_b2, -g_u / tau, -g_u * u, None
 
 
@@ -65,7 +65,7 @@ def apply_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi:
     ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
     if not device.on_numba(w2, b2, center, log_window):
-        weight = fade(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
+        weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
         return w2 * weight, b2 * weight
     result: tuple[Tensor, Tensor] = apply_autograd(_Window, w2, b2, center, log_window, xi)
     return result

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.colours.sh import coefficients, truncate_bands
+from neuprim.core.model.colours.sh import prunable_sh_coefficients, truncate_sh_bands
 from neuprim.core.model.cosine_sums import ball_mean, canonicalize_cosines, smaller_neuron_counts
 from neuprim.core.model.edge import sinc
 from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, RayNet, Shading, read_script
@@ -117,9 +117,9 @@ class LightNetwork(ColourField):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
         size = geometry.length_scale.detach()[:, None]
-        view = normalize_direction(means - device.to_like(camera.position, means), size)
-        to_light = device.to_like(conditions["light"], means) - means
-        strength = device.to_like(conditions["light_intensity"], means).expand(self.channels) / self.typical
+        view = normalize_direction(means - device.to_device_like(camera.position, means), size)
+        to_light = device.to_device_like(conditions["light"], means) - means
+        strength = device.to_device_like(conditions["light_intensity"], means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
             factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
@@ -239,22 +239,22 @@ class LightHarmonics(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[LightHarmonics, dict[str, Tensor]]:
-        return LightHarmonics(**{**self.settings(), "degree": value}), truncate_bands(params, "light_sh", value)
+        return LightHarmonics(**{**self.settings(), "degree": value}), truncate_sh_bands(params, "light_sh", value)
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        return coefficients(self.degree, self.channels, "light_sh")
+        return prunable_sh_coefficients(self.degree, self.channels, "light_sh")
 
     def script(self) -> str:
         return read_script(__package__, "harmonics.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]
-        to_light = device.to_like(conditions["light"], color) - geometry.means
+        to_light = device.to_device_like(conditions["light"], color) - geometry.means
         squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
         if self.degree:
             bands = real_harmonics(normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree)
             color = color + (bands[:, 1:, None] * params["light_sh"]).sum(1)
-        strength = device.to_like(conditions["light_intensity"], color) / self.typical
+        strength = device.to_device_like(conditions["light_intensity"], color) / self.typical
         strength = strength / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)
 

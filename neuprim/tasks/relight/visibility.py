@@ -67,10 +67,10 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
         up = torch.tensor([0.0, 1.0, 0.0] if overhead else [0.0, 0.0, 1.0], dtype=torch.float64)
         camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
         near = max(1e-4 * radius, distance - 1.5 * radius)
-        depths = means @ device.to_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
+        depths = means @ device.to_device_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
         low, high = torch.stack([depths.min(), depths.max()]).tolist()
         edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
-        slabs = torch.bucketize(depths, device.to_like(edges[1:-1], means))
+        slabs = torch.bucketize(depths, device.to_device_like(edges[1:-1], means))
         own = replace(settings, depth=True, near=near, samples=1)
         opacities, distances = render_slabs(geometry, density, slabs, LAYERS, camera, own)
     view, limits = camera.viewmat[:3].contiguous(), (BIAS * 2.0 * radius, SOFTNESS * 2.0 * radius)
@@ -78,7 +78,9 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
     def visibility(points: Tensor) -> Tensor:
         points = points.detach().double().contiguous()
         if not device.on_numba(points, opacities):
-            return sample_visibility(points, device.to_like(view, points), near, focal, opacities, distances, *limits)
+            return sample_visibility(
+                points, device.to_device_like(view, points), near, focal, opacities, distances, *limits
+            )
         found = np.empty(len(points), np.float32)
         places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy())
         parallel_for(_visibility_kernel, len(found), _CHUNK, settings.threads, *places, *images, *limits, found)

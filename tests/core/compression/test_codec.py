@@ -14,13 +14,13 @@ from neuprim.core import checkpoint
 from neuprim.core.compression import (
     LEVELS,
     bit_table,
-    canonicalize,
+    canonical_model,
     fake_quantize,
     fit_quantizers,
     fit_quantizers_to_error,
     read_compressed,
 )
-from neuprim.core.compression.quantizers import Columns
+from neuprim.core.compression.quantizers import ColumnQuantizer
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.model.fields import prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
@@ -46,7 +46,7 @@ def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: i
     wanted, made = stored(model, LEVELS[level])
     for key, value in wanted.params.items():
         back, scheme = again.params[key].reshape(model.count, value[0].numel()), made[key]
-        if not isinstance(scheme, Columns):
+        if not isinstance(scheme, ColumnQuantizer):
             assert float(angles(value, back).max()) < 4.0 / scheme.half
             continue
         x = value.reshape(back.shape)
@@ -104,7 +104,7 @@ def test_neither_the_order_of_rows_nor_their_place_matters(tmp_path: Path) -> No
     for backend in ("reference", "cpu"):
         settings = RenderSettings(backend=backend)
         with torch.no_grad():
-            a, b = (render(m, scenes.camera(), {}, settings).rgb for m in (canonicalize(model), wanted))
+            a, b = (render(m, scenes.camera(), {}, settings).rgb for m in (canonical_model(model), wanted))
         assert torch.allclose(a, b, atol=1e-5)
 
 
@@ -188,7 +188,7 @@ def effects_of(model: Primitives) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("name", FIELDS)
 def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) -> None:
     task, model = example(name, 2000)
-    whole, error = canonicalize(model), 1e-4
+    whole, error = canonical_model(model), 1e-4
     effects = effects_of(whole)
     made = fit_quantizers_to_error(whole, effects, error)
     back = fake_quantize(whole.params, made)
@@ -214,7 +214,7 @@ def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) ->
 
 
 def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> None:
-    model = canonicalize(without_pieces(example("soft", 400)[1]))
+    model = canonical_model(without_pieces(example("soft", 400)[1]))
     effects = {
         name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()
     }

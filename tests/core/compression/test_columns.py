@@ -12,14 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from neuprim.core.compression.quantizers import MAX_BITS, Columns, Rotations, columns_of_step, fit_columns, snap_to_zero
+from neuprim.core.compression.quantizers import (
+    MAX_BITS,
+    ColumnQuantizer,
+    RotationQuantizer,
+    columns_of_step,
+    fit_columns,
+    snap_to_zero,
+)
 from neuprim.core.compression.sections import morton_decode, morton_encode
 
 finite = st.floats(width=32, allow_nan=False, allow_infinity=False)
 
 
-def columns(bits: int, low: float, high: float) -> Columns:
-    return Columns(torch.tensor([bits]), torch.tensor([low]), torch.tensor([high]))
+def columns(bits: int, low: float, high: float) -> ColumnQuantizer:
+    return ColumnQuantizer(torch.tensor([bits]), torch.tensor([low]), torch.tensor([high]))
 
 
 # ---------------------------------------------------------------- columns
@@ -105,7 +112,7 @@ def angle(a: Tensor, b: Tensor) -> Tensor:
 @pytest.mark.parametrize("bits", [3, 4, 6, 8, 11, 16])
 def test_orientations_come_back_within_steps_and_again_as_they_were(bits: int) -> None:
     q = torch.randn(20_000, 4, generator=torch.Generator().manual_seed(bits))
-    made = Rotations(bits)
+    made = RotationQuantizer(bits)
     codes = made.codes(q)
     assert codes.min() >= 0 and codes[:, 0].max() <= 3 and codes[:, 1:].max() <= 2 * made.half
     once = made.values(codes)
@@ -121,14 +128,14 @@ def test_ties_between_components_are_coded_as_they_were() -> None:
     noise = 1e-3 * torch.randn(50, *signs.shape, generator=torch.Generator().manual_seed(0))
     q = torch.cat([signs, (signs + noise).reshape(-1, 4)])
     for bits in range(3, 17):
-        made = Rotations(bits)
+        made = RotationQuantizer(bits)
         once = made.values(made.codes(q))
         assert torch.equal(made.values(made.codes(once)), once)
 
 
 def test_rounded_orientations_keep_norm_sign_and_gradient() -> None:
     q = (3 * torch.randn(50, 4, generator=torch.Generator().manual_seed(0))).requires_grad_()
-    out = Rotations(5).fake_quantize(q)
+    out = RotationQuantizer(5).fake_quantize(q)
     assert torch.allclose(out.norm(dim=1), q.norm(dim=1)) and bool(((out * q).sum(1) > 0).all())
     assert 0 < float(angle(q.detach(), out.detach()).max()) < 0.3
     (grad,) = torch.autograd.grad(out.sum(), q)

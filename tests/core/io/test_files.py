@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.files import publish_folder, refuse_existing, staged, write_text
+from neuprim.core.io.files import publish_folder, refuse_existing, staged_output, write_text
 from tests.systems import posix
 
 
@@ -74,7 +74,7 @@ def test_files_are_flushed_through_a_writable_descriptor(tmp_path: Path, monkeyp
 def test_a_staged_file_and_its_companions_are_published_together(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    with staged(tmp_path / "new" / "a.obj", False) as output:
+    with staged_output(tmp_path / "new" / "a.obj", False) as output:
         output.out.write_text("mesh")
         (output.out.parent / "a.mtl").write_text("look")
         assert tree(tmp_path / "new") == {} and output.out.name == "a.obj"
@@ -86,7 +86,7 @@ def test_a_staged_file_and_its_companions_are_published_together(
     assert tree(tmp_path) == {"new/a.mtl": "look", "new/a.obj": "mesh"} and os.listdir(tmp_path) == ["new"]
     (tmp_path / "empty").mkdir()
     monkeypatch.chdir(tmp_path / "empty")
-    with staged(Path("."), False) as output:
+    with staged_output(Path("."), False) as output:
         output.out.mkdir()
         (output.out / "x").write_text("new")
         output.publish()
@@ -99,7 +99,7 @@ def test_a_staged_folder_joins_an_existing_one(tmp_path: Path, overwrite: bool) 
     for name in ("0", "other", "deep/1"):
         (tmp_path / "frames" / name).write_text("old")
     before = tree(tmp_path)
-    with staged(tmp_path / "frames", overwrite) as output:
+    with staged_output(tmp_path / "frames", overwrite) as output:
         (output.out / "deep").mkdir(parents=True)
         for name in ("0", "deep/1", "deep/2"):
             (output.out / name).write_text("new")
@@ -119,7 +119,7 @@ def test_what_is_in_the_way_of_staged_output_stays(tmp_path: Path, name: str, fo
     for file in ("file", "taken", "companion"):
         (tmp_path / file).write_text("old")
     with pytest.raises(ConfigError, match=r"companion: exists|is a folder|is a file"):
-        with staged(tmp_path / (name if name != "taken" else "new"), name != "taken") as output:
+        with staged_output(tmp_path / (name if name != "taken" else "new"), name != "taken") as output:
             if folder:
                 output.out.mkdir()
             (output.out / "x" if folder else output.out).write_text("new")
@@ -132,15 +132,15 @@ def test_what_is_in_the_way_of_staged_output_stays(tmp_path: Path, name: str, fo
 @pytest.mark.parametrize("failure", [DataError, ZeroDivisionError, KeyboardInterrupt])
 def test_failed_staging_leaves_nothing_and_names_final_paths(tmp_path: Path, failure: type[BaseException]) -> None:
     (tmp_path / "a").write_text("old")
-    with pytest.raises(failure) as caught, staged(tmp_path / "a", True) as output:
+    with pytest.raises(failure) as caught, staged_output(tmp_path / "a", True) as output:
         output.out.write_text("half")
         raise failure(f"{output.out}: no")
     assert tree(tmp_path) == {"a": "old"} and os.listdir(tmp_path) == ["a"]
     assert failure is not DataError or str(caught.value) == f"{tmp_path}/a: no"
-    with pytest.raises(PermissionError) as refused, staged(tmp_path / "a", True) as output:
+    with pytest.raises(PermissionError) as refused, staged_output(tmp_path / "a", True) as output:
         raise PermissionError(13, "Permission denied", str(output.out))
     assert refused.value.filename == str(tmp_path / "a")
-    with pytest.raises(NotADirectoryError) as impossible, staged(tmp_path / "a" / "x.ply", False):
+    with pytest.raises(NotADirectoryError) as impossible, staged_output(tmp_path / "a" / "x.ply", False):
         pass
     assert impossible.value.filename == str(tmp_path / "a" / "x.ply")
 

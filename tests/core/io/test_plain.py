@@ -11,7 +11,7 @@ import yaml
 from neuprim.core.checkpoint import read_header, write_tensors
 from neuprim.core.errors import CheckpointError, cut, one_line
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.io.plain import finite, load_json, load_yaml
+from neuprim.core.io.plain import finite_number, load_json, load_yaml
 
 HUGE = ["1e400", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 100_000, "-" + "1" * 30, str(2**64)]
 
@@ -39,7 +39,7 @@ def test_numbers_within_them_are_as_they_were() -> None:
 
 @pytest.mark.parametrize("value", [True, "1", [1], None, float("nan"), float("inf"), 10**400])
 def test_what_is_no_finite_number(value: object) -> None:
-    assert finite(value) is None
+    assert finite_number(value) is None
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.ply import read_elements, read_ply, write_ply
+from neuprim.core.io.ply import read_ply, read_ply_elements, write_ply
 
 ROWS = np.array(
     [(1.5, -2, 250, 1e-300), (np.float32(0.1), 7, 3, 2.5)],
@@ -71,7 +71,7 @@ def test_elements_in_any_order_with_lists_of_any_length(tmp_path: Path, order: s
         assert found.names == ("x", "tag") and found.rows["x"].tolist() == [1e-300, 1.0]
         assert found.rows["tag"].tolist() == [9, 10]
         with open(path, "rb") as file:
-            both = read_elements(file, path.stat().st_size, path, ("face", "vertex"))
+            both = read_ply_elements(file, path.stat().st_size, path, ("face", "vertex"))
         corners, numbers = both["face"].lists["vertex_indices"], both["vertex"].lists["more"]
         assert corners.sizes.tolist() == [3, 4] and corners.values.tolist() == [0, 1, 2, 3, 2, 1, 0]
         assert numbers.sizes.tolist() == [len(m) for m in more] and numbers.values.tolist() == [*more[0], *more[1]]

@@ -14,7 +14,7 @@ import pytest
 
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.io import store as stores
-from neuprim.core.io.plain import read_arrays
+from neuprim.core.io.plain import read_npz_arrays
 from neuprim.core.io.store import Store, open_store
 
 Make = Callable[[], Store]
@@ -155,7 +155,7 @@ WANTED = {"a": (np.float32, (None, 3)), "b": (np.float64, ())}
 def test_arrays_are_read_back(tmp_path: Path) -> None:
     a = np.arange(6, dtype=np.float32).reshape(2, 3)
     np.savez(tmp_path / "f.npz", a=a, b=np.float64(2), more=np.array(["text"]))
-    found = read_arrays(tmp_path / "f.npz", WANTED)
+    found = read_npz_arrays(tmp_path / "f.npz", WANTED)
     assert found.keys() == {"a", "b"} and np.array_equal(found["a"], a) and float(found["b"]) == 2
 
 
@@ -171,7 +171,7 @@ def test_arrays_are_read_back(tmp_path: Path) -> None:
 def test_arrays_of_another_form_are_refused(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
     np.savez(tmp_path / "f.npz", **arrays)
     with pytest.raises(DataError, match=rf"f\.npz: damaged \({message}"):
-        read_arrays(tmp_path / "f.npz", WANTED)
+        read_npz_arrays(tmp_path / "f.npz", WANTED)
 
 
 def test_a_header_that_claims_more_than_there_is(tmp_path: Path) -> None:
@@ -186,13 +186,13 @@ def test_a_header_that_claims_more_than_there_is(tmp_path: Path) -> None:
     with zipfile.ZipFile(file, "w") as archive:
         archive.writestr("a.npy", array)
     with pytest.raises(DataError, match=r"a claims shape \(9000000000, 3\), and has \d+ bytes"):
-        read_arrays(file, {"a": WANTED["a"]})
+        read_npz_arrays(file, {"a": WANTED["a"]})
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.npy", array + bytes(10**7))
     with pytest.raises(DataError, match=r"a claims 10,?\d+ bytes of a file of"):
-        read_arrays(file, {"a": WANTED["a"]})
+        read_npz_arrays(file, {"a": WANTED["a"]})
     file.write_bytes(data[:100])
     with pytest.raises(DataError, match=r"f\.npz: damaged"):
-        read_arrays(file, WANTED)
+        read_npz_arrays(file, WANTED)
     with pytest.raises(DataError, match=r"none\.npz: damaged \(.*No such file"):
-        read_arrays(tmp_path / "none.npz", WANTED)
+        read_npz_arrays(tmp_path / "none.npz", WANTED)

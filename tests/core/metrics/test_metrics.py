@@ -11,7 +11,16 @@ import torch
 from scipy.signal import convolve2d
 
 from neuprim.core.errors import DataError, NonFiniteError
-from neuprim.core.metrics import SSIM_SIGMA, SSIM_WINDOW, from_json, psnr, psnr_gain, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics import (
+    SSIM_SIGMA,
+    SSIM_WINDOW,
+    metric_from_json,
+    metric_to_json,
+    psnr,
+    psnr_gain,
+    ssim,
+    ssim_3dgs,
+)
 
 
 def pair(
@@ -129,13 +138,13 @@ def test_non_finite_values_are_an_error_not_a_number() -> None:
 
 def test_infinite_values_survive_strict_json() -> None:
     for value in (math.inf, 31.25):
-        text = json.dumps(to_json("psnr", value), allow_nan=False)
-        assert from_json(json.loads(text), "psnr") == value
-    assert json.loads(json.dumps(to_json("psnr", math.inf))) == {"psnr": None, "psnr_infinite": True}
-    assert from_json({"psnr": None}, "psnr") is None
-    assert from_json({}, "psnr") is None
-    assert from_json({"psnr": True}, "psnr") is None
-    assert from_json({"psnr": "12"}, "psnr") is None
+        text = json.dumps(metric_to_json("psnr", value), allow_nan=False)
+        assert metric_from_json(json.loads(text), "psnr") == value
+    assert json.loads(json.dumps(metric_to_json("psnr", math.inf))) == {"psnr": None, "psnr_infinite": True}
+    assert metric_from_json({"psnr": None}, "psnr") is None
+    assert metric_from_json({}, "psnr") is None
+    assert metric_from_json({"psnr": True}, "psnr") is None
+    assert metric_from_json({"psnr": "12"}, "psnr") is None
 
 
 @pytest.mark.parametrize("channels", [1, 2, 5, 31])

@@ -5,16 +5,16 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from neuprim.core.metrics import to_json
+from neuprim.core.metrics import metric_to_json
 from neuprim.core.metrics.image import format_metrics
 
 
 def metrics(values: list[float], bad: list[str]) -> dict[str, Any]:
-    views = [{"name": f"v{i}", **to_json("psnr", value)} for i, value in enumerate(values)]
+    views = [{"name": f"v{i}", **metric_to_json("psnr", value)} for i, value in enumerate(values)]
     worst = min(range(len(values)), key=lambda i: values[i])
     return {
         "per_view": views,
-        **to_json("psnr_worst", values[worst]),
+        **metric_to_json("psnr_worst", values[worst]),
         "view_worst": f"v{worst}",
         "worse_than_black_image": bad,
     }

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.config import compose
 from neuprim.core.model.densities.cosine import CosineDensity, cosine_density
-from neuprim.core.model.edge import EDGES, NORMS, chord_integral, profile, spherical_bessel
+from neuprim.core.model.edge import EDGES, NORMS, chord_integral, edge_profile, spherical_bessel
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry, Pairs
 from neuprim.core.model.schema import InitContext
@@ -34,7 +34,7 @@ def test_profiles_are_those_of_the_formulas(order: int) -> None:
     weight = w * (1 - x * x) ** order
     z = np.concatenate([np.logspace(-7, 3, 400), [0.0]])
     exact = (weight * np.cos(z[:, None] * x)).sum(1) / weight.sum()
-    assert np.abs(profile(torch.from_numpy(z), order).numpy() - exact).max() <= 2e-13
+    assert np.abs(edge_profile(torch.from_numpy(z), order).numpy() - exact).max() <= 2e-13
 
 
 @pytest.mark.parametrize("edge", [1, 2])

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import GAIN_LIMIT, amplified
+from neuprim.core.model.densities.cosine import GAIN_LIMIT, apply_density_gain
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
@@ -37,7 +37,7 @@ def test_it_is_the_formula_forward_and_backward(dtype: torch.dtype, tolerance: f
         given(neurons, dtype, flat),
         [x.detach().double().requires_grad_() for x in given(neurons, dtype, flat)],
     )
-    found, wanted = amplified(*mine), formula(*exact)
+    found, wanted = apply_density_gain(*mine), formula(*exact)
     same = formula(*given(neurons, dtype, flat))
     assert all(torch.equal(a, b) for a, b in zip(found, same, strict=True)), (
         "drawn values do not depend on how gradients are found"

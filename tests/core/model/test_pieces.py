@@ -15,11 +15,11 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Field, prunable_units_by_name
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import (
-    count_numbers,
-    load_sparse,
-    nonzero_rows,
+    count_unit_numbers,
+    dense_parameters,
+    primitives_with_unit,
     removal_effect,
-    store_sparse,
+    sparse_parameters,
     zero_units,
 )
 from neuprim.core.task import TaskSpec
@@ -54,7 +54,7 @@ def test_no_number_is_in_two_pieces_and_each_has_some(density: Field, colour: Fi
     assert pieces
     times = {name: torch.zeros_like(value) for name, value in model.params.items()}
     for piece in pieces.values():
-        assert count_numbers(piece, model.params) > 0
+        assert count_unit_numbers(piece, model.params) > 0
         for name, place in piece.places.items():
             times[name][(slice(None), *place)] += 1
     assert all(float(count.max()) <= 1 for count in times.values() if count.numel())
@@ -68,7 +68,9 @@ def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) 
     for name, piece in prunable_units_by_name(model.density, model.colour).items():
         everywhere = torch.ones(COUNT, dtype=torch.bool)
         empty = Primitives(model.density, model.colour, zero_units({name: (piece, everywhere)}, model.params))
-        assert not bool(nonzero_rows(piece, empty.params).any()) and bool(nonzero_rows(piece, model.params).all())
+        assert not bool(primitives_with_unit(piece, empty.params).any()) and bool(
+            primitives_with_unit(piece, model.params).all()
+        )
         empty.lower(camera(), CONDITIONS).check()
         untouched = [key for key in model.params if key not in piece.places]
         assert all(empty.params[key] is model.params[key] for key in untouched)
@@ -110,8 +112,8 @@ BITS = (45 * COUNT + 7) // 8  # bytes of the bits of COUNT primitives' coefficie
 def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field) -> None:
     model = pruned(made(density, colour))
     own = (*model.density.parameters(), *model.colour.parameters())
-    stored, sparse = store_sparse(model.params, own)
-    again = load_sparse(stored, sparse, own, "file")
+    stored, sparse = sparse_parameters(model.params, own)
+    again = dense_parameters(stored, sparse, own, "file")
     assert sparse and again.keys() == model.params.keys()
     assert all(
         torch.equal(again[name].view(torch.int32), value.view(torch.int32)) for name, value in model.params.items()

@@ -76,7 +76,7 @@ def test_dropped_bands_are_the_basis_cut_off() -> None:
     field, params = SphericalHarmonics(3).reduce(model.of(model.colour), model.geometry, "degree", 1)
     origin = camera().position
     seen = field.lower(params, model.geometry, camera(), {}).rgb
-    whole = sh.colors(model.params["means"], model.params["sh_dc"], model.params["sh_rest"], origin, 1)
+    whole = sh.sh_colors(model.params["means"], model.params["sh_dc"], model.params["sh_rest"], origin, 1)
     assert torch.equal(seen, whole) and params["sh_rest"].shape == (COUNT, 3, 3)
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.rows import take_rows
+from neuprim.core.model.rows import take_primitive_rows
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
@@ -31,7 +31,7 @@ def pull(taken: dict[str, Tensor]) -> None:
 @pytest.mark.parametrize("case", ROWS)
 def test_it_is_index_select(case: str, dtype: torch.dtype) -> None:
     rows, mine, theirs = torch.tensor(ROWS[case], dtype=torch.int64), tensors(dtype), tensors(dtype)
-    taken, wanted = take_rows(mine, rows), {n: x.index_select(0, rows) for n, x in theirs.items()}
+    taken, wanted = take_primitive_rows(mine, rows), {n: x.index_select(0, rows) for n, x in theirs.items()}
     assert list(taken) == list(mine)
     assert all(torch.equal(taken[n], wanted[n]) and taken[n].dtype == dtype for n in wanted)
     pull(taken)
@@ -45,7 +45,7 @@ def test_strides_do_not_matter_and_what_nothing_is_asked_of_has_no_gradient() ->
     wide = torch.randn(3, 9, generator=torch.Generator().manual_seed(2))
     turned, unused = wide.t().requires_grad_(), torch.ones(9, 2, requires_grad=True)
     rows = torch.tensor([0, 4])
-    taken = take_rows({"turned": turned, "unused": unused}, rows)
+    taken = take_primitive_rows({"turned": turned, "unused": unused}, rows)
     assert torch.equal(taken["turned"], wide.t()[rows])
     taken["turned"].sum().backward()  # an expanded gradient, of stride 0
     assert turned.grad is not None and turned.grad.sum(1).tolist() == [3, 0, 0, 0, 3, 0, 0, 0, 0]
@@ -62,5 +62,5 @@ def test_without_a_gradient_few_and_many_rows(count: int) -> None:
     }
     rows = torch.randperm(6000, generator=g)[:count].sort().values
     with torch.no_grad():
-        taken = take_rows(mine, rows)
+        taken = take_primitive_rows(mine, rows)
     assert all(torch.equal(taken[n], x[rows]) and not taken[n].requires_grad for n, x in mine.items())

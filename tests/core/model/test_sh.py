@@ -31,7 +31,7 @@ def sphere(polar: int = 12, around: int = 24) -> tuple[torch.Tensor, torch.Tenso
 
 def test_orthonormal() -> None:
     d, w = sphere()
-    values = sh.basis(d, 3)
+    values = sh.sh_basis(d, 3)
     gram = values.T @ (w[:, None] * values)
     assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-13)
 
@@ -40,12 +40,12 @@ def test_order_and_signs() -> None:
     """Those of 3D Gaussian splatting: y, z, x with signs -, +, - in band 1."""
     x, y, z = torch.eye(3, dtype=torch.float64)[:, None]
     c1 = math.sqrt(3 / (4 * math.pi))
-    assert sh.basis(x, 1)[0].tolist() == pytest.approx([sh.C0, 0, 0, -c1])
-    assert sh.basis(y, 1)[0].tolist() == pytest.approx([sh.C0, -c1, 0, 0])
-    assert sh.basis(z, 1)[0].tolist() == pytest.approx([sh.C0, 0, c1, 0])
-    assert sh.basis(z, 2)[0, 6].item() == pytest.approx(0.6307831305050401)
-    assert sh.basis(x, 2)[0, 8].item() == pytest.approx(0.5462742152960396)
-    assert sh.basis(x, 3)[0, 15].item() == pytest.approx(-0.5900435899266435)
+    assert sh.sh_basis(x, 1)[0].tolist() == pytest.approx([sh.C0, 0, 0, -c1])
+    assert sh.sh_basis(y, 1)[0].tolist() == pytest.approx([sh.C0, -c1, 0, 0])
+    assert sh.sh_basis(z, 1)[0].tolist() == pytest.approx([sh.C0, 0, c1, 0])
+    assert sh.sh_basis(z, 2)[0, 6].item() == pytest.approx(0.6307831305050401)
+    assert sh.sh_basis(x, 2)[0, 8].item() == pytest.approx(0.5462742152960396)
+    assert sh.sh_basis(x, 3)[0, 15].item() == pytest.approx(-0.5900435899266435)
 
 
 def fresh(degree: int, channels: int, sh_every: float = 0.0) -> tuple[Primitives, SphericalHarmonics, torch.Tensor]:
@@ -119,7 +119,7 @@ def on_blocks(
     return fused_colors(means, dc, rest, origin, degree)
 
 
-@pytest.mark.parametrize("kernels", [sh.colors, on_blocks])
+@pytest.mark.parametrize("kernels", [sh.sh_colors, on_blocks])
 @pytest.mark.parametrize("degree", [1, 2, 3])
 def test_values_and_gradients_are_those_of_float64(degree: int, kernels: Callable[..., torch.Tensor]) -> None:
     """Also of the camera's position, and for colours that are cut off at zero."""
@@ -136,7 +136,7 @@ def test_values_and_gradients_are_those_of_float64(degree: int, kernels: Callabl
         for name, value in exact.items():
             value.copy_(mine[name])
     pull = torch.randn(50, 4, generator=g)
-    found, wanted = kernels(**mine, degree=degree), sh.colors(**exact, degree=degree)
+    found, wanted = kernels(**mine, degree=degree), sh.sh_colors(**exact, degree=degree)
     assert bool((wanted == 0).any()) and torch.allclose(found.double(), wanted, rtol=1e-5, atol=1e-5)
     (found * pull).sum().backward()
     (wanted * pull.double()).sum().backward()

@@ -17,7 +17,7 @@ from neuprim.core.compute.device import HOST
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
-from neuprim.core.render.backends import choose_backend, computing_device, device_of
+from neuprim.core.render.backends import best_render_device, choose_backend, computing_device
 from neuprim.runs.fit import prepare_training
 from tests import scenes
 from tests.core import tiny
@@ -120,10 +120,10 @@ def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.M
         (RenderSettings(backend="card"), CARD),
         (setting(CARD.type), CARD),
     ):
-        assert device_of(model, settings, camera, {}) == wanted, settings
+        assert best_render_device(model, settings, camera, {}) == wanted, settings
     row = replace(backends.TABLE[0], unsupported=lambda low, camera: "this model")
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
-    assert device_of(model, RenderSettings(), camera, {}) == HOST
+    assert best_render_device(model, RenderSettings(), camera, {}) == HOST
 
 
 def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:

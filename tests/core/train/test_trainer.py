@@ -147,7 +147,7 @@ def test_a_step_works_on_as_many_threads_as_the_renderer_has(
     """Its loss and its optimiser too, whatever the machine has."""
     trainer, other, asked = tiny.trainer(plain, 40), tiny.trainer(plain, 40), set()
     monkeypatch.setattr(threads, "core_count", lambda: 5)
-    monkeypatch.setattr(threads, "_pool", lambda n, made=threads._pool: asked.add(n) or made(n))  # type: ignore[func-returns-value]
+    monkeypatch.setattr(threads, "_thread_pool", lambda n, made=threads._thread_pool: asked.add(n) or made(n))  # type: ignore[func-returns-value]
     trainer.renderer = replace(trainer.renderer, threads=count)
     trainer.train_step()
     assert asked == (set() if count == 1 else {3})

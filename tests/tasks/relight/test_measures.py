@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from neuprim.core.errors import DataError
-from neuprim.core.metrics import means, psnr
+from neuprim.core.metrics import mean_metrics, psnr
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks import relight
 from neuprim.tasks.relight import pixel_class_errors, pixel_class_shares, relight_scores
@@ -38,7 +38,7 @@ def test_classes_pool_by_their_pixels() -> None:
     first[:4], second[:2] = 2, 0
     entries = [pixel_class_errors(rendered, truth, first), pixel_class_errors(rendered + 0.1, truth, second)]
     assert set(entries[0]) == {"mse_background", "pixels_background", "mse_cast_shadow", "pixels_cast_shadow"}
-    pooled = means(entries)
+    pooled = mean_metrics(entries)
     squares = torch.cat(
         [(rendered - truth).square()[first == 2], ((rendered + 0.1).clamp(0, 1) - truth).square()[second == 2]]
     )  # one pool over both views

@@ -19,7 +19,7 @@ ZIP, MASK, BLOSC = 1, 2, 4  # the bits of a grid's compression word
 _BLOSC_HEADER = struct.Struct("<4xI4xI")  # of a chunk's 16 bytes: how many it unpacks to, and how many it has
 
 
-class Cursor:
+class VdbCursor:
     """A position ``at`` in the ``data`` of a file that cannot go beyond ``end``."""
 
     __slots__ = ("at", "data", "end", "path")
@@ -58,7 +58,7 @@ class Cursor:
 
 
 @contextmanager
-def open_cursor(path: Path) -> Iterator[Cursor]:
+def open_cursor(path: Path) -> Iterator[VdbCursor]:
     """A cursor at the start of a file, which is mapped rather than read; raises DataError where it cannot be."""
     if not path.exists():
         raise DataError(f"{path}: file not found; expected an OpenVDB file")
@@ -72,7 +72,7 @@ def open_cursor(path: Path) -> Iterator[Cursor]:
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror or error}); expected an OpenVDB file") from None
     with data:
-        yield Cursor(path, data)
+        yield VdbCursor(path, data)
 
 
 def compression_label(flags: int) -> str:
@@ -228,7 +228,7 @@ def read_header(path: Path) -> FileHeader:
         return parse_header(cursor)
 
 
-def parse_header(cursor: Cursor) -> FileHeader:
+def parse_header(cursor: VdbCursor) -> FileHeader:
     """:func:`read_header` for an open file whose cursor is at the start."""
     if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
         expected = f"{MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
@@ -240,11 +240,11 @@ def parse_header(cursor: Cursor) -> FileHeader:
     if not offsets:
         raise cursor.fail("written as a stream, without offsets of grids; expected a file (save it again with OpenVDB)")
     cursor.skip(36, "the file's identifier")
-    metadata = _metadata(cursor, "file metadata")
+    metadata = _parse_metadata(cursor, "file metadata")
     (count,) = cursor.unpack("I", "the number of grids")
     grids: list[GridHeader] = []
     for i in range(count):
-        grids.append(_grid(cursor, f"grid {i + 1} of {count}"))
+        grids.append(_parse_grid(cursor, f"grid {i + 1} of {count}"))
         cursor.at = grids[-1].end
     names = [grid.name for grid in grids]
     if len(set(names)) != len(names):
@@ -258,7 +258,7 @@ def _unique_name(text: str) -> str:
     return f"{name}[{number}]" if number else name
 
 
-def _grid(cursor: Cursor, what: str) -> GridHeader:
+def _parse_grid(cursor: VdbCursor, what: str) -> GridHeader:
     name = _unique_name(cursor.text(f"name of {what}"))
     what = f"grid {name!r}"
     kind, parent = cursor.text(f"type of {what}"), cursor.text(f"parent of {what}")
@@ -268,18 +268,18 @@ def _grid(cursor: Cursor, what: str) -> GridHeader:
     if not cursor.at <= start <= block <= end <= len(cursor.data):
         expected = f"rising offsets from {cursor.at} to at most {len(cursor.data)}"
         raise cursor.fail(f"{what} claims bytes {start} to {block} to {end}; expected {expected}")
-    inner = Cursor(cursor.path, cursor.data, start, end)
+    inner = VdbCursor(cursor.path, cursor.data, start, end)
     (flags,) = inner.unpack("I", f"compression of {what}")
     if flags & ~(ZIP | MASK | BLOSC):
         expected = "a sum of 1 (zip), 2 (active values) and 4 (blosc)"
         raise inner.fail(f"{what} has compression bits {flags:#x}; expected {expected}")
-    metadata = _metadata(inner, f"metadata of {what}")
-    mapping, transform = _transform(inner, what)
+    metadata = _parse_metadata(inner, f"metadata of {what}")
+    mapping, transform = _parse_transform(inner, what)
     tree, half, parent = kind.removesuffix(_HALF), kind.endswith(_HALF), _unique_name(parent)
     return GridHeader(name, tree, half, flags, metadata, mapping, transform, parent, inner.at, block, end)
 
 
-def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
+def _parse_metadata(cursor: VdbCursor, what: str) -> dict[str, Any]:
     (count,) = cursor.unpack("I", f"count of {what}")
     found: dict[str, Any] = {}
     for _ in range(count):
@@ -300,7 +300,7 @@ def _metadata(cursor: Cursor, what: str) -> dict[str, Any]:
     return found
 
 
-def _transform(cursor: Cursor, what: str) -> tuple[str, np.ndarray | None]:
+def _parse_transform(cursor: VdbCursor, what: str) -> tuple[str, np.ndarray | None]:
     mapping = cursor.text(f"transform of {what}")
     if mapping not in _DOUBLES:
         return mapping, None

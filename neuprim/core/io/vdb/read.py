@@ -22,9 +22,9 @@ from neuprim.core.io.vdb.header import (
     BLOSC,
     MASK,
     ZIP,
-    Cursor,
     FileHeader,
     GridHeader,
+    VdbCursor,
     decompressor,
     open_cursor,
     parse_header,
@@ -56,10 +56,10 @@ def read_grids(
         if names is None:
             names = [g.name for g in file.grids if not (g.undecodable() if level_sets else g.refusal())]
         for name in names:
-            yield _read(cursor, file, file.grid(name), max_bytes, level_sets)
+            yield _decode_grid(cursor, file, file.grid(name), max_bytes, level_sets)
 
 
-def _read(cursor: Cursor, file: FileHeader, header: GridHeader, max_bytes: int, level_sets: bool) -> Grid:
+def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_bytes: int, level_sets: bool) -> Grid:
     what = f"grid {header.name!r}"
     refusal = header.undecodable() if level_sets else header.refusal()
     if refusal or header.transform is None:
@@ -88,7 +88,7 @@ _CHUNK = 1024  # leaves decoded together: 2 MB of float32, which stay in a core'
 _LEAF = 512  # voxels
 
 
-class Slots:
+class NodeSlots:
     """The children of an internal node: how many, voxels along an edge of each, and their lowest indices in it."""
 
     def __init__(self, log2: int, edge: int) -> None:
@@ -97,15 +97,15 @@ class Slots:
         self.offsets = np.stack(axes, 1).astype(np.int32) * np.int32(edge)
 
 
-UPPER, LOWER = Slots(5, 128), Slots(4, 8)
+UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
     """Decodes the tree of ``source``, called ``what``, into the arrays of a Grid of at most ``max_bytes``."""
 
-    def __init__(self, file: Cursor, source: GridHeader, what: str, max_bytes: int) -> None:
-        self._buffers = Cursor(file.path, file.data, source.block, source.end)
-        self._cursor = cursor = Cursor(file.path, file.data, source.tree_at, source.block)
+    def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
+        self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
+        self._cursor = cursor = VdbCursor(file.path, file.data, source.tree_at, source.block)
         self._flags, self._half, self._what = source.flags, source.half, what
         self._shape = (3,) if source.channels == 3 else ()
         self._stored = np.dtype("<f2" if source.half else "<f4")
@@ -169,10 +169,10 @@ class _TreeReader:
             self._cursor.skip(64 * len(leaves), f"masks of {len(leaves)} leaves of {self._what}")
             self._leaf_origins.append(lower + leaves)
 
-    def _node(self, origin: np.ndarray, slots: Slots) -> np.ndarray:
+    def _node(self, origin: np.ndarray, slots: NodeSlots) -> np.ndarray:
         """Reads an internal node, keeps its tiles, and returns which slots, in order, are children."""
         cursor, what = self._cursor, f"a node of {self._what}"
-        children, active = (_bits(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
+        children, active = (_unpack_mask(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
         values = self._values(active, slots.count, what)
         if values is not None:
             kept = np.flatnonzero(~children)
@@ -211,11 +211,11 @@ class _TreeReader:
         values = np.empty((count, *self._shape), np.float32)
         values[:] = low
         if chosen is not None:
-            values[_bits(chosen)] = high
+            values[_unpack_mask(chosen)] = high
         values[active] = found
         return values
 
-    def _inactive(self, cursor: Cursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
+    def _inactive(self, cursor: VdbCursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
         """The code of a node, its two inactive values, and the mask that chooses the second of them."""
         code = cursor.take(1, f"value code of {what}")[0]
         if code > ALL_VALUES:
@@ -227,7 +227,7 @@ class _TreeReader:
             high = self._floats(cursor.take(self._full_size, f"inactive value of {what}"))
         return code, low, high, cursor.take(count // 8, f"selection mask of {what}") if code in (3, 4, 5) else None
 
-    def _payload(self, cursor: Cursor, count: int, what: str) -> bytes:
+    def _payload(self, cursor: VdbCursor, count: int, what: str) -> bytes:
         """The bytes of ``count`` stored values."""
         size = count * self._stored_size
         if not self._packed:
@@ -245,7 +245,7 @@ class _TreeReader:
         except ValueError as error:
             raise self._bad(cursor, what, error) from None
 
-    def _bad(self, cursor: Cursor, what: str, error: Exception) -> DataError:
+    def _bad(self, cursor: VdbCursor, what: str, error: Exception) -> DataError:
         return cursor.fail(f"{what} has, before byte {cursor.at}, {error}")
 
     def _decoded(self, raw: bytes) -> np.ndarray:
@@ -257,13 +257,13 @@ class _TreeReader:
     def _leaves(self, first: int, last: int) -> None:
         """Decode leaves ``first`` to ``last`` - 1: one loop over their headers, then whole arrays."""
         masks, special, whole, payloads = self._leaf_bytes(first, last)
-        active = _bits(masks).reshape(-1, _LEAF)
+        active = _unpack_mask(masks).reshape(-1, _LEAF)
         values = self.values[first:last]
         values[:] = self.background
         for i, low, high, chosen in special:
             values[i] = low
             if chosen is not None:
-                values[i, _bits(chosen)] = high
+                values[i, _unpack_mask(chosen)] = high
         stored = active
         if whole:
             stored = active.copy()
@@ -322,7 +322,7 @@ class _TreeReader:
         return b"".join(masks), special, whole, b"".join(payloads)
 
 
-def _bits(raw: bytes) -> np.ndarray:
+def _unpack_mask(raw: bytes) -> np.ndarray:
     return np.unpackbits(np.frombuffer(raw, np.uint8), bitorder="little").view(bool)
 
 

@@ -15,7 +15,7 @@ from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.vdb.grid import TILE_SIZES, Grid
 from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, compression_label
-from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, Slots
+from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, NodeSlots
 
 COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
 """Ways to pack values; inactive ones that are the background are never stored."""
@@ -46,16 +46,16 @@ def write_vdb(
         raise DataError(f"{path}: grids named {', '.join(map(repr, names))}; expected different names")
     flags = COMPRESSIONS[compression]
     identifier = str(uuid.uuid4()).encode()
-    head = struct.pack("<qIIIB", MAGIC, _VERSION, *_LIBRARY, 1) + identifier + _metadata(metadata or {}, str(path))
+    head = struct.pack("<qIIIB", MAGIC, _VERSION, *_LIBRARY, 1) + identifier + _pack_metadata(metadata or {}, str(path))
     with atomic_path(path) as temporary, open(temporary, "wb") as file:
         file.write(head + struct.pack("<I", len(grids)))
         for grid in grids:
             where = f"{path}: grid {grid.name!r}"
             writer = _TreeWriter(grid, flags, where)
             kind = ("Tree_vec3s_5_4_3" if grid.channels == 3 else "Tree_float_5_4_3") + "_HalfFloat" * grid.half
-            own = struct.pack("<I", flags) + _grid_metadata(grid, flags, where) + _transform(grid.transform, where)
+            own = struct.pack("<I", flags) + _grid_metadata(grid, flags, where) + _pack_transform(grid.transform, where)
             tree = own + writer.topology
-            file.write(_text(grid.name) + _text(kind) + _text(""))
+            file.write(_pack_text(grid.name) + _pack_text(kind) + _pack_text(""))
             start = file.tell() + 24
             file.write(struct.pack("<3q", start, start + len(tree), start + len(tree) + len(writer.buffers)))
             file.write(tree)
@@ -65,23 +65,23 @@ def write_vdb(
 # ---------------------------------------------------------------- head of a grid
 
 
-def _text(value: str) -> bytes:
+def _pack_text(value: str) -> bytes:
     raw = value.encode()
     return struct.pack("<I", len(raw)) + raw
 
 
-def _metadata(values: Mapping[str, Any], where: str) -> bytes:
+def _pack_metadata(values: Mapping[str, Any], where: str) -> bytes:
     parts = [struct.pack("<I", len(values))]
     for name, value in values.items():
-        kind, raw = _metadatum(value)
+        kind, raw = _pack_metadatum(value)
         if not kind:
             expected = "text, bool, int (64 bits), float, or three ints or floats"
             raise DataError(f"{where}: metadata {name!r} is {value!r}; expected {expected}")
-        parts.append(_text(name) + _text(kind) + struct.pack("<I", len(raw)) + raw)
+        parts.append(_pack_text(name) + _pack_text(kind) + struct.pack("<I", len(raw)) + raw)
     return b"".join(parts)
 
 
-def _metadatum(value: Any) -> tuple[str, bytes]:
+def _pack_metadatum(value: Any) -> tuple[str, bytes]:
     if isinstance(value, str):
         return "string", value.encode()
     if isinstance(value, bool):
@@ -103,17 +103,17 @@ def _metadatum(value: Any) -> tuple[str, bytes]:
 
 def _grid_metadata(grid: Grid, flags: int, where: str) -> bytes:
     # values of foreign types are bytes, which cannot be written
-    kept = {k: v for k, v in grid.metadata.items() if k not in _STALE and _metadatum(v)[0]}
+    kept = {k: v for k, v in grid.metadata.items() if k not in _STALE and _pack_metadatum(v)[0]}
     box: tuple[tuple[int, ...], tuple[int, ...]] = _EMPTY_BOX
     if grid.bounds:  # OpenVDB's boxes include their upper corner
         box = grid.bounds[0], tuple(v - 1 for v in grid.bounds[1])
     kept |= {"class": grid.kind, "name": grid.name, "file_bbox_min": box[0], "file_bbox_max": box[1]}
     kept |= {"file_voxel_count": grid.active_voxels, "file_compression": compression_label(flags)}
     kept |= {"is_saved_as_half_float": bool(grid.half)}
-    return _metadata(dict(sorted(kept.items())), where)
+    return _pack_metadata(dict(sorted(kept.items())), where)
 
 
-def _transform(matrix: np.ndarray, where: str) -> bytes:
+def _pack_transform(matrix: np.ndarray, where: str) -> bytes:
     """The simplest of OpenVDB's maps that is this transform."""
     matrix = np.asarray(matrix, np.float64)
     sound = matrix.shape == (4, 4) and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
@@ -121,12 +121,12 @@ def _transform(matrix: np.ndarray, where: str) -> bytes:
         raise DataError(f"{where}: transform {matrix.tolist()}; expected an invertible affine (4, 4) matrix")
     scale, translation = np.diag(matrix)[:3], matrix[:3, 3]
     if (matrix[:3, :3] != np.diag(scale)).any():
-        return _text("AffineMap") + matrix.T.astype("<f8").tobytes()
+        return _pack_text("AffineMap") + matrix.T.astype("<f8").tobytes()
     name = ("Uniform" if (scale == scale[0]).all() else "") + ("ScaleTranslateMap" if translation.any() else "ScaleMap")
     parts = [scale, np.abs(scale), 1 / scale, 1 / scale**2, 0.5 / scale]
     if translation.any():
         parts.insert(0, translation)
-    return _text(name) + np.concatenate(parts).astype("<f8").tobytes()
+    return _pack_text(name) + np.concatenate(parts).astype("<f8").tobytes()
 
 
 # ---------------------------------------------------------------- tree
@@ -137,7 +137,7 @@ class _TreeWriter:
 
     def __init__(self, grid: Grid, flags: int, where: str) -> None:
         self._grid, self._where = grid, where
-        self._pack = _packer(flags, (2 if grid.half else 4) * grid.channels)
+        self._pack = _value_packer(flags, (2 if grid.half else 4) * grid.channels)
         self._flags = flags
         self._check()
         self._origins = grid.origins.astype(np.int64)
@@ -172,7 +172,7 @@ class _TreeWriter:
         grid = self._grid
         root = np.flatnonzero(grid.tiles.sizes == TILE_SIZES[2])
         small = np.flatnonzero(grid.tiles.sizes < TILE_SIZES[2])
-        nodes = _grouped(TILE_SIZES[2], self._origins, self._tile_origins[small])
+        nodes = _group_by_block(TILE_SIZES[2], self._origins, self._tile_origins[small])
         parts = [struct.pack("<i", 1), grid.background.astype("<f4").tobytes()]
         parts.append(struct.pack("<II", len(root), len(nodes)))
         for i in root:
@@ -186,12 +186,14 @@ class _TreeWriter:
     def _upper(self, parts: list[bytes], origin: tuple[int, int, int], leaves: np.ndarray, tiles: np.ndarray) -> None:
         here = tiles[self._grid.tiles.sizes[tiles] == UPPER.edge]
         below = tiles[self._grid.tiles.sizes[tiles] < UPPER.edge]
-        nodes = _grouped(UPPER.edge, self._origins[leaves], self._tile_origins[below])
-        nodes.sort(key=lambda node: _slot(np.array([node[0]]), origin, UPPER)[0])
-        self._node(parts, _slot(np.array([n[0] for n in nodes]).reshape(-1, 3), origin, UPPER), origin, here, UPPER)
+        nodes = _group_by_block(UPPER.edge, self._origins[leaves], self._tile_origins[below])
+        nodes.sort(key=lambda node: _slot_numbers(np.array([node[0]]), origin, UPPER)[0])
+        self._node(
+            parts, _slot_numbers(np.array([n[0] for n in nodes]).reshape(-1, 3), origin, UPPER), origin, here, UPPER
+        )
         for corner, (inner, small) in nodes:
             mine = leaves[inner]
-            slots = _slot(self._origins[mine], corner, LOWER)
+            slots = _slot_numbers(self._origins[mine], corner, LOWER)
             mine = mine[np.argsort(slots)]
             self._node(parts, slots, corner, below[small], LOWER)
             for leaf in mine:
@@ -200,7 +202,12 @@ class _TreeWriter:
                 self._buffers.append(mask + self._values(self._grid.values[leaf], self._grid.masks[leaf]))
 
     def _node(
-        self, parts: list[bytes], children: np.ndarray, origin: tuple[int, int, int], tiles: np.ndarray, slots: Slots
+        self,
+        parts: list[bytes],
+        children: np.ndarray,
+        origin: tuple[int, int, int],
+        tiles: np.ndarray,
+        slots: NodeSlots,
     ) -> None:
         """Appends an internal node: masks of children and of active tiles, and the tiles' values."""
         grid = self._grid
@@ -208,7 +215,7 @@ class _TreeWriter:
         values = np.empty((slots.count, *grid.background.shape), np.float32)
         values[:] = grid.background
         has_child[children] = True
-        at = _slot(self._tile_origins[tiles], origin, slots)
+        at = _slot_numbers(self._tile_origins[tiles], origin, slots)
         active[at] = grid.tiles.active[tiles]
         values[at] = grid.tiles.values[tiles]
         parts += [np.packbits(has_child, bitorder="little").tobytes(), np.packbits(active, bitorder="little").tobytes()]
@@ -230,7 +237,7 @@ class _TreeWriter:
         return bytes([code]) + extra + self._pack(stored.astype("<f2" if grid.half else "<f4").tobytes())
 
 
-def _grouped(
+def _group_by_block(
     size: int, leaves: np.ndarray, tiles: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
     """The blocks of ``size`` voxels that hold leaves or tiles, by corner, with the indices of both in each."""
@@ -244,14 +251,14 @@ def _grouped(
     return found
 
 
-def _slot(corners: np.ndarray, origin: tuple[int, int, int], slots: Slots) -> np.ndarray:
+def _slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: NodeSlots) -> np.ndarray:
     """The slot numbers, in a node at ``origin``, of the children at ``corners`` (n, 3)."""
     edge = round(slots.count ** (1 / 3))
     x, y, z = ((corners - np.array(origin)) // slots.edge).astype(np.int64).T
     return np.asarray((x * edge + y) * edge + z)
 
 
-def _packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
+def _value_packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
     """The function that packs values of ``unit`` bytes, with their length in front as OpenVDB has it."""
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw

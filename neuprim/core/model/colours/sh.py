@@ -15,12 +15,12 @@ from neuprim.core.model.schema import Params
 from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
 
 
-def coefficient_count(degree: int) -> int:
+def sh_coefficient_count(degree: int) -> int:
     """Coefficients per channel of all bands up to ``degree``."""
     return (degree + 1) ** 2
 
 
-def basis(directions: Tensor, degree: int) -> Tensor:
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """(N, (degree + 1)^2) basis values at unit ``directions`` (N, 3), degree 0..3."""
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical-harmonics degree {degree}; expected 0..3")
@@ -44,7 +44,7 @@ def basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(rows, -1)
 
 
-def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
+def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
     """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 tensors.
 
     Args:
@@ -56,7 +56,7 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
     Raises:
         FormError: a tensor does not fit.
     """
-    _check(means, dc, rest, origin, degree)
+    _check_sh_inputs(means, dc, rest, origin, degree)
     if degree == 0:
         return (dc * C0 + 0.5).clamp_min(0.0)
     assert rest is not None  # checked above
@@ -68,16 +68,16 @@ def colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         from neuprim.core.model.colours import sh_warp
 
         return sh_warp.fused_colors(means, dc, rest, origin, degree)
-    offset = means - device.to_like(origin, means)
+    offset = means - device.to_device_like(origin, means)
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-    bands = basis(direction, degree)[:, 1:]
+    bands = sh_basis(direction, degree)[:, 1:]
     return (dc * C0 + 0.5 + (bands[:, :, None] * rest[:, : bands.shape[1]]).sum(1)).clamp_min(0.0)
 
 
-def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> None:
+def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> None:
     if not isinstance(degree, int) or not 0 <= degree <= 3:
         raise FormError(f"sh.colors: degree {degree!r}; expected 0..3")
-    needed = coefficient_count(degree) - 1
+    needed = sh_coefficient_count(degree) - 1
     if needed and rest is None:
         raise FormError(f"sh.colors: rest is None; expected (N, at least {needed}, C) for degree {degree}")
     tensors: list[tuple[str, Any, tuple[Shape, ...]]] = [("means", means, (("N", 3),)), ("dc", dc, (("N", "C"),))]
@@ -91,10 +91,10 @@ def _check(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degre
         raise FormError(f"sh.colors: {fault}")
 
 
-def truncate_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
+def truncate_sh_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
     """Return the tensors without the bands above ``degree`` of ``name``: the closest there is, on average."""
     kept = {key: value for key, value in params.items() if key != name}
-    return {**kept, name: params[name][:, : coefficient_count(degree) - 1].contiguous()} if degree else kept
+    return {**kept, name: params[name][:, : sh_coefficient_count(degree) - 1].contiguous()} if degree else kept
 
 
 _DARKEST = 1e-3
@@ -102,7 +102,7 @@ _DARKEST = 1e-3
 black."""
 
 
-def coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, ...]:
+def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, ...]:
     """Every number by itself of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``, told of by bands."""
     return tuple(
         PrunableUnit(
@@ -114,6 +114,6 @@ def coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, .
     )
 
 
-def initial_dc(color: Tensor) -> Tensor:
+def initial_sh_dc(color: Tensor) -> Tensor:
     """(N, C) float32 zero-order coefficients of a colour (N, C) that is the same from everywhere."""
     return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

@@ -148,6 +148,6 @@ class _Colors(torch.autograd.Function):
 
 
 def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """:func:`~neuprim.core.model.colours.sh.colors` of float32 CPU tensors, degree 1..3; differentiable in all four."""
+    """:func:`~neuprim.core.model.colours.sh.sh_colors` of float32 CPU tensors, degree 1..3; differentiable."""
     result: Tensor = apply_autograd(_Colors, means, dc, rest, origin, degree)
     return result

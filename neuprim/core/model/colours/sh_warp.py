@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 
 d, f = wp.float64, wp.float32
@@ -131,7 +131,7 @@ class _Colors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
         means, dc, rest = (x.detach().contiguous() for x in (means, dc, rest))
-        centre = device.to_like(origin.detach(), means).double().contiguous()
+        centre = device.to_device_like(origin.detach(), means).double().contiguous()
         color = torch.empty(dc.shape, dtype=torch.float32, device=dc.device)
         arrays = (
             array(means, wp.vec3),
@@ -140,7 +140,7 @@ class _Colors(torch.autograd.Function):
             array(centre, wp.float64),
             array(color, wp.float32),
         )
-        launch(_kernels(degree)[0], len(means), arrays, means.device)
+        launch_kernel(_kernels(degree)[0], len(means), arrays, means.device)
         ctx.tensors, ctx.degree, ctx.origin = (means, rest, centre, color), degree, (origin.dtype, origin.device)
         return color
 
@@ -148,7 +148,7 @@ class _Colors(torch.autograd.Function):
     def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:
         means, rest, centre, color = ctx.tensors
         g_means, g_dc, g_rest = torch.empty_like(means), torch.empty_like(color), torch.empty_like(rest)
-        launch(
+        launch_kernel(
             _kernels(ctx.degree)[1], len(means),
             (
                 array(means, wp.vec3), array(rest, wp.float32), array(centre, wp.float64), array(color, wp.float32),
@@ -162,6 +162,6 @@ class _Colors(torch.autograd.Function):
 
 
 def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """:func:`~neuprim.core.model.colours.sh.colors` of float32 GPU tensors, degree 1..3; differentiable in all four."""
+    """:func:`~neuprim.core.model.colours.sh.sh_colors` of float32 GPU tensors, degree 1..3; differentiable."""
     result: Tensor = _Colors.apply(means, dc, rest, origin, degree)
     return result

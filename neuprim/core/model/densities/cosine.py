@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.cosine_sums import canonicalize_cosines, canonicalize_gain, prune_neurons, smaller_neuron_counts
-from neuprim.core.model.edge import EDGES, NORMS, fade
+from neuprim.core.model.edge import EDGES, NORMS, edge_weight
 from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
@@ -86,14 +86,14 @@ class CosineDensity(DensityField):
             ParameterSpec("W1", (K, 3), 3e-3, lambda c: c.uniform(K, 3, bound=third)),
             ParameterSpec("b1", (K,), 3e-3, lambda c: c.uniform(K, bound=third)),
             ParameterSpec("w2", (K,), 1e-2, lambda c: c.uniform(K, bound=amplitude)),
-            ParameterSpec("b2", (1,), 1e-2, lambda c: _initial_offset(c, amplitude, NORMS[self.edge])),
+            ParameterSpec("b2", (1,), 1e-2, lambda c: _initial_density_offset(c, amplitude, NORMS[self.edge])),
         ]
         if self.gain:
             specs.append(ParameterSpec("log_gain", (1,), 2e-1, lambda c: torch.zeros(c.count, 1)))
         return specs
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
-        w2, b2 = amplified(params["w2"], params["b2"], params.get("log_gain"))
+        w2, b2 = apply_density_gain(params["w2"], params["b2"], params.get("log_gain"))
         return Cosine(params["W1"], params["b1"], w2, b2, self.omega0, self.edge)
 
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
@@ -128,14 +128,14 @@ class CosineDensity(DensityField):
         return read_script(__package__, "cosine.js")
 
     def largest(self, params: Params, geometry: Geometry) -> Tensor:
-        w2, b2 = amplified(params["w2"], params["b2"], params.get("log_gain"))
+        w2, b2 = apply_density_gain(params["w2"], params["b2"], params.get("log_gain"))
         return (b2.reshape(-1) + w2.abs().sum(1)).clamp_min(0) / geometry.length_scale
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
         return {**params, "w2": params["w2"] * factor[:, None], "b2": params["b2"] * factor[:, None]}
 
 
-def amplified(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
+def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
     """Return (w2, b2), (N, K) and (N, 1), times the gain exp(log_gain), (N, 1) or (N,)."""
     if log_gain is None:
         return w2, b2
@@ -148,7 +148,7 @@ _FAINT, _SOLID = 0.02, 0.98
 """Starting points that say how opaque they are start within these: beyond, little light or little gradient passes."""
 
 
-def _initial_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
+def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
     mode, alpha = ctx.choice("mode", "opaque", "paper"), ctx.number("alpha", 0.8, 0, 1)
     opaque = -math.log1p(-alpha) / norm  # a central chord of a sphere has optical depth N_p b2
     if mode == "paper" and amplitude:
@@ -170,10 +170,10 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
     whitened = (geometry.rotations[prim].transpose(1, 2) @ local[:, :, None])[..., 0] * (
         m[:, None] / geometry.scales[prim]
     )
-    return sigma * fade(whitened.square().sum(-1), form.edge)
+    return sigma * edge_weight(whitened.square().sum(-1), form.edge)
 
 
-def split_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
+def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
     """(rows,) float64 factor c on a child's (w2, b2), see :func:`split_cosine`."""
     r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
     if edge == 0:
@@ -190,7 +190,7 @@ def split_cosine(
     c = r V/2V' then, V = s_1 s_2 s_3, and both children have as much of the weight (1 - |y|^2)^p as their parent. In
     float64, so that the field changes by no more than the final rounding.
     """
-    r, c = split_scale(old, new), split_scale(old, new, edge)
+    r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
     W1, b1 = params["W1"].double(), params["b1"].double()
     b1 = b1 + (W1 * shift[:, None, :]).sum(-1)
@@ -217,7 +217,7 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
     ``volume``: the Gaussians are densities in space, whose optical depth, not alpha, is a bell on the screen.
     """
-    table = _table(edge, volume)
+    table = _gaussian_support_table(edge, volume)
     alphas = alphas.double().clamp(1e-9, 1 - 1e-9)
     where = (torch.logit(alphas).clamp(float(_LOGITS[0]), float(_LOGITS[-1])) - _LOGITS[0]) / (_LOGITS[1] - _LOGITS[0])
     row = where.floor().long().clamp(0, len(_LOGITS) - 2)
@@ -227,7 +227,7 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
 
 @lru_cache
-def _table(edge: int, volume: bool) -> Tensor:
+def _gaussian_support_table(edge: int, volume: bool) -> Tensor:
     """(O, 2) c and log(tau / -log(1 - o)) for the tabulated opacities, by a golden section of c."""
     r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
     opacity = torch.sigmoid(_LOGITS)[:, None]

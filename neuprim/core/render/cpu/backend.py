@@ -17,23 +17,30 @@ from neuprim.core.model.checks import non_finite_error, refuse_non_finite_colour
 from neuprim.core.model.primitives import Lowered
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.backward import ImageGradient, backward_tiles, sum_rows
+from neuprim.core.render.cpu.backward import ImageGradient, backward_tiles, sum_gradient_rows
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
-from neuprim.core.render.cpu.colour_net import Net, net_backward, prepare_net
+from neuprim.core.render.cpu.colour_net import ColourNet, colour_net_backward, prepare_colour_net
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
-from neuprim.core.render.cpu.forward import Image, SavedForBackward, composite_tiles
-from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_backward, prepare_wide
+from neuprim.core.render.cpu.forward import SavedForBackward, TileImage, composite_tiles
+from neuprim.core.render.cpu.prepare import (
+    PrimitiveArrays,
+    Projected,
+    View,
+    prepare_backward,
+    prepare_primitives,
+    prepare_wide,
+)
 from neuprim.core.render.cpu.tiles import FrameArrays
 from neuprim.core.render.cpu.trigonometry import EDGE_TYPES
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.rasterize import (
     NET,
     PARAMETERS,
-    Request,
-    gradients_like,
-    parameters_of,
+    RasterRequest,
+    input_gradients,
+    primitive_tensors,
     rasterize,
-    remember_inputs,
+    remember_input_types,
 )
 from neuprim.core.settings import RenderSettings
 
@@ -44,31 +51,31 @@ Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
-class _Prepared:
+class _PreparedFrame:
     """What the backward pass shares with the forward pass of one frame."""
 
-    request: Request
+    request: RasterRequest
     tensors: dict[str, Array]  # parameters, and weights of colour networks, by name, all of one dtype
     view: View
     projected: Projected
     arrays: FrameArrays
     lists: TileLists
-    net: Net | None
+    net: ColourNet | None
     tiles: int  # of an image
     chunk: int  # tiles that are one unit of work
 
     @property
-    def parameters(self) -> Parameters:
-        return Parameters(*(self.tensors[name] for name in PARAMETERS))
+    def parameters(self) -> PrimitiveArrays:
+        return PrimitiveArrays(*(self.tensors[name] for name in PARAMETERS))
 
 
-def _array(tensor: Tensor) -> Array:
+def _cpu_array(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.detach().resolve_neg().numpy())
 
 
 def _arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
     """By name and in one dtype, the widest, so that a mix does not compile kernels of its own."""
-    arrays = [_array(x) for x in tensors]
+    arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]
     return dict(zip((*PARAMETERS, *NET), arrays, strict=False))
@@ -83,29 +90,34 @@ def _ray_norms(width: int, height: int, fx: float, fy: float, cx: float, cy: flo
     return result
 
 
-def _view(camera: Camera, viewmat: Tensor, near: float, turns: float) -> View:
+def _camera_view(camera: Camera, viewmat: Tensor, near: float, turns: float) -> View:
     matrix = viewmat.detach().double().numpy()
     R, t = np.ascontiguousarray(matrix[:3, :3]), np.ascontiguousarray(matrix[:3, 3])
     fx, fy, cx, cy = (float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
     return View(R, t, fx, fy, cx, cy, camera.width, camera.height, near, turns)
 
 
-def _prepare(
-    request: Request, viewmat: Tensor, tensors: Sequence[Tensor], images: tuple[Array, int] | None = None
-) -> _Prepared:
+def _prepare_frame(
+    request: RasterRequest, viewmat: Tensor, tensors: Sequence[Tensor], images: tuple[Array, int] | None = None
+) -> _PreparedFrame:
     camera, settings = request.camera, request.settings
     arrays, threads = _arrays_by_name(tensors), settings.threads
-    parameters = Parameters(*(arrays[name] for name in PARAMETERS))
+    parameters = PrimitiveArrays(*(arrays[name] for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
     projected = Projected.allocate(count, K)
-    view, least = _view(camera, viewmat, settings.near_plane, request.turns), P.min_visible_depth(settings.alpha_min)
-    parallel_for(prepare, count, _PRIMITIVES_PER_CHUNK, threads, parameters, view, request.edge, least, projected)
+    view, least = (
+        _camera_view(camera, viewmat, settings.near_plane, request.turns),
+        P.min_visible_depth(settings.alpha_min),
+    )
+    parallel_for(
+        prepare_primitives, count, _PRIMITIVES_PER_CHUNK, threads, parameters, view, request.edge, least, projected
+    )
     bad = np.flatnonzero(projected.status == P.NON_FINITE)
     if bad.size:
         raise non_finite_error({name: torch.from_numpy(array) for name, array in arrays.items()}, int(bad[0]))
     in_float64, net_rows = projected.in_float64, None
     if "Wx" in arrays:
-        net_rows, fast = prepare_net(np.arange(count), arrays, False, threads)
+        net_rows, fast = prepare_colour_net(np.arange(count), arrays, False, threads)
         in_float64 = in_float64 | fast
     slots, which = np.full(count, -1, np.int32), np.flatnonzero(in_float64 & (projected.status == P.VISIBLE))
     slots[which] = np.arange(len(which), dtype=np.int32)
@@ -116,7 +128,7 @@ def _prepare(
     net = None
     if net_rows is not None:
         hidden = arrays["Wx"].shape[1]
-        net = Net(net_rows, prepare_net(which, arrays, True, threads)[0], hidden + hidden % 2)
+        net = ColourNet(net_rows, prepare_colour_net(which, arrays, True, threads)[0], hidden + hidden % 2)
     lists = bin_primitives(projected, camera.width, camera.height, threads, images)
     request.stats.extra["float64"], request.stats.pairs = len(which), lists.pairs
     frame = FrameArrays(
@@ -140,29 +152,29 @@ def _prepare(
     across, workers = -(-camera.width // P.TILE), resolve_threads(threads)
     tiles = across * -(-camera.height // P.TILE)
     chunk = max(2 if workers > 1 else _TILES_ALONE, across // 2, tiles // (_UNITS_PER_THREAD * workers))
-    return _Prepared(request, arrays, view, projected, frame, lists, net, tiles, chunk)
+    return _PreparedFrame(request, arrays, view, projected, frame, lists, net, tiles, chunk)
 
 
 class _Rasterize(torch.autograd.Function):
     @staticmethod
     def forward(  # type: ignore[override]
-        ctx: Any, request: Request, viewmat: Tensor, background: Tensor, palette: Tensor, *tensors: Tensor
+        ctx: Any, request: RasterRequest, viewmat: Tensor, background: Tensor, palette: Tensor, *tensors: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         weights = dict(zip(NET, tensors[len(PARAMETERS) :], strict=False))
         colours = weights | {"base" if weights else "colors": palette}
         refuse_non_finite_colours(colours, dict(zip(PARAMETERS, tensors, strict=False)) | colours)
-        frame = _prepare(request, viewmat, tensors)
+        frame = _prepare_frame(request, viewmat, tensors)
         settings, camera = request.settings, request.camera
         h, w = camera.height, camera.width
-        image = Image(
+        image = TileImage(
             rgb=np.empty((h, w, palette.shape[1]), np.float32),
             transmittance=np.empty((h, w), np.float32),
             zsum=np.zeros((h, w) if settings.depth else (1, 1), np.float32),
             last=np.empty((h, w), np.int32),
-            background=_array(background.float()),
+            background=_cpu_array(background.float()),
             with_depth=settings.depth,
         )
-        colors = np.ascontiguousarray(_array(palette), np.float32)
+        colors = np.ascontiguousarray(_cpu_array(palette), np.float32)
         work = (frame.tiles, frame.chunk, settings.threads, frame.arrays, colors, image)
         form, saved = (frame.net, EDGE_TYPES[request.edge]), None
         if settings.sort == "entry":
@@ -173,13 +185,13 @@ class _Rasterize(torch.autograd.Function):
             lanes, saved.depths = [n for n, _ in drawn], [depths for _, depths in drawn]
         request.stats.extra["forward_lanes"] = sum(lanes)
         ctx.frame, ctx.colors, ctx.image, ctx.saved = frame, colors, image, saved
-        remember_inputs(ctx, (viewmat, background, palette, *tensors))
+        remember_input_types(ctx, (viewmat, background, palette, *tensors))
         return torch.from_numpy(image.rgb), torch.from_numpy(image.transmittance), torch.from_numpy(image.zsum)
 
     @staticmethod
     def backward(ctx: Any, g_rgb: Tensor | None, g_T: Tensor | None, g_z: Tensor | None) -> tuple[Any, ...]:  # type: ignore[override]
-        frame: _Prepared = ctx.frame
-        image: Image = ctx.image
+        frame: _PreparedFrame = ctx.frame
+        image: TileImage = ctx.image
         request, count, threads = frame.request, len(ctx.colors), frame.request.settings.threads
         (h, w), C = image.transmittance.shape, ctx.colors.shape[1]
         g_rgb = torch.zeros(h, w, C) if g_rgb is None else g_rgb
@@ -191,10 +203,10 @@ class _Rasterize(torch.autograd.Function):
         gradient = ImageGradient(
             transmittance=image.transmittance,
             last=image.last,
-            rgb=_float32(g_rgb),
-            g_transmittance=_float32(g_T + g_rgb @ torch.from_numpy(image.background)),
-            z=_float32(g_z) if with_depth and g_z is not None else np.zeros((1, 1), np.float32),
-            error=np.zeros((h, w), np.float32) if asked is None else _float32(asked.error.detach()),
+            rgb=_float32_image(g_rgb),
+            g_transmittance=_float32_image(g_T + g_rgb @ torch.from_numpy(image.background)),
+            z=_float32_image(g_z) if with_depth and g_z is not None else np.zeros((1, 1), np.float32),
+            error=np.zeros((h, w), np.float32) if asked is None else _float32_image(asked.error.detach()),
             pair_rows=pair_rows,
             with_depth=with_depth,
         )
@@ -212,9 +224,9 @@ class _Rasterize(torch.autograd.Function):
         request.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
         lists, primitives = frame.lists, (count, _PRIMITIVES_PER_CHUNK, threads)
-        parallel_for(sum_rows, *primitives, lists.first, lists.slots, pair_rows, grads, touched)
+        parallel_for(sum_gradient_rows, *primitives, lists.first, lists.slots, pair_rows, grads, touched)
         parameters = frame.parameters
-        out = Parameters(*(np.zeros(x.shape, np.float32) for x in parameters))
+        out = PrimitiveArrays(*(np.zeros(x.shape, np.float32) for x in parameters))
         g_view = np.zeros((count if ctx.needs_input_grad[1] else 0, 3, 4), np.float64)
         parallel_for(
             prepare_backward, *primitives, parameters, frame.view, frame.projected, grads, touched, out, g_view
@@ -225,7 +237,7 @@ class _Rasterize(torch.autograd.Function):
             t = frame.tensors
             g_net = [np.zeros(t[name].shape, np.float32) for name in NET]
             parallel_for(
-                net_backward, *primitives, t["log_scales"], t["quats"], t["Wx"], frame.net.rows,
+                colour_net_backward, *primitives, t["log_scales"], t["quats"], t["Wx"], frame.net.rows,
                 grads, base + C, touched, out.log_scales, out.quats, *g_net,
             )  # fmt: skip
         if asked is not None:
@@ -235,10 +247,10 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             background = (g_rgb * torch.from_numpy(image.transmittance)[..., None]).sum((0, 1))
         results = (np.ascontiguousarray(grads[:, base : base + C]), *out, *g_net)
-        return gradients_like(ctx, view, (background, *map(torch.from_numpy, results)))
+        return input_gradients(ctx, view, (background, *map(torch.from_numpy, results)))
 
 
-def _float32(tensor: Tensor) -> Array:
+def _float32_image(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.resolve_neg().numpy(), np.float32)
 
 
@@ -252,8 +264,8 @@ def render_slabs(
 ) -> tuple[Tensor, Tensor]:
     """Return opacity and depth of each slab, prepared as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means = lowered.geometry.means
-    request = Request.of(lowered, camera, settings, RenderStats("cpu", len(means)))
-    frame = _prepare(request, camera.viewmat, parameters_of(lowered), (slabs.numpy(), count))
+    request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))
+    frame = _prepare_frame(request, camera.viewmat, primitive_tensors(lowered), (slabs.numpy(), count))
     shape, saved = (count, camera.height, camera.width), SavedForBackward.allocate(0)
     T, z = np.empty(shape, np.float32), np.empty(shape, np.float32)
     rgb, last = np.empty((*shape[1:], 1), np.float32), np.empty(shape[1:], np.int32)  # not used
@@ -262,7 +274,7 @@ def render_slabs(
         starts = frame.lists.starts[slab * frame.tiles : (slab + 1) * frame.tiles + 1]
         parallel_for(
             composite_tiles, frame.tiles, frame.chunk, settings.threads, frame.arrays._replace(starts=starts), colors,
-            Image(rgb, T[slab], z[slab], last, black, True), saved.live, saved.first_lane, None,
+            TileImage(rgb, T[slab], z[slab], last, black, True), saved.live, saved.first_lane, None,
             EDGE_TYPES[request.edge],
         )  # fmt: skip
     alpha = 1 - torch.from_numpy(T)

@@ -10,7 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import borrow_array, compress16, copy16, exact_kernel, inline, kernel, release_array
+from neuprim.core.compute.kernels import (
+    borrow_array,
+    borrow_arrays,
+    compress16,
+    copy16,
+    exact_kernel,
+    inline,
+    kernel,
+    release_array,
+)
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.colour_net import ray_colour_gradient, ray_colours
@@ -23,13 +32,12 @@ from neuprim.core.render.cpu.gradients import (
     neuron_gradients,
 )
 from neuprim.core.render.cpu.tiles import (
-    aligned,
-    chords,
-    compact,
-    fetch_ahead,
-    lend_frame,
+    aligned_zeros,
+    compact_lanes,
+    lane_chords,
     pair_window,
     prefetch_depths,
+    prefetch_pair,
     row_spans,
 )
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
@@ -57,7 +65,7 @@ class ImageGradient(NamedTuple):
 
 
 @inline
-def optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
+def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
     """DEPTH of every lane, as the forward pass computes it."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
@@ -67,7 +75,7 @@ def optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 
 @inline
-def opacity(S, n, amin, amax):  # type: ignore[no-untyped-def]
+def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
     """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH, with the forward pass's clamp and cut."""
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
@@ -205,7 +213,7 @@ def _compact_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _total(sums, first):  # type: ignore[no-untyped-def]
+def _sum_row(sums, first):  # type: ignore[no-untyped-def]
     total = f(0)
     for k in range(P.TILE):
         total += sums[first + k]
@@ -213,7 +221,7 @@ def _total(sums, first):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _load_tile(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
+def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
     """Fill a tile's pixel state; returns the largest number of contributors of a pixel."""
     transmittance, last, g_rgb, g_transmittance, g_z, error, _, with_depth = image
     height, width = norms.shape
@@ -246,26 +254,21 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
     ``live``, ``first_lane``, ``depths``: :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of
     these tiles; the others as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
-    frame, colors, live, first_lane, depths = (
-        lend_frame(frame),
-        borrow_array(colors),
-        borrow_array(live),
-        borrow_array(first_lane),
-        borrow_array(depths),
-    )
+    frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
+    live, first_lane, depths = borrow_array(live), borrow_array(first_lane), borrow_array(depths)
     rows, starts, ids, slots, neurons = frame.rows, frame.starts, frame.ids, frame.slots, frame.neurons
-    pair_rows, with_depth = borrow_array(image.pair_rows), image.with_depth
+    pair_rows, with_depth = image.pair_rows, image.with_depth
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE
     C = colors.shape[1]
     color_at = P.G_NEURONS + P.PER_NEURON * neurons
     scratch = L.BACKWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    lanes, wide_lanes = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
-    slopes, pixels = aligned(neurons * L.NEURON_SCRATCH), aligned((6 + C) * P.PIXELS + 2 * P.TILE)
-    weights, rays, totals = aligned(P.TILE), aligned(P.TILE), aligned((2 + C) * P.TILE)
-    ends, begins, lives = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32), aligned(P.TILE)
+        waves = aligned_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    lanes, wide_lanes = aligned_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    slopes, pixels = aligned_zeros(neurons * L.NEURON_SCRATCH), aligned_zeros((6 + C) * P.PIXELS + 2 * P.TILE)
+    weights, rays, totals = aligned_zeros(P.TILE), aligned_zeros(P.TILE), aligned_zeros((2 + C) * P.TILE)
+    ends, begins, lives = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32), aligned_zeros(P.TILE)
     S, D, V = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(slopes).reshape((neurons, L.NEURON_SCRATCH))
     state, w, cg, sums = borrow_array(pixels), borrow_array(weights), borrow_array(rays), borrow_array(totals)
     bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
@@ -274,14 +277,14 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
         if starts[t] == starts[t + 1]:
             continue
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
-        deepest = _load_tile(state, tx, ty, frame.norms, image, C)
+        deepest = _load_tile_gradients(state, tx, ty, frame.norms, image, C)
         first = starts[t]
         for q in range(first + deepest, starts[t + 1]):
             pair_rows[q, :] = f(0)
         for back in range(deepest):
             q = first + deepest - 1 - back
             if back + 1 < deepest:
-                fetch_ahead(np.int64(ids[q - 1]), frame)
+                prefetch_pair(np.int64(ids[q - 1]), frame)
                 prefetch_depths(depths, np.int64(first_lane[q - 1]), np.int64(first_lane[q]))
             i = ids[q]
             p, out = rows[i], pair_rows[q]
@@ -291,7 +294,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
             for y in range(P.TILE):
                 rows_live[y] = f((live_bits >> y) & 1)
             row_spans(frame.spans[i], pair, rows_live, bounds)
-            n = compact(S, state, offset, bounds, pair.y0, pair.y1)
+            n = compact_lanes(S, state, offset, bounds, pair.y0, pair.y1)
             out[:] = f(0)
             if n == 0:
                 continue
@@ -303,7 +306,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
             if not later:
                 evaluated += n16
                 lanes_with_slopes(S, D, V, n16, bounds, frame, pair, edge)
-            opacity(S, n16, frame.alpha_min, frame.alpha_max)
+            lane_opacities(S, n16, frame.alpha_min, frame.alpha_max)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)
             if net is not None:
@@ -334,13 +337,13 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
                         st = state[L.GZ + base :]
                         for k in range(a, b):
                             S[L.GMID + at + k] = w[k] * st[k] * p[P.UNIT]
-            weight = _total(sums, 0)
+            weight = _sum_row(sums, 0)
             if weight == f(0):
                 continue  # hidden or below the cut everywhere: every gradient is zero
-            out[P.G_WEIGHT], out[P.G_ERROR] = weight, _total(sums, P.TILE)
+            out[P.G_WEIGHT], out[P.G_ERROR] = weight, _sum_row(sums, P.TILE)
             if net is None:
                 for c in range(C):
-                    out[color_at + c] = _total(sums, (2 + c) * P.TILE)
+                    out[color_at + c] = _sum_row(sums, (2 + c) * P.TILE)
             if later:
                 n16 = ((_compact_gradients(S, n16, neurons > AT_ONCE) + 15) // 16) * 16
                 evaluated += n16
@@ -348,7 +351,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
                 gradients_at_once(S, n16, frame, pair, edge, out)
                 continue
             if later:
-                chords(S, n16, frame, pair, False, True, edge)
+                lane_chords(S, n16, frame, pair, False, True, edge)
                 for k in range(n16):
                     S[L.GMID + k] = f(0)
             neuron_gradients(S, V, n16, p, frame.kinds[i], neurons, edge, slots[i] >= 0, out)
@@ -364,7 +367,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
 
 
 @exact_kernel
-def sum_rows(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
+def sum_gradient_rows(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
     """grads[i] = sum of primitive i's pair rows, in pair order, for primitives ``start:stop``."""
     for i in range(start, stop):
         g = grads[i]

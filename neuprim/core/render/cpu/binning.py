@@ -89,7 +89,7 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
 
 
 @exact_kernel
-def _scatter(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
+def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
     """Counting sort by tile; primitives come in depth order, so each tile's list is front to back."""
     for k in range(tiles.shape[0]):
         starts[tiles[k] + 1] += 1
@@ -119,5 +119,5 @@ def bin_primitives(
     if images is not None:
         tiles += np.repeat(images[0].astype(np.int32) * np.int32(across * down), np.diff(first))
     ids, slots = np.empty(len(tiles), np.int32), np.empty(len(tiles), np.int32)
-    _scatter(depth_order(projected.depth), first, tiles, starts, ids, slots)
+    _sort_pairs_by_tile(depth_order(projected.depth), first, tiles, starts, ids, slots)
     return TileLists(starts, ids, first, slots)

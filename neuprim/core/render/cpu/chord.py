@@ -13,8 +13,8 @@ _MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
 
 
 @inline_source
-def ray(p):  # type: ignore[no-untyped-def]
-    """What :func:`chord` reads of a primitive's row, read once for all lanes."""
+def load_ray(p):  # type: ignore[no-untyped-def]
+    """What :func:`intersect_chord` reads of a primitive's row, read once for all lanes."""
     return (
         p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2],
         p[P.XA], p[P.XA + 1], p[P.XA + 2], p[P.XU], p[P.XU + 1], p[P.XU + 2], p[P.XV], p[P.XV + 1], p[P.XV + 2],
@@ -23,10 +23,10 @@ def ray(p):  # type: ignore[no-untyped-def]
 
 
 @inline_source
-def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
+def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     """The chord of one pixel of the tile, named as in the layout; ``half`` is 0 where the ray misses.
 
-    fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`ray`.
+    fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`load_ray`.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
     y = np.floor(pixel * f(1 / P.TILE))
@@ -56,13 +56,13 @@ def chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 
 
 @inline_source
-def by_depth(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
+def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
     """dh/dD of h = sqrt(D/a), with the floor on D; a soft edge needs none, as D^p tames what grows as D^-1/2."""
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
 
 @inline_source
-def weight(D, edge):  # type: ignore[no-untyped-def]
+def edge_weight(D, edge):  # type: ignore[no-untyped-def]
     """FADE of a whole chord, the mean of (1 - |y|^2)^p, and its derivative by D; 1 and 0 for a hard edge."""
     inner = max(D, f(0))
     if len(edge) == 0:
@@ -73,7 +73,7 @@ def weight(D, edge):  # type: ignore[no-untyped-def]
 
 
 @inline
-def through_chord(  # type: ignore[no-untyped-def]
+def chord_backward(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
     """From dL/d(half, MID), dL/d(chord middle) = q, dL/d(half e) = v to dL/d(origin m, direction e) of the ray.
@@ -96,13 +96,13 @@ def through_chord(  # type: ignore[no-untyped-def]
 
 
 @inline
-def zero_ray():  # type: ignore[no-untyped-def]
-    """The sums of :func:`add_ray` at the start."""
+def zero_ray_sums():  # type: ignore[no-untyped-def]
+    """The sums of :func:`add_ray_gradient` at the start."""
     return f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0)
 
 
 @inline
-def add_ray(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
+def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
     """One lane's share of dL/d(E0, EX, EY, XA), from dL/dm and dL/de; ``reach`` is tc + slide."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
@@ -114,7 +114,7 @@ def add_ray(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: 
 
 
 @inline
-def put_ray(sums, out):  # type: ignore[no-untyped-def]
+def store_ray_gradient(sums, out):  # type: ignore[no-untyped-def]
     """Write the sums into a gradient row."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     out[P.E0], out[P.E0 + 1], out[P.E0 + 2] = a0, a1, a2

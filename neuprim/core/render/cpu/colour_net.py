@@ -13,7 +13,7 @@ import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.model.rows import rotation, rotation_backward
+from neuprim.core.model.rows import fill_rotation, rotation_backward
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import phase_float64
@@ -26,7 +26,7 @@ _RGB_GRADIENT = L.RAY_COLOUR + 3 * L.LANES  # dL/d RAY_COLOUR of three channels,
 Array = np.ndarray[Any, Any]
 
 
-class Net(NamedTuple):
+class ColourNet(NamedTuple):
     """The networks of one frame, as the pixel kernels take them."""
 
     # (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
@@ -40,7 +40,7 @@ class Net(NamedTuple):
 
 
 @exact_kernel
-def _fill_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
+def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
     """Rows ``out[n]`` of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for float32."""
     H, C = Wx.shape[1], Wout.shape[1]
     local, axes = np.empty((3, 3)), np.empty(3)
@@ -49,7 +49,7 @@ def _fill_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast)
         row = out[n]
         row[:] = 0.0
         fast[n] = False
-        rotation(quats[i], local)
+        fill_rotation(quats[i], local)
         top = max(np.float64(log_scales[i, 0]), np.float64(log_scales[i, 1]), np.float64(log_scales[i, 2]))
         for a in range(3):
             axes[a] = np.exp(np.float64(log_scales[i, a]) - top)
@@ -70,18 +70,18 @@ def _fill_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast)
             fast[n] |= square > P.FLOAT64_TURNS**2
 
 
-def prepare_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
+def prepare_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
     """Return the network rows of primitives ``which``, float64 if ``wide``, and which of them have a fast unit."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
     tensors = (t[name] for name in ("log_scales", "quats", "Wx", "bias", "Wout"))
-    parallel_for(_fill_rows, len(which), _PRIMITIVES_PER_CHUNK, threads, which, *tensors, out, fast)
+    parallel_for(_fill_net_rows, len(which), _PRIMITIVES_PER_CHUNK, threads, which, *tensors, out, fast)
     return out, fast
 
 
 @exact_kernel
-def net_backward(  # type: ignore[no-untyped-def]
+def colour_net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
     """Chain rule from gradient rows, networks' columns from ``first`` on, to parameters of ``start:stop``.
@@ -94,7 +94,7 @@ def net_backward(  # type: ignore[no-untyped-def]
         if not touched[i]:
             continue
         g = grads[i]
-        inverse = rotation(quats[i], local)
+        inverse = fill_rotation(quats[i], local)
         longest = 0
         for a in range(1, 3):
             if log_scales[i, a] > log_scales[i, longest]:
@@ -143,7 +143,7 @@ def _rgb_unit(p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _rgb(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
+def _add_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
     """RAY_COLOUR += output of two units, three channels; with ``slopes`` also their cos and d cos/d turn."""
     ax, ay, az, ab, a0, a1, a2 = _rgb_unit(p, o)
     bx, by, bz, bb, b0, b1, b2 = _rgb_unit(p, o2)
@@ -166,7 +166,7 @@ def _rgb(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
+def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
     """cos and d cos/d turn of one unit."""
     wx, wy, wz, b = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE]
     for k in range(n):
@@ -178,7 +178,7 @@ def _waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
+def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
     """The same from a float64 row and float64 chord middles."""
     for k in range(n):
         r = phase_float64(D, k, p, o)
@@ -188,7 +188,7 @@ def _waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _mix(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
+def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
     """RAY_COLOUR += output of all units, any channels, from their cos in ``V``."""
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
@@ -208,20 +208,20 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
             colour[k] = base[c]
     if slots[i] >= 0:
         for j in range(net.hidden):
-            _waves_float64(D, V[j], n, net.wide[slots[i]], (P.NET_OUT + C) * j)
-        _mix(S, V, n, p, net.hidden, C)
+            _unit_waves_float64(D, V[j], n, net.wide[slots[i]], (P.NET_OUT + C) * j)
+        _mix_net_outputs(S, V, n, p, net.hidden, C)
     elif C == 3:
         for j in range(0, net.hidden, 2):
             o = (P.NET_OUT + 3) * j
-            _rgb(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, slopes)
+            _add_rgb_units(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, slopes)
     else:
         for j in range(net.hidden):
-            _waves(S, V[j], n, p, (P.NET_OUT + C) * j)
-        _mix(S, V, n, p, net.hidden, C)
+            _unit_waves(S, V[j], n, p, (P.NET_OUT + C) * j)
+        _mix_net_outputs(S, V, n, p, net.hidden, C)
 
 
 @inline
-def _rgb_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
+def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
     """Gradients of two units, three channels, and their share of dL/dQ."""
     ax, ay, az, _, a0, a1, a2 = _rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _rgb_unit(p, o2)
@@ -296,7 +296,7 @@ def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-un
     if C == 3:
         for j in range(0, net.hidden, 2):
             o = (P.NET_OUT + 3) * j
-            _rgb_gradient(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, row)
+            _rgb_units_gradient(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, row)
     else:
         for j in range(net.hidden):
             _unit_gradient(S, V[j], n, p, (P.NET_OUT + C) * j, C, row)

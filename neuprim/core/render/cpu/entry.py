@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.compute.kernels import borrow_array, borrow_arrays, inline, kernel, release_array
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.backward import opacity, optical_depths
+from neuprim.core.render.cpu.backward import lane_opacities, lane_optical_depths
 from neuprim.core.render.cpu.colour_net import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, lanes_with_slopes, neuron_gradients
-from neuprim.core.render.cpu.tiles import box_pixels, compact, field_values, pair_window, row_spans
+from neuprim.core.render.cpu.tiles import box_pixels, compact_lanes, field_values, pair_window, row_spans
 
 f = np.float32
 
@@ -33,7 +33,7 @@ _CUT = f(-1e30)  # entry of every chord that the near plane cuts: in front of al
 Array = np.ndarray[Any, Any]
 
 
-class _Lanes(NamedTuple):
+class _PairLanes(NamedTuple):
     """Memory for the lanes of one pair; ``waves`` of a colour network, else None."""
 
     S: Array
@@ -57,13 +57,13 @@ class _Hits(NamedTuple):
 
 
 @inline
-def _new_lanes(C, net):  # type: ignore[no-untyped-def]
+def _allocate_lanes(C, net):  # type: ignore[no-untyped-def]
     scratch = L.BACKWARD_SCRATCH
     waves: Any = None
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
         waves = np.zeros((net.hidden, L.NET_SCRATCH), np.float32)
-    return _Lanes(
+    return _PairLanes(
         np.zeros(scratch + 1024, np.float32),
         np.zeros(FLOAT64_SCRATCH, np.float64),
         np.zeros(L.NORM + P.PIXELS + 2 * P.TILE, np.float32),
@@ -75,7 +75,7 @@ def _new_lanes(C, net):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _new_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-def]
+def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-def]
     """Room for the hits of any of the tiles ``start:stop``: their boxes' pixels."""
     room, pairs = 1, 1
     for t in range(start, stop):
@@ -99,11 +99,11 @@ def _new_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-de
 def _gather_lanes(lanes, frame, pair):  # type: ignore[no-untyped-def]
     """Compact the pixels of one pair into lanes; returns their number."""
     row_spans(frame.spans[pair.i], pair, lanes.rows_live, lanes.bounds)
-    return compact(lanes.S, lanes.state, lanes.offset, lanes.bounds, pair.y0, pair.y1)
+    return compact_lanes(lanes.S, lanes.state, lanes.offset, lanes.bounds, pair.y0, pair.y1)
 
 
 @inline
-def _load_tile(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
+def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
     """Ray norms of a tile's pixels, and which of its rows lie in the image."""
     height, width = norms.shape
     for y in range(P.TILE):
@@ -114,7 +114,7 @@ def _load_tile(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _list_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # type: ignore[no-untyped-def]
+def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # type: ignore[no-untyped-def]
     """List the hits of a tile. Returns (hits, evaluated lanes)."""
     S, D, offset, bounds = lanes.S, lanes.D, lanes.offset, lanes.bounds
     values, marks = hits.values, hits.marks
@@ -130,8 +130,8 @@ def _list_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # ty
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
         field_values(S, D, n16, bounds, frame, pair, False, True, edge)
-        optical_depths(S, n16, edge)
-        opacity(S, n16, frame.alpha_min, frame.alpha_max)
+        lane_optical_depths(S, n16, edge)
+        lane_opacities(S, n16, frame.alpha_min, frame.alpha_max)
         if net is not None:
             ray_colours(S, D, lanes.waves, n16, i, net, frame.slots, colors[i], False)
         anchor, unit = p[P.ANCHOR_Z], p[P.UNIT]
@@ -154,7 +154,7 @@ def _list_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # ty
 
 
 @inline
-def _sort_hits(count, hits):  # type: ignore[no-untyped-def]
+def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
     """Fill ``listing`` and ``pixel_start``.
 
     Counting sort by pixel, which keeps the order of the centres, then a stable insertion sort: few hits move far.
@@ -186,20 +186,22 @@ def _sort_hits(count, hits):  # type: ignore[no-untyped-def]
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
     """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` gets the hits per pixel."""
+    frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE
     C, tmin = colors.shape[1], frame.transmittance_min
-    lanes, hits = _new_lanes(C, net), _new_hits(start, stop, across, frame, C, net)
+    own_lanes, own_hits = _allocate_lanes(C, net), _allocate_hits(start, stop, across, frame, C, net)
+    lanes, hits = borrow_arrays(own_lanes), borrow_arrays(own_hits)
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     color = np.zeros(C, np.float32)
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
         first, end = frame.starts[t], frame.starts[t + 1]
-        _load_tile(lanes, frame.norms, tx, ty)
-        count, tile_lanes = _list_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge)
+        _load_tile_norms(lanes, frame.norms, tx, ty)
+        count, tile_lanes = _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge)
         evaluated += tile_lanes
-        _sort_hits(count, hits)
+        _sort_tile_hits(count, hits)
         for y in range(min(P.TILE, height - ty)):
             for x in range(min(P.TILE, width - tx)):
                 j = y * P.TILE + x
@@ -222,11 +224,13 @@ def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # t
                 image.last[ty + y, tx + x] = drawn
                 if image.with_depth:
                     image.zsum[ty + y, tx + x] = z
+    release_array(own_lanes)
+    release_array(own_hits)
     return evaluated
 
 
 @inline
-def _uncomposite(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # type: ignore[no-untyped-def]
+def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # type: ignore[no-untyped-def]
     """Composite the hits of one tile again and walk back: weights and dL/d(2 FIELD HALF) of every hit."""
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     height, width = norms.shape
@@ -261,21 +265,23 @@ def _uncomposite(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # 
 @kernel
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
     """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`, but composites anew."""
+    frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE
     C, neurons, with_depth = colors.shape[1], frame.neurons, image.with_depth
     color_at = P.G_NEURONS + P.PER_NEURON * neurons
-    lanes, hits = _new_lanes(C, net), _new_hits(start, stop, across, frame, C, net)
+    own_lanes, own_hits = _allocate_lanes(C, net), _allocate_hits(start, stop, across, frame, C, net)
+    lanes, hits = borrow_arrays(own_lanes), borrow_arrays(own_hits)
     S, D, waves, values, marks, pair_start = lanes.S, lanes.D, lanes.waves, hits.values, hits.marks, hits.pair_start
     V = np.zeros((neurons, L.NEURON_SCRATCH), np.float32)
     evaluated = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
         first, end = frame.starts[t], frame.starts[t + 1]
-        _load_tile(lanes, frame.norms, tx, ty)
-        count, tile_lanes = _list_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge)
+        _load_tile_norms(lanes, frame.norms, tx, ty)
+        count, tile_lanes = _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge)
         evaluated += tile_lanes
-        _sort_hits(count, hits)
-        _uncomposite(hits, frame.ids, first, tx, ty, frame.norms, colors, image, frame.transmittance_min, net)
+        _sort_tile_hits(count, hits)
+        _uncomposite_hits(hits, frame.ids, first, tx, ty, frame.norms, colors, image, frame.transmittance_min, net)
         for q in range(first, end):
             i = frame.ids[q]
             p, out = frame.rows[i], image.pair_rows[q]
@@ -319,4 +325,6 @@ def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # ty
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
             chord_gradient(S, n16, p, out, edge, in_float64)
+    release_array(own_lanes)
+    release_array(own_hits)
     return evaluated

@@ -32,7 +32,7 @@ FLOAT64_SCRATCH = L.lane_array(10)
 
 @inline
 def chords_float64(S, X, n, bounds, frame, pair, with_mid, backward):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.tiles.chords` from the float64 row; lanes beyond ``bounds`` are padding."""
+    """As :func:`~neuprim.core.render.cpu.tiles.lane_chords` from the float64 row; beyond ``bounds`` is padding."""
     p, depth_floor = frame.wide[frame.slots[pair.i]], frame.depth_floor
     at = 0
     for y in range(pair.y0, pair.y1):
@@ -92,7 +92,7 @@ def phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _reduced(X, k, p, o):  # type: ignore[no-untyped-def]
+def _reduced_phases(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
@@ -106,7 +106,7 @@ def _hard_neurons(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
         for k in range(n):
-            r, s, v = _reduced(X, k, p, o)
+            r, s, v = _reduced_phases(X, k, p, o)
             sinc, c = sinc_turns(s * s), cos_turns(r * r)
             if V is not None:
                 slope = dsinc_turns(s * s) * f(2) * s
@@ -150,7 +150,7 @@ def _moments(z, j, M):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _weight(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
+def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
     """Coefficients q[0..4] of (D - a (shift + half u)^2)^p, and their mean over the chord."""
     c0, c1, c2 = D - square * shift * shift, -2.0 * square * shift * half, -square * half * half
     q[0], q[1], q[2], q[3], q[4] = c0, c1, c2, 0.0, 0.0
@@ -165,7 +165,7 @@ def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
         D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]
-        mean = _weight(D, shift, square, half, soft, q)
+        mean = _edge_polynomial(D, shift, square, half, soft, q)
         visible = mean > 0.0 and half > 0.0
         S[L.FADE + k] = f(mean) if visible else f(0)
         c0, c1, c2, total = 1.0, 0.0, 0.0, 0.0
@@ -182,7 +182,7 @@ def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
             continue
         for m in range(neurons):
             o = P.NEURONS + P.PER_NEURON * m
-            r, _, v = _reduced(X, k, p, o)
+            r, _, v = _reduced_phases(X, k, p, o)
             _moments(_PI2 * v, j, M)
             c, s, a = np.float64(cos_turns(r * r)), np.float64(TAU * r * sinc_turns(r * r)), p[o + P.AMPLITUDE]
             even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]

@@ -11,19 +11,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import borrow_array, inline, kernel, release_array
+from neuprim.core.compute.kernels import borrow_array, borrow_arrays, inline, kernel, release_array
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.colour_net import ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.tiles import (
-    aligned,
+    aligned_zeros,
     box_pixels,
-    compact,
-    fetch_ahead,
+    compact_lanes,
     field_values,
-    lend_frame,
     pair_window,
+    prefetch_pair,
     row_spans,
 )
 from neuprim.core.render.cpu.trigonometry import one_minus_exp
@@ -35,7 +34,7 @@ _LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a f
 Array = np.ndarray[Any, Any]
 
 
-class Image(NamedTuple):
+class TileImage(NamedTuple):
     """Arrays that the forward kernels fill, and the (C,) background behind them."""
 
     # (H, W, C) and (H, W)
@@ -91,7 +90,7 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _opacity(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
+def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
     """ALPHA: 0 below alpha_min and for integrals that are not positive, at most alpha_max; depth to ``depths``."""
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
@@ -201,15 +200,11 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
         colors: (N, C) colours, or the bases of the networks' colours.
-        net: :class:`~neuprim.core.render.cpu.colour_net.Net`; None leaves no trace in the compiled kernel.
+        net: :class:`~neuprim.core.render.cpu.colour_net.ColourNet`; None leaves no trace in the compiled kernel.
         edge: one of :data:`~neuprim.core.render.cpu.trigonometry.EDGE_TYPES`.
     """
-    frame, colors, live, first_lane = (
-        lend_frame(frame),
-        borrow_array(colors),
-        borrow_array(live),
-        borrow_array(first_lane),
-    )
+    frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
+    live, first_lane = borrow_array(live), borrow_array(first_lane)
     rows, starts, ids, norms = frame.rows, frame.starts, frame.ids, frame.norms
     height, width = norms.shape
     with_depth, tmin = image.with_depth, frame.transmittance_min
@@ -221,9 +216,13 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
     scratch = L.FORWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = aligned(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    lanes, wide_lanes = aligned(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
-    pixels, weights, lives = aligned((4 + C) * P.PIXELS + 2 * P.TILE), aligned(P.TILE), aligned(P.TILE)
+        waves = aligned_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    lanes, wide_lanes = aligned_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    pixels, weights, lives = (
+        aligned_zeros((4 + C) * P.PIXELS + 2 * P.TILE),
+        aligned_zeros(P.TILE),
+        aligned_zeros(P.TILE),
+    )
     ends, begins = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32)
     S, D, state, w = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(pixels), borrow_array(weights)
     bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
@@ -245,18 +244,18 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
                 state[index(j + L.T_)], state[index(j + L.NORM)] = f(1), norms[index(ty + y), index(tx + x)]
         for q in range(starts[t], starts[t + 1]):
             if q + 1 < starts[t + 1]:
-                fetch_ahead(np.int64(ids[q + 1]), frame)
+                prefetch_pair(np.int64(ids[q + 1]), frame)
             i = ids[q]
             p = rows[i]
             pair = pair_window(frame, i, tx, ty)
             row_spans(frame.spans[i], pair, rows_live, bounds)
-            n = compact(S, state, offset, bounds, pair.y0, pair.y1)
+            n = compact_lanes(S, state, offset, bounds, pair.y0, pair.y1)
             if keep:
                 live[q], first_lane[q] = _live_bits(rows_live), evaluated
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
                 field_values(S, D, n16, bounds, frame, pair, with_depth, False, edge)
-                _opacity(S, n16, frame, edge, keep, depths, evaluated)
+                _store_opacities(S, n16, frame, edge, keep, depths, evaluated)
                 evaluated += n16
                 if net is not None:
                     ray_colours(S, D, waves, n16, i, net, frame.slots, colors[i], False)

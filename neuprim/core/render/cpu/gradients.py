@@ -11,9 +11,18 @@ import numpy as np
 from neuprim.core.compute.kernels import inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.chord import add_ray, by_depth, chord, put_ray, ray, through_chord, weight, zero_ray
+from neuprim.core.render.cpu.chord import (
+    add_ray_gradient,
+    chord_backward,
+    edge_weight,
+    half_chord_slope,
+    intersect_chord,
+    load_ray,
+    store_ray_gradient,
+    zero_ray_sums,
+)
 from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
-from neuprim.core.render.cpu.tiles import chords
+from neuprim.core.render.cpu.tiles import lane_chords
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
 f = np.float32
@@ -22,11 +31,11 @@ _TINY = f(1e-30)
 
 
 @inline
-def _neuron(p, o):  # type: ignore[no-untyped-def]
+def _load_neuron(p, o):  # type: ignore[no-untyped-def]
     return p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], p[o + P.AMPLITUDE]
 
 
-def _products(slopes):  # type: ignore[no-untyped-def]
+def _neuron_products(slopes):  # type: ignore[no-untyped-def]
     """cos B, d(cos B)/d phase and cos dB/d rate of two neurons on a chord with middle q and half chord vector v."""
 
     @inline
@@ -46,18 +55,18 @@ def _products(slopes):  # type: ignore[no-untyped-def]
     return products
 
 
-_slow, _medium, _fast = _products(slopes_slow), _products(slopes_medium), _products(slopes_fast)
+_slow, _medium, _fast = _neuron_products(slopes_slow), _neuron_products(slopes_medium), _neuron_products(slopes_fast)
 
 
 @inline
-def _add_neuron(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
+def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
     """One lane's share of dL/d(amplitude, phase, W) but for the amplitude, from the three products times dL/d FIELD."""
     s0, s1, s2, s3, s4 = sums
     return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
 
 
 @inline
-def _put_neuron(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
+def _store_neuron_gradient(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
     s0, s1, s2, s3, s4 = sums
     o = P.G_NEURONS + P.PER_NEURON * m
     out[o + P.AMPLITUDE], out[o + P.PHASE] = s0, amplitude * s1
@@ -68,75 +77,83 @@ def _put_neuron(sums, amplitude, m, out):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
+def _gradients_without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
-    row, tc, field = ray(p), p[P.TC], p[P.OFFSET]
-    total, rays = f(0), zero_ray()
+    row, tc, field = load_ray(p), p[P.TC], p[P.OFFSET]
+    total, rays = f(0), zero_ray_sums()
     for k in range(n):
-        du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
-        fade, by_d = weight(D, edge)
+        du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = intersect_chord(
+            S[L.PIXEL + k], fx0, fy0, row
+        )
+        fade, by_d = edge_weight(D, edge)
         g = f(2) * S[L.GRAD + k]
         total += g * half * fade
-        gmx, gmy, gmz, gex, gey, gez = through_chord(
+        gmx, gmy, gmz, gex, gey, gez = chord_backward(
             g * field * fade, f(0), f(0), g * half * field * by_d, f(0), half, ex, ey, ez, px, py, pz, mid, tm, ia, h,
             uncut,
-            by_depth(D, ia, depth_floor, edge), f(0), f(0), f(0), f(0), f(0), f(0),
+            half_chord_slope(D, ia, depth_floor, edge), f(0), f(0), f(0), f(0), f(0), f(0),
         )  # fmt: skip
-        rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
+        rays = add_ray_gradient(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
     out[P.G_OFFSET], out[P.G_LOG_M] = total, total * field
-    put_ray(rays, out)
+    store_ray_gradient(rays, out)
 
 
-def _with_two(products):  # type: ignore[no-untyped-def]
+def _gradients_of_two_neurons(products):  # type: ignore[no-untyped-def]
     @inline
     def gradients(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
         p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
-        row, tc, offset = ray(p), p[P.TC], p[P.OFFSET]
-        first, second = _neuron(p, P.NEURONS), _neuron(p, P.NEURONS + P.PER_NEURON)
+        row, tc, offset = load_ray(p), p[P.TC], p[P.OFFSET]
+        first, second = _load_neuron(p, P.NEURONS), _load_neuron(p, P.NEURONS + P.PER_NEURON)
         ax, ay, az, _, aa = first
         bx, by, bz, _, ba = second
         ax1, ay1, az1, bx1, by1, bz1 = ax * aa, ay * aa, az * aa, bx * ba, by * ba, bz * ba
-        total, rays = f(0), zero_ray()
+        total, rays = f(0), zero_ray_sums()
         sums, sums1 = (f(0), f(0), f(0), f(0), f(0)), (f(0), f(0), f(0), f(0), f(0))
         for k in range(n):
-            du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
+            du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = intersect_chord(
+                S[L.PIXEL + k], fx0, fy0, row
+            )
             shift = mid - tm
             qx, qy, qz = px + shift * ex, py + shift * ey, pz + shift * ez
             vx, vy, vz = ex * half, ey * half, ez * half
             c, s, d, c1, s1, d1 = products(edge, qx, qy, qz, vx, vy, vz, first, second)
             field = offset + c * aa + c1 * ba
-            fade, by_d = weight(D, edge)
+            fade, by_d = edge_weight(D, edge)
             g = f(2) * S[L.GRAD + k]
             gf = g * half * fade
             total += gf
             u, v, u1, v1 = gf * s, gf * d, gf * s1, gf * d1
-            sums = _add_neuron(sums, gf * c, u, v, qx, qy, qz, vx, vy, vz)
-            sums1 = _add_neuron(sums1, gf * c1, u1, v1, qx, qy, qz, vx, vy, vz)
+            sums = _add_neuron_gradient(sums, gf * c, u, v, qx, qy, qz, vx, vy, vz)
+            sums1 = _add_neuron_gradient(sums1, gf * c1, u1, v1, qx, qy, qz, vx, vy, vz)
             gqx, gqy, gqz = u * ax1 + u1 * bx1, u * ay1 + u1 * by1, u * az1 + u1 * bz1
             gvx, gvy, gvz = v * ax1 + v1 * bx1, v * ay1 + v1 * by1, v * az1 + v1 * bz1
-            gmx, gmy, gmz, gex, gey, gez = through_chord(
+            gmx, gmy, gmz, gex, gey, gez = chord_backward(
                 gvx * ex + gvy * ey + gvz * ez + g * field * fade, gqx * ex + gqy * ey + gqz * ez, f(0),
                 g * half * field * by_d, f(0),
-                half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, by_depth(D, ia, depth_floor, edge), gqx, gqy, gqz,
-                gvx, gvy, gvz,
+                half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, half_chord_slope(D, ia, depth_floor, edge),
+                gqx, gqy, gqz, gvx, gvy, gvz,
             )  # fmt: skip
-            rays = add_ray(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
+            rays = add_ray_gradient(rays, du, dv, slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
         out[P.G_OFFSET], out[P.G_LOG_M] = total, total * offset + aa * sums[0] + ba * sums1[0]
-        _put_neuron(sums, aa, 0, out)
-        _put_neuron(sums1, ba, 1, out)
-        put_ray(rays, out)
+        _store_neuron_gradient(sums, aa, 0, out)
+        _store_neuron_gradient(sums1, ba, 1, out)
+        store_ray_gradient(rays, out)
 
     return gradients
 
 
-_with_two_slow, _with_two_medium, _with_two_fast = _with_two(_slow), _with_two(_medium), _with_two(_fast)
+_with_two_slow, _with_two_medium, _with_two_fast = (
+    _gradients_of_two_neurons(_slow),
+    _gradients_of_two_neurons(_medium),
+    _gradients_of_two_neurons(_fast),
+)
 
 
 @inline
 def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
     """The gradient row of a pair with at most :data:`AT_ONCE` neurons from PIXEL and GRAD of its lanes."""
     if frame.neurons == 0:
-        _without_neurons(S, n, frame, pair, edge, out)
+        _gradients_without_neurons(S, n, frame, pair, edge, out)
         return
     kind = frame.kinds[pair.i, 0]
     if kind == L.MEDIUM:
@@ -158,7 +175,7 @@ def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no
         chords_float64(S, D, n, bounds, frame, pair, False, True)
         neurons_float64(edge, S, D, V, n, frame.wide[slot], frame.neurons)
     else:
-        chords(S, n, frame, pair, False, True, edge)
+        lane_chords(S, n, frame, pair, False, True, edge)
 
 
 @inline
@@ -184,7 +201,7 @@ def _two_neurons(products):  # type: ignore[no-untyped-def]
     @inline
     def add(S, V0, V1, n, p, m, edge, out):  # type: ignore[no-untyped-def]
         o = P.NEURONS + P.PER_NEURON * m
-        first, second = _neuron(p, o), _neuron(p, o + P.PER_NEURON)
+        first, second = _load_neuron(p, o), _load_neuron(p, o + P.PER_NEURON)
         ax, ay, az, _, aa = first
         bx, by, bz, _, ba = second
         # amplitudes once per neuron, not per lane: in the weights here, in the sums below
@@ -200,16 +217,16 @@ def _two_neurons(products):  # type: ignore[no-untyped-def]
             else:
                 c, s, d, c1, s1, d1 = products(edge, qx, qy, qz, vx, vy, vz, first, second)
             u, v, u1, v1 = gf * s, gf * d, gf * s1, gf * d1
-            sums = _add_neuron(sums, gf * c, u, v, qx, qy, qz, vx, vy, vz)
-            sums1 = _add_neuron(sums1, gf * c1, u1, v1, qx, qy, qz, vx, vy, vz)
+            sums = _add_neuron_gradient(sums, gf * c, u, v, qx, qy, qz, vx, vy, vz)
+            sums1 = _add_neuron_gradient(sums1, gf * c1, u1, v1, qx, qy, qz, vx, vy, vz)
             S[L.GQX + k] += u * ax1 + u1 * bx1
             S[L.GQY + k] += u * ay1 + u1 * by1
             S[L.GQZ + k] += u * az1 + u1 * bz1
             S[L.GEX + k] += v * ax1 + v1 * bx1
             S[L.GEY + k] += v * ay1 + v1 * by1
             S[L.GEZ + k] += v * az1 + v1 * bz1
-        _put_neuron(sums, aa, m, out)
-        _put_neuron(sums1, ba, m + 1, out)
+        _store_neuron_gradient(sums, aa, m, out)
+        _store_neuron_gradient(sums1, ba, m + 1, out)
 
     return add
 
@@ -247,7 +264,7 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
     BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
-    rays = zero_ray()
+    rays = zero_ray_sums()
     for k in range(n):
         half, ex, ey, ez = S[L.HALF + k], S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
         mid, tm, slide = S[L.MID + k], S[L.TM + k], S[L.SLIDE + k]
@@ -265,10 +282,10 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
                 g_tm, gD, gA = g * half * S[L.BY_TM + k], g * half * S[L.BY_D + k], g * half * S[L.BY_A + k]
             else:
                 gD = g * half * field * S[L.BY_D + k]
-        gmx, gmy, gmz, gex, gey, gez = through_chord(
+        gmx, gmy, gmz, gex, gey, gez = chord_backward(
             g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, S[L.IA + k], S[L.HEIGHT + k],
             S[L.UNCUT + k],
             S[L.DH + k], gqx, gqy, gqz, gvx, gvy, gvz,
         )  # fmt: skip
-        rays = add_ray(rays, S[L.DU + k], S[L.DV + k], slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
-    put_ray(rays, out)
+        rays = add_ray_gradient(rays, S[L.DU + k], S[L.DV + k], slide, tc + slide, gmx, gmy, gmz, gex, gey, gez)
+    store_ray_gradient(rays, out)

@@ -10,16 +10,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from neuprim.core.compute.kernels import borrow_array, exact_kernel, release_array, strict
+from neuprim.core.compute.kernels import borrow_arrays, exact_kernel, release_array, strict
 from neuprim.core.model.edge import NORMS
-from neuprim.core.model.rows import rotation, rotation_backward
+from neuprim.core.model.rows import fill_rotation, rotation_backward
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 
 Array = np.ndarray[Any, Any]
 
 
-class Parameters(NamedTuple):
+class PrimitiveArrays(NamedTuple):
     """Geometry and density of N primitives with K neurons, or the gradients by them."""
 
     means: Array
@@ -47,7 +47,7 @@ class View(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """What :func:`prepare` fills for each primitive."""
+    """What :func:`prepare_primitives` fills for each primitive."""
 
     rows: Array  # (N, row_width) float32 rows of the pixel kernels
     # (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes
@@ -88,27 +88,6 @@ def _scratch(K):  # type: ignore[no-untyped-def]
     return _Scratch(np.empty((10, 3)), np.empty((K, 4)), np.empty(K))
 
 
-# Kernels borrow all arrays: a tuple that is handed on for each primitive would count the references of each of them.
-
-
-@strict
-def _borrow_scratch(s):  # type: ignore[no-untyped-def]
-    return _Scratch(borrow_array(s.work), borrow_array(s.waves), borrow_array(s.rate))
-
-
-@strict
-def borrow_parameters(p):  # type: ignore[no-untyped-def]
-    return Parameters(
-        borrow_array(p.means), borrow_array(p.log_scales), borrow_array(p.quats), borrow_array(p.W1),
-        borrow_array(p.b1), borrow_array(p.w2), borrow_array(p.b2),
-    )  # fmt: skip
-
-
-@strict
-def borrow_view(v):  # type: ignore[no-untyped-def]
-    return View(borrow_array(v.R), borrow_array(v.t), v.fx, v.fy, v.cx, v.cy, v.width, v.height, v.near, v.turns)
-
-
 @strict
 def _is_too_faint(most, edge, least):  # type: ignore[no-untyped-def]
     """Whether no chord can reach the depth ``least``: no half chord is longer than the longest semi-axis."""
@@ -130,14 +109,14 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _cross(a, b, out):  # type: ignore[no-untyped-def]
+def _cross_product(a, b, out):  # type: ignore[no-untyped-def]
     out[0] = a[1] * b[2] - a[2] * b[1]
     out[1] = a[2] * b[0] - a[0] * b[2]
     out[2] = a[0] * b[1] - a[1] * b[0]
 
 
 @strict
-def _dot(a, b):  # type: ignore[no-untyped-def]
+def _dot_product(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
@@ -148,7 +127,7 @@ def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # typ
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
     """
     R, t = view.R, view.t
-    n = rotation(quat, local)
+    n = fill_rotation(quat, local)
     top = max(np.float64(log_scale[0]), np.float64(log_scale[1]), np.float64(log_scale[2]))
     m = np.exp(top)
     for i in range(3):
@@ -169,7 +148,7 @@ def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # typ
 
 
 @strict
-def _wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-untyped-def]
+def _fill_wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-untyped-def]
     """Fill the float64 row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest number)."""
     means, log_scales, quats, W1, b1, w2, b2 = parameters
     work, waves, rate = scratch
@@ -217,7 +196,7 @@ def _wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-unty
 
 
 @strict
-def _is_finite(i, parameters, most):  # type: ignore[no-untyped-def]
+def _is_finite_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
     """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
@@ -231,7 +210,7 @@ def _is_finite(i, parameters, most):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no-untyped-def]
+def _silhouette_extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no-untyped-def]
     """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels.
 
     Tangents as in ``screen_boxes`` of the reference, in units of m; ``s22``: S_zz of the whole ellipsoid.
@@ -247,7 +226,7 @@ def _extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no
 
 
 @strict
-def _longest(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def]
+def _longest_half_chord(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def]
     """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes.
 
     A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
@@ -257,7 +236,11 @@ def _longest(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def
         return 1.0
     u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
     du, dv = wide * (1.0 + u), wide * (1.0 + v)
-    least = np.sqrt(_dot(e0, e0)) - view.fx * du * np.sqrt(_dot(ex, ex)) - view.fy * dv * np.sqrt(_dot(ey, ey))
+    least = (
+        np.sqrt(_dot_product(e0, e0))
+        - view.fx * du * np.sqrt(_dot_product(ex, ex))
+        - view.fy * dv * np.sqrt(_dot_product(ey, ey))
+    )
     most = np.sqrt(1.0 + (u + du) ** 2 + (v + dv) ** 2)
     return most / least if least > most else 1.0
 
@@ -265,27 +248,25 @@ def _longest(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def
 @exact_kernel
 def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ignore[no-untyped-def]
     """Fill the float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
-    parameters, view, memory = borrow_parameters(parameters), borrow_view(view), _scratch(parameters.W1.shape[1])
-    scratch = _borrow_scratch(memory)
+    parameters, view, memory = borrow_arrays(parameters), borrow_arrays(view), _scratch(parameters.W1.shape[1])
+    scratch = borrow_arrays(memory)
     for n in range(start, stop):
         wide[n, :] = 0.0
-        _wide_row(which[n], parameters, view, scratch, order, wide[n])
-    release_array(memory.work)
-    release_array(memory.waves)
-    release_array(memory.rate)
+        _fill_wide_row(which[n], parameters, view, scratch, order, wide[n])
+    release_array(memory)
 
 
 @exact_kernel
-def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
+def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` for primitives ``start:stop``; silhouettes are those of rays that reach the optical depth ``least``.
 
     A primitive that cannot reach it anywhere gets a status, an empty box and a depth of 0 alone.
     """
-    parameters, view = borrow_parameters(parameters), borrow_view(view)
+    parameters, view = borrow_arrays(parameters), borrow_arrays(view)
     rows, spans, boxes, kinds, order, depth, status, in_float64 = out
     w2, b2, near, K = parameters.w2, parameters.b2, view.near, parameters.W1.shape[1]
     memory, row = _scratch(K), np.zeros(rows.shape[1])
-    scratch = _borrow_scratch(memory)
+    scratch = borrow_arrays(memory)
     work, rate = scratch.work, scratch.rate
     B, axes, c = work[0:3], work[3], work[4]
     e0, ex, ey, xa = row[P.E0 : P.EX], row[P.EX : P.EY], row[P.EY : P.XA], row[P.XA : P.XU]
@@ -297,9 +278,9 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         if _is_too_faint(most, edge, least):  # whatever its place
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
             in_float64[i], depth[i] = False, 0.0
-            status[i] = P.CULLED if _is_finite(i, parameters, most) else P.NON_FINITE
+            status[i] = P.CULLED if _is_finite_primitive(i, parameters, most) else P.NON_FINITE
             continue
-        m, finite, biggest = _wide_row(i, parameters, view, scratch, order, row)
+        m, finite, biggest = _fill_wide_row(i, parameters, view, scratch, order, row)
         for n in range(kinds.shape[1]):
             fastest = rate[min(2 * n + 1, K - 1)]
             kinds[i, n] = L.SLOW if fastest < L.SLOW_TURNS else (L.MEDIUM if fastest < L.MEDIUM_TURNS else L.FAST)
@@ -309,7 +290,7 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         in_float64[i] = (K > 0 and rate[K - 1] > P.FLOAT64_TURNS) or max(
             abs(row[P.UX]), abs(row[P.UY])
         ) > P.FLOAT64_PIXELS
-        in_float64[i] |= _dot(xa, xa) > P.FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
+        in_float64[i] |= _dot_product(xa, xa) > P.FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         thinnest = min(axes[0], axes[1], axes[2])
         in_float64[i] |= thinnest * (P.FLOAT64_RATIO_NEAR if tc == 0.0 else P.FLOAT64_RATIO) < 1.0
         depth[i] = c[2]
@@ -333,27 +314,36 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         x0, x1, y0, y1 = 0.0, float(view.width), 0.0, float(view.height)
         if c[2] - reach > 1e-3 * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
             s22 = szz / (m * m)
-            square = _visible_square(most, _longest(c, m, reach, row, view, e0, ex, ey), edge, least)
+            square = _visible_square(most, _longest_half_chord(c, m, reach, row, view, e0, ex, ey), edge, least)
             if square == 0.0:
                 continue
-            x0, x1 = _extent(c, m, B, axes, view.fx, view.cx, 0, s22, square)
-            y0, y1 = _extent(c, m, B, axes, view.fy, view.cy, 1, s22, square)
+            x0, x1 = _silhouette_extent(c, m, B, axes, view.fx, view.cx, 0, s22, square)
+            y0, y1 = _silhouette_extent(c, m, B, axes, view.fy, view.cy, 1, s22, square)
             x0, x1 = max(0.0, np.ceil(x0 - 0.5)), min(float(view.width), np.floor(x1 - 0.5) + 1)
             y0, y1 = max(0.0, np.ceil(y0 - 0.5)), min(float(view.height), np.floor(y1 - 0.5) + 1)
             # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width by HX,
             # HY
-            _cross(xa, e0, k0)
-            _cross(xa, ex, ka)
-            _cross(ex, e0, tmp)
+            _cross_product(xa, e0, k0)
+            _cross_product(xa, ex, ka)
+            _cross_product(ex, e0, tmp)
             for j in range(3):
                 ka[j] += tc * tmp[j]
-            _cross(xa, ey, kb)
-            _cross(ey, e0, tmp)
+            _cross_product(xa, ey, kb)
+            _cross_product(ey, e0, tmp)
             for j in range(3):
                 kb[j] += tc * tmp[j]
-            q0, q1 = square * _dot(e0, e0) - _dot(k0, k0), square * _dot(e0, ex) - _dot(k0, ka)
-            q2, q3 = square * _dot(e0, ey) - _dot(k0, kb), square * _dot(ex, ex) - _dot(ka, ka)
-            q4, q5 = square * _dot(ex, ey) - _dot(ka, kb), square * _dot(ey, ey) - _dot(kb, kb)
+            q0, q1 = (
+                square * _dot_product(e0, e0) - _dot_product(k0, k0),
+                square * _dot_product(e0, ex) - _dot_product(k0, ka),
+            )
+            q2, q3 = (
+                square * _dot_product(e0, ey) - _dot_product(k0, kb),
+                square * _dot_product(ex, ex) - _dot_product(ka, ka),
+            )
+            q4, q5 = (
+                square * _dot_product(ex, ey) - _dot_product(ka, kb),
+                square * _dot_product(ey, ey) - _dot_product(kb, kb),
+            )
             d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
             if q3 < 0.0 and d2 < 0.0:
                 yc = -d1 / d2
@@ -368,7 +358,7 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
                     # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted
                     # needle each is many radii of its thin axis, and they cancel
                     slide = abs(row[P.TU]) * broad + abs(row[P.TV]) * tall
-                    reached = np.sqrt(_dot(ex, ex)) * broad + np.sqrt(_dot(ey, ey)) * tall
+                    reached = np.sqrt(_dot_product(ex, ex)) * broad + np.sqrt(_dot_product(ey, ey)) * tall
                     in_float64[i] |= slide * reached > P.FLOAT64_RADII
                     for a in range(3):
                         in_float64[i] |= abs(row[P.XU + a]) * broad + abs(row[P.XV + a]) * tall > P.FLOAT64_RADII
@@ -379,20 +369,18 @@ def prepare(start, stop, parameters, view, edge, least, out):  # type: ignore[no
         if x1 > x0 and y1 > y0:
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
             status[i] = P.VISIBLE
-    release_array(memory.work)
-    release_array(memory.waves)
-    release_array(memory.rate)
+    release_array(memory)
 
 
 @exact_kernel
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
     """Chain rule from gradient rows to parameters, for the ``touched`` primitives among ``start:stop``.
 
-    Fills ``out`` (:class:`Parameters`, float32) and ``g_view`` (N, 3, 4), each one's part of dL/d(R | t); empty:
+    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each one's part of dL/d(R | t); empty:
     unwanted.
     """
-    view = borrow_view(view)
-    means, log_scales, quats, W1, _, _, _ = borrow_parameters(parameters)
+    view = borrow_arrays(view)
+    means, log_scales, quats, W1, _, _, _ = borrow_arrays(parameters)
     g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = out
     rows, order, R, turns, K = projected.rows, projected.order, view.R, view.turns, W1.shape[1]
     local, B, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))

@@ -13,10 +13,10 @@ from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
 
-from neuprim.core.compute.kernels import borrow_array, copy16, inline
+from neuprim.core.compute.kernels import copy16, inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.chord import by_depth, chord, ray, weight
+from neuprim.core.render.cpu.chord import edge_weight, half_chord_slope, intersect_chord, load_ray
 from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.trigonometry import cos_turns, profiles_fast, profiles_medium, profiles_slow
 
@@ -65,18 +65,6 @@ class PairWindow(NamedTuple):
 
 
 @inline
-def lend_frame(frame):  # type: ignore[no-untyped-def]
-    """The same arrays without reference counts."""
-    return FrameArrays(
-        borrow_array(frame.rows), borrow_array(frame.wide), borrow_array(frame.slots), borrow_array(frame.spans),
-        borrow_array(frame.boxes), borrow_array(frame.kinds),
-        borrow_array(frame.starts), borrow_array(frame.ids), borrow_array(frame.norms), frame.alpha_min,
-        frame.alpha_max,
-        frame.transmittance_min, frame.depth_floor, frame.neurons,
-    )  # fmt: skip
-
-
-@inline
 def pair_window(frame, i, tx, ty):  # type: ignore[no-untyped-def]
     box, p = frame.boxes[i], frame.rows[i]
     return PairWindow(
@@ -95,7 +83,7 @@ def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 
 @inline
-def aligned(floats):  # type: ignore[no-untyped-def]
+def aligned_zeros(floats):  # type: ignore[no-untyped-def]
     """Zeros that begin a cache line; numba aligns to 32 bytes, and a vector across two lines costs twice."""
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
@@ -120,7 +108,7 @@ _prefetch: Any = intrinsic(_emit_prefetch)
 
 
 @inline
-def fetch_ahead(i, frame):  # type: ignore[no-untyped-def]
+def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
     """Ask memory for what the next pair, of primitive ``i``, reads first."""
     rows, spans, boxes = frame.rows, frame.spans, frame.boxes
     row = rows.ctypes.data + i * rows.strides[0]
@@ -159,7 +147,7 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 
 
 @inline
-def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
+def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
     """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Returns the lane count.
 
     Every row copies a whole vector without a branch; the next row, or the padding, overwrites what stands over.
@@ -179,15 +167,17 @@ def compact(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
 
 
 @inline
-def chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chord middle Q, direction E and half length of n lanes; HALF = 0 where the ray misses.
 
     A soft-edged chord may not be cut: such primitives are drawn in float64.
     """
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
-    row, offset = ray(p), p[P.OFFSET]
+    row, offset = load_ray(p), p[P.OFFSET]
     for k in range(n):
-        du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = chord(S[L.PIXEL + k], fx0, fy0, row)
+        du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = intersect_chord(
+            S[L.PIXEL + k], fx0, fy0, row
+        )
         # from the closest point, not from the ray's origin: the shift is zero unless the near plane cuts
         shift = mid - tm
         S[L.QX + k], S[L.QY + k], S[L.QZ + k] = px + shift * ex, py + shift * ey, pz + shift * ez
@@ -195,7 +185,7 @@ def chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-unty
         S[L.HALF + k] = half
         S[L.FIELD + k] = offset
         if len(edge) > 0:
-            fade, by_d = weight(D, edge)
+            fade, by_d = edge_weight(D, edge)
             S[L.FADE + k] = fade
             if backward:
                 S[L.BY_D + k] = by_d
@@ -205,10 +195,10 @@ def chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-unty
             S[L.DU + k], S[L.DV + k] = du, dv
             S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k] = mid, tm, ia, uncut
             S[L.HEIGHT + k], S[L.SLIDE + k] = h, slide
-            S[L.DH + k] = by_depth(D, ia, depth_floor, edge)
+            S[L.DH + k] = half_chord_slope(D, ia, depth_floor, edge)
 
 
-def _values(profiles):  # type: ignore[no-untyped-def]
+def _neuron_values(profiles):  # type: ignore[no-untyped-def]
     """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons in one range of rates."""
 
     @inline
@@ -232,19 +222,23 @@ def _values(profiles):  # type: ignore[no-untyped-def]
     return add
 
 
-_values_slow, _values_medium, _values_fast = _values(profiles_slow), _values(profiles_medium), _values(profiles_fast)
+_values_slow, _values_medium, _values_fast = (
+    _neuron_values(profiles_slow),
+    _neuron_values(profiles_medium),
+    _neuron_values(profiles_fast),
+)
 
 
 @inline
 def field_values(S, D, n, bounds, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Chords and FIELD of ``n`` lanes of a pair, in float64 where float32 is too coarse; see :func:`chords`."""
+    """Chords and FIELD of ``n`` lanes of a pair, in float64 where float32 is too coarse; see :func:`lane_chords`."""
     i = pair.i
     if frame.slots[i] >= 0:
         chords_float64(S, D, n, bounds, frame, pair, with_mid, backward)
         neurons_float64(edge, S, D, None, n, frame.wide[frame.slots[i]], frame.neurons)
     else:
         p = frame.rows[i]
-        chords(S, n, frame, pair, with_mid, backward, edge)
+        lane_chords(S, n, frame, pair, with_mid, backward, edge)
         for m in range(0, frame.neurons, 2):
             o = P.NEURONS + P.PER_NEURON * m
             if frame.kinds[i, m // 2] == L.MEDIUM:

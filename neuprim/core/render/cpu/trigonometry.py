@@ -172,7 +172,7 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _reduced(v, w):  # type: ignore[no-untyped-def]
+def _reduced_rates(v, w):  # type: ignore[no-untyped-def]
     """v and w reduced to half a turn, whether they were within, and reciprocals (1 where within) by one division."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
@@ -184,7 +184,7 @@ def _reduced(v, w):  # type: ignore[no-untyped-def]
 @inline
 def _hard_sincs_fast(v, w):  # type: ignore[no-untyped-def]
     """Any v and w: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
-    r, s, a, b, iv, iw = _reduced(v, w)
+    r, s, a, b, iv, iw = _reduced_rates(v, w)
     x, y = sinc_turns(r * r), sinc_turns(s * s)
     return x if a else x * r * iv, y if b else y * s * iw
 
@@ -192,7 +192,7 @@ def _hard_sincs_fast(v, w):  # type: ignore[no-untyped-def]
 @inline
 def _hard_slopes_fast(v, w):  # type: ignore[no-untyped-def]
     """d sinc/dv = (cos - sinc)/v beyond half a turn."""
-    r, s, a, b, iv, iw = _reduced(v, w)
+    r, s, a, b, iv, iw = _reduced_rates(v, w)
     y, z = r * r, s * s
     x, u = sinc_turns(y), sinc_turns(z)
     sx, su = x if a else x * r * iv, u if b else u * s * iw
@@ -201,7 +201,7 @@ def _hard_slopes_fast(v, w):  # type: ignore[no-untyped-def]
     return sx, dx, su, du
 
 
-def _horner(coefficients: tuple[float, ...]) -> Kernel:
+def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
     """The polynomial with these coefficients, lowest first, unrolled."""
     first = f(coefficients[0])
     if len(coefficients) == 1:
@@ -211,7 +211,7 @@ def _horner(coefficients: tuple[float, ...]) -> Kernel:
             return first
 
         return last
-    rest = _horner(coefficients[1:])
+    rest = _horner_polynomial(coefficients[1:])
 
     @inline
     def polynomial(z):  # type: ignore[no-untyped-def]
@@ -220,9 +220,9 @@ def _horner(coefficients: tuple[float, ...]) -> Kernel:
     return polynomial
 
 
-def _halves(coefficients: tuple[float, ...]) -> Kernel:
+def _split_polynomial(coefficients: tuple[float, ...]) -> Kernel:
     """The same as two shorter chains, whose latencies overlap; ten coefficients."""
-    low, high = _horner(coefficients[:5]), _horner(coefficients[5:])
+    low, high = _horner_polynomial(coefficients[:5]), _horner_polynomial(coefficients[5:])
 
     @inline
     def polynomial(t):  # type: ignore[no-untyped-def]
@@ -232,8 +232,8 @@ def _halves(coefficients: tuple[float, ...]) -> Kernel:
     return polynomial
 
 
-def _slow(p: int) -> tuple[Kernel, Kernel]:
-    value, slope = _horner(_SLOW[p]), _horner(_SLOW_SLOPE[p])
+def _slow_profiles(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -247,8 +247,8 @@ def _slow(p: int) -> tuple[Kernel, Kernel]:
     return profiles, slopes
 
 
-def _medium(p: int) -> tuple[Kernel, Kernel]:
-    value, slope = _halves(_MEDIUM[p]), _halves(_MEDIUM_SLOPE[p])
+def _medium_profiles(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _split_polynomial(_MEDIUM[p]), _split_polynomial(_MEDIUM_SLOPE[p])
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -262,8 +262,8 @@ def _medium(p: int) -> tuple[Kernel, Kernel]:
     return profiles, slopes
 
 
-def _fast(p: int) -> tuple[Kernel, Kernel]:
-    value, slope = _horner(_SLOW[p]), _horner(_SLOW_SLOPE[p])
+def _fast_profiles(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
     first = p == 1
 
     @inline
@@ -282,12 +282,12 @@ def _fast(p: int) -> tuple[Kernel, Kernel]:
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
-        r, s, a, b, iv, iw = _reduced(v, w)
+        r, s, a, b, iv, iw = _reduced_rates(v, w)
         return one(v, a, r, iv)[0], one(w, b, s, iw)[0]
 
     @inline
     def slopes(v, w):  # type: ignore[no-untyped-def]
-        r, s, a, b, iv, iw = _reduced(v, w)
+        r, s, a, b, iv, iw = _reduced_rates(v, w)
         x, dx = one(v, a, r, iv)
         y, dy = one(w, b, s, iw)
         return x, dx, y, dy
@@ -295,7 +295,9 @@ def _fast(p: int) -> tuple[Kernel, Kernel]:
     return profiles, slopes
 
 
-_soft_slow, _soft_medium, _soft_fast = ((kind(1), kind(2)) for kind in (_slow, _medium, _fast))
+_soft_slow, _soft_medium, _soft_fast = (
+    (kind(1), kind(2)) for kind in (_slow_profiles, _medium_profiles, _fast_profiles)
+)
 profiles_slow = dispatch_by_length(_hard_sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
 profiles_medium = dispatch_by_length(_hard_sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
 profiles_fast = dispatch_by_length(_hard_sincs_fast, _soft_fast[0][0], _soft_fast[1][0])

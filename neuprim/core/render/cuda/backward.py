@@ -17,34 +17,34 @@ from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import (
     column_of,
+    gradient_row_sums,
+    gradient_row_type,
     hit_at,
     int_at,
     number_at,
     number_of_row,
-    row_sums,
-    row_type,
     set_hit,
     span_of,
 )
 from neuprim.core.render.cuda.chord import (
-    chord,
-    phase,
+    chord_backward,
+    intersect_chord,
+    load_ray,
+    neuron_phase,
     pixel_of_lane,
     pixel_of_slot,
-    ray_of,
     slot_of_pixel,
-    through_chord,
     xyz,
 )
-from neuprim.core.render.cuda.layout import Form
-from neuprim.core.render.cuda.trigonometry import TAU, band_of, cos_turns, sin_turns
+from neuprim.core.render.cuda.layout import KernelForm
+from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, edge_profiles, sin_turns
 
 
 @functools.cache
-def pixels_kernel(form: Form, depth: bool) -> Any:
+def pixels_kernel(form: KernelForm, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
     C, H = form.channels, form.hidden
-    colours, width = L.colours(form.neurons), L.columns(form.neurons, C)
+    colours, width = L.colour_column(form.neurons), L.row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
@@ -100,13 +100,13 @@ def pixels_kernel(form: Form, depth: bool) -> Any:
 
 
 @functools.cache
-def pairs_kernel(form: Form, depth: bool) -> Any:
+def pairs_kernel(form: KernelForm, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
     K, P, C = form.neurons, form.edge, form.channels
-    W, width = L.columns(K, C), L.gradient_width(K, C)
-    row_of, add_lanes = row_type(width), row_sums(width)
-    _, pair = band_of(P)
-    amplitudes = L.amplitudes(K)
+    W, width = L.row_columns(K, C), L.gradient_width(K, C)
+    row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
+    _, pair = edge_profiles(P)
+    amplitudes = L.amplitude_column(K)
     vecK = wp.types.vector(length=max(K, 1), dtype=wp.float32)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
     mean = float(NORMS[P])
@@ -163,7 +163,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                         g_error += hit[1] * number_at(error, pixel)
                         for k in range(wp.static(C)):
                             g_colour[k] += hit[1] * number_of_row(g_rgb, pixel, wp.static(C), k)
-                        c = chord(ray_of(row, 0), px, py)
+                        c = intersect_chord(load_ray(row, 0), px, py)
                         q = c.x + (c.h - c.half) * c.e
                         scale = float(norm)  # I = scale half field
                         if wp.static(P == 1):
@@ -183,7 +183,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                             w = row[0, wp.static(L.NEURONS + k)]
                             z = c.half * wp.dot(c.e, xyz(w))
                             band = pair(z)
-                            u = phase(q, w)
+                            u = neuron_phase(q, w)
                             r = u - wp.rint(u)
                             cosine = cos_turns(r * r)
                             one = cosine * band[0]
@@ -215,7 +215,7 @@ def pairs_kernel(form: Form, depth: bool) -> Any:
                             by_depth = 0.5 * c.ia / wp.sqrt(wp.max(D, depth_floor) * c.ia)
                         else:
                             gD = float(P) * gf * field / D
-                        pull = through_chord(c, g_half, g_mid, gD, by_depth, gq, gv)
+                        pull = chord_backward(c, g_half, g_mid, gD, by_depth, gq, gv)
                         gG = pull.e + (row[0, L.REST][0] + c.slide) * pull.m
                         gE0 += pull.e + c.slide * pull.m
                         gEX += c.du * gG

@@ -23,7 +23,7 @@ from neuprim.core.compute.warp import (
     Vec4is,
     Vec4s2d,
     array,
-    launch,
+    launch_kernel,
     wp,
 )
 from neuprim.core.errors import BackendUnavailable
@@ -38,7 +38,7 @@ _MOST = 2**31  # indices of pairs are int32
 
 
 @dataclass(frozen=True)
-class Counted:
+class TileCounts:
     """What the host learns of a frame."""
 
     pairs: int  # (tile, primitive) pairs
@@ -62,19 +62,19 @@ class TileLists:
         return int(self.ids.shape[0])
 
 
-def count_tiles(counts: Tensor, bad: Tensor) -> Counted:
+def count_tiles(counts: Tensor, bad: Tensor) -> TileCounts:
     """Running sums of what ``prepare`` counted; the host waits here, once. BackendUnavailable: too many pairs."""
     ends = torch.stack(
         [torch.cumsum(row, 0, dtype=torch.int64) for row in counts]
     )  # along one row torch's scan is ten times faster
     if counts.shape[1] == 0:
-        return Counted(0, 0, -1, ends)
+        return TileCounts(0, 0, -1, ends)
     pairs, in_float64, first_bad = torch.cat((ends[:, -1], bad.long())).tolist()
     if pairs >= _MOST:
         raise BackendUnavailable(
             f"primitives reach {pairs} tiles in all; the cuda backend counts to {_MOST - 1}: render a smaller image"
         )
-    return Counted(pairs, in_float64, first_bad if first_bad < counts.shape[1] else -1, ends)
+    return TileCounts(pairs, in_float64, first_bad if first_bad < counts.shape[1] else -1, ends)
 
 
 @wp.struct
@@ -92,7 +92,7 @@ class Ellipse:
 
 
 @wp.func
-def ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.float32, box: wp.vec4i):
+def silhouette_ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.float32, box: wp.vec4i):
     """``span``: SKEW, XC, YC, HX."""
     e = Ellipse()
     e.box = box
@@ -129,7 +129,7 @@ def tile_range(e: Ellipse, ty: int):
 
 
 @functools.cache
-def _kernels() -> tuple[Any, Any]:
+def _binning_kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def emit(
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
@@ -149,7 +149,7 @@ def _kernels() -> tuple[Any, Any]:
             origin = int(0)
             if tiles > 0:
                 origin = images[i] * tiles
-            e = ellipse(spans[i, 0], spans[i, 1][0], rows[i, _E0][3], rows[i, _EX][3], box)
+            e = silhouette_ellipse(spans[i, 0], spans[i, 1][0], rows[i, _E0][3], rows[i, _EX][3], box)
             for ty in range(box[1] // _TILE, (box[3] - 1) // _TILE + 1):
                 lo_hi = tile_range(e, ty)
                 for tx in range(lo_hi[0], lo_hi[1]):
@@ -186,7 +186,7 @@ def bin_primitives(
     boxes: Tensor,
     depth: Tensor,
     counts: Tensor,
-    counted: Counted,
+    counted: TileCounts,
     camera: Camera,
     images: tuple[Tensor, int] | None = None,
 ) -> tuple[TileLists, Tensor, Tensor]:
@@ -202,7 +202,7 @@ def bin_primitives(
     def integers(n: int) -> Tensor:
         return torch.empty(n, dtype=torch.int32, device=device)
 
-    emit, list_pairs = _kernels()
+    emit, list_pairs = _binning_kernels()
     order = torch.argsort(depth, stable=True)
     first = torch.zeros(N + 1, dtype=torch.int32, device=device)
     slots, which, keys = integers(N), integers(counted.in_float64), torch.empty(pairs, dtype=torch.int64, device=device)
@@ -212,7 +212,7 @@ def bin_primitives(
         array(counted.ends, wp.int64), across, image_of, 0 if images is None else each, array(first, wp.int32),
         array(keys, wp.int64), array(slots, wp.int32), array(which, wp.int32),
     )  # fmt: skip
-    launch(emit, N, reached, device, PER_BLOCK)
+    launch_kernel(emit, N, reached, device, PER_BLOCK)
     keys, came_from = torch.sort(keys)
     starts = torch.zeros(several * each + 1, dtype=torch.int32, device=device)
     ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
@@ -220,7 +220,7 @@ def bin_primitives(
         array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, several * each, each,
         array(starts, wp.int32), array(ids, wp.int32), array(tile_of, wp.int32), array(slots_of, wp.int32),
     )  # fmt: skip
-    launch(list_pairs, pairs, found, device)
+    launch_kernel(list_pairs, pairs, found, device)
     return TileLists(starts, ids, tile_of, first, slots_of), slots, which
 
 

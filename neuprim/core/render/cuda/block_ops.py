@@ -35,7 +35,7 @@ def any_thread(yes: int) -> int:
     """Whether any thread of the block says so."""
 
 
-def _halving(width: int) -> str:
+def _halving_sums(width: int) -> str:
     """Each step keeps half of the values and adds a partner lane's: 31 shuffles per 32 values instead of 160.
 
     Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone, so that they are unrolled.
@@ -73,17 +73,17 @@ def _halving(width: int) -> str:
 
 
 @functools.cache
-def row_type(width: int) -> Any:
+def gradient_row_type(width: int) -> Any:
     """A gradient row in registers."""
     return wp.types.vector(length=width, dtype=wp.float32)
 
 
 @functools.cache
-def row_sums(width: int) -> Callable[..., Any]:
+def gradient_row_sums(width: int) -> Callable[..., Any]:
     """A function (x, lane, out, pair) that writes sums over a warp's lanes to a pair's row; ``width`` is 32 times n."""
-    row = row_type(width)
+    row = gradient_row_type(width)
 
-    @wp.func_native(_halving(width))
+    @wp.func_native(_halving_sums(width))
     def sums(x: row, lane: int, out: Floats, pair: int): ...
 
     return sums

@@ -48,13 +48,13 @@ def xyz(a: wp.vec4):
 
 
 @wp.func
-def phase(q: wp.vec3, w: wp.vec4):
+def neuron_phase(q: wp.vec3, w: wp.vec4):
     """Of a neuron at q, in turns: three multiplications with additions, as the sum begins with its own phase."""
     return w[3] + q[0] * w[0] + q[1] * w[1] + q[2] * w[2]
 
 
 @wp.func
-def ray_of(rows: Any, j: int):
+def load_ray(rows: Any, j: int):
     """From row ``j`` of a tile of rows or of the whole array."""
     r = Ray()
     r.e0 = rows[j, L.E0]
@@ -67,7 +67,7 @@ def ray_of(rows: Any, j: int):
 
 
 @wp.func
-def chord(r: Ray, px: float, py: float):
+def intersect_chord(r: Ray, px: float, py: float):
     """Of the pixel centre (px, py)."""
     c = Chord()
     c.du = px - r.e0[3]
@@ -101,7 +101,9 @@ class Pull:
 
 
 @wp.func
-def through(c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3):
+def chord_ends_backward(
+    c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3
+):
     """From dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD has what reaches D through ``h``, too."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
@@ -117,11 +119,11 @@ def through(c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: f
 
 
 @wp.func
-def through_chord(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
+def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
     """The same in float32, where dh/dD = ``by_depth`` and nothing reaches a ray on other ways than D and the ends."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
-    return through(c, g_half, g_mid, 0.0, gD + (gt1 - gt0) * by_depth, 0.0, gq, gv)
+    return chord_ends_backward(c, g_half, g_mid, 0.0, gD + (gt1 - gt0) * by_depth, 0.0, gq, gv)
 
 
 @wp.func

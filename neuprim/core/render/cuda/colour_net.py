@@ -31,15 +31,15 @@ from neuprim.core.compute.warp import (
     Vec4s,
     Vec4s2d,
     array,
-    launch,
+    launch_kernel,
     wp,
 )
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.block_ops import row_sums, row_type
-from neuprim.core.render.cuda.chord import chord, phase, pixel_of_slot, ray_of, through_chord, xyz
-from neuprim.core.render.cuda.float64 import chord64, through64
-from neuprim.core.render.cuda.layout import Form
+from neuprim.core.render.cuda.block_ops import gradient_row_sums, gradient_row_type
+from neuprim.core.render.cuda.chord import chord_backward, intersect_chord, load_ray, neuron_phase, pixel_of_slot, xyz
+from neuprim.core.render.cuda.float64 import chord_backward64, intersect_chord64
+from neuprim.core.render.cuda.layout import KernelForm
 from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
 from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, sin_turns
@@ -55,7 +55,7 @@ _FAST = wp.constant(d(W.FLOAT64_TURNS**2))
 
 
 @dataclass
-class Net:
+class ColourNet:
     """The networks of a frame; the parameters are contiguous, float32 or float64 alike."""
 
     Wx: Tensor  # (N, H, 3)
@@ -71,7 +71,7 @@ class Net:
 
 
 @wp.func
-def _unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
+def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
     """(WX, WY, WZ, PHASE): on whitened axes and in turns."""
     p = project_primitive(wp.vec3d(), log_scale, quat, View())
     on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
@@ -80,7 +80,7 @@ def _unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
 
 
 @functools.cache
-def _kernels(double: bool) -> tuple[Any, Any, Any]:
+def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -91,7 +91,7 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
     ):  # fmt: skip
         """Thread (i, j): unit j of primitive i."""
         i, j = wp.tid()
-        unit = _unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
+        unit = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
         fast[i, j] = unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2] > _FAST
         at = j * (1 + (channels + 3) // 4)
         rows[i, at] = wp.vec4(unit)
@@ -110,7 +110,7 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
         """Thread (m, j): unit j of primitive ``which[m]``."""
         m, j = wp.tid()
         i = which[m]
-        wide[m, j] = _unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
+        wide[m, j] = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def backward(
@@ -156,38 +156,38 @@ def _kernels(double: bool) -> tuple[Any, Any, Any]:
     return fill_rows, prepare_wide, backward
 
 
-def _types(double: bool) -> tuple[Any, Any, Any]:
+def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
     return (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
 
-def prepare_net(log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor) -> Net:
+def prepare_colour_net(log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor) -> ColourNet:
     """Rows of all primitives; ``wide`` is empty, see :func:`fill_wide_net`."""
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
     dtype = torch.float64 if double else torch.float32
     log_scales, quats, Wx, bias, Wout = (x.detach().to(dtype).contiguous() for x in tensors)
     (N, H, _), C, device = Wx.shape, Wout.shape[1], Wx.device
-    real, vec3, vec4 = _types(double)
+    real, vec3, vec4 = _kernel_types(double)
     rows = torch.empty(N, H * L.net_columns(C), 4, device=device)
     fast = torch.empty(N, H, dtype=torch.bool, device=device)
-    launch(
-        _kernels(double)[0], (N, H),
+    launch_kernel(
+        _colour_net_kernels(double)[0], (N, H),
         (
             array(log_scales, vec3), array(quats, vec4), array(Wx, vec3), array(bias, real), array(Wout, real), C,
             array(rows, wp.vec4), array(fast, wp.bool),
         ), device, PER_BLOCK,
     )  # fmt: skip
-    return Net(Wx, bias, Wout, rows, fast.any(1), torch.empty(0, H, 4, dtype=torch.float64, device=device))
+    return ColourNet(Wx, bias, Wout, rows, fast.any(1), torch.empty(0, H, 4, dtype=torch.float64, device=device))
 
 
-def fill_wide_net(net: Net, which: Tensor, log_scales: Tensor, quats: Tensor) -> None:
+def fill_wide_net(net: ColourNet, which: Tensor, log_scales: Tensor, quats: Tensor) -> None:
     """Fill ``net.wide`` for primitives ``which`` (M,) int32; parameters as the frame has them."""
     M, H, device = len(which), net.hidden, net.Wx.device
     double = net.Wx.dtype == torch.float64
-    real, vec3, vec4 = _types(double)
+    real, vec3, vec4 = _kernel_types(double)
     net.wide = torch.empty(M, H, 4, dtype=torch.float64, device=device)
-    launch(
-        _kernels(double)[1], (M, H),
+    launch_kernel(
+        _colour_net_kernels(double)[1], (M, H),
         (
             array(which, wp.int32), array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4),
             array(net.Wx, vec3), array(net.bias, real),
@@ -196,8 +196,8 @@ def fill_wide_net(net: Net, which: Tensor, log_scales: Tensor, quats: Tensor) ->
     )  # fmt: skip
 
 
-def net_backward(
-    net: Net, parameters: Sequence[Tensor], weights: Tensor, grads: Tensor, out: Sequence[Tensor]
+def colour_net_backward(
+    net: ColourNet, parameters: Sequence[Tensor], weights: Tensor, grads: Tensor, out: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the float32 gradients of Wx, bias and Wout; adds to those of log_scales and quats in ``out``.
 
@@ -207,12 +207,12 @@ def net_backward(
     _, g_log_scales, g_quats, *_ = out
     first = FIRST_COLOUR + int(net.Wout.shape[1])
     double = net.Wx.dtype == torch.float64
-    _, vec3, vec4 = _types(double)
+    _, vec3, vec4 = _kernel_types(double)
     g_Wx, g_bias, g_Wout = (
         torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in (net.Wx, net.bias, net.Wout)
     )
-    launch(
-        _kernels(double)[2], net.Wx.shape[0],
+    launch_kernel(
+        _colour_net_kernels(double)[2], net.Wx.shape[0],
         (
             array(log_scales.to(net.Wx), vec3), array(quats.to(net.Wx), vec4), array(net.Wx, vec3), net.hidden,
             int(net.Wout.shape[1]),
@@ -224,18 +224,18 @@ def net_backward(
     return g_Wx, g_bias, g_Wout
 
 
-def net_width(form: Form) -> int:
+def net_width(form: KernelForm) -> int:
     """Columns of a network's gradient row."""
     return L.gradient_width(0, form.channels, form.hidden)
 
 
 @functools.cache
-def net_pairs_kernel(form: Form) -> Any:
+def net_pairs_kernel(form: KernelForm) -> Any:
     """A warp a pair: gradients of its network, and the ray's share through the chord's middle."""
     C, H, P = form.channels, form.hidden, form.edge
     each, width = L.net_columns(C), net_width(form)
-    columns, net_columns = L.columns(form.neurons, C), max(H * each, 1)
-    row_of, add_lanes = row_type(width), row_sums(width)
+    columns, net_columns = L.row_columns(form.neurons, C), max(H * each, 1)
+    row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
@@ -262,7 +262,7 @@ def net_pairs_kernel(form: Form) -> Any:
                         at = pixel_of_slot(spans, n, s)
                         X = left + at[0]
                         Y = top + at[1]
-                        c = chord(ray_of(row, 0), float(X) + 0.5, float(Y) + 0.5)
+                        c = intersect_chord(load_ray(row, 0), float(X) + 0.5, float(Y) + 0.5)
                         q = c.x + (c.mid - c.tm) * c.e
                         g = vecC()
                         for k in range(wp.static(C)):
@@ -272,7 +272,7 @@ def net_pairs_kernel(form: Form) -> Any:
                         gq = wp.vec3()
                         for j in range(wp.static(H)):
                             w = units[0, wp.static(each * j)]
-                            u = phase(q, w)
+                            u = neuron_phase(q, w)
                             r = u - wp.rint(u)
                             cosine = cos_turns(r * r)
                             pull = float(0.0)
@@ -292,7 +292,7 @@ def net_pairs_kernel(form: Form) -> Any:
                         by_depth = 0.5 * c.h / D
                         if wp.static(P == 0):
                             by_depth = 0.5 * c.ia / wp.sqrt(wp.max(D, depth_floor) * c.ia)
-                        pulled = through_chord(c, 0.0, wp.dot(gq, c.e), 0.0, by_depth, gq, wp.vec3())
+                        pulled = chord_backward(c, 0.0, wp.dot(gq, c.e), 0.0, by_depth, gq, wp.vec3())
                         gE = pulled.e + c.slide * pulled.m
                         gG = pulled.e + (row[0, L.REST][0] + c.slide) * pulled.m
                         for k in range(3):
@@ -322,7 +322,7 @@ def float64_hues_kernel(channels: int) -> Any:
         begin = offsets[n]
         for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
             at = pixel_of_slot(spans, n, s)
-            c = chord64(wide, r, (tiles[n] % across) * L.TILE + at[0], (tiles[n] // across) * L.TILE + at[1])
+            c = intersect_chord64(wide, r, (tiles[n] % across) * L.TILE + at[0], (tiles[n] // across) * L.TILE + at[1])
             for k in range(wp.static(channels)):
                 hue = d(rows[i, first + k // 4][k % 4])
                 for j in range(hidden):
@@ -336,11 +336,11 @@ def float64_hues_kernel(channels: int) -> Any:
 
 
 @functools.cache
-def float64_net_kernel(form: Form) -> Any:
+def float64_net_kernel(form: KernelForm) -> Any:
     """:func:`net_pairs_kernel` for in_float64 pairs, in float64."""
     C = form.channels
     each, width = L.net_columns(C), net_width(form)
-    row_of, add_lanes = row_type(width), row_sums(width)
+    row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
@@ -362,7 +362,7 @@ def float64_net_kernel(form: Form) -> Any:
                 if weight > 0.0:
                     at = pixel_of_slot(spans, n, s)
                     X, Y = (tile % across) * L.TILE + at[0], (tile // across) * L.TILE + at[1]
-                    c = chord64(wide, r, X, Y)
+                    c = intersect_chord64(wide, r, X, Y)
                     g = vecC()
                     for k in range(wp.static(C)):
                         if hues[begin + s, k] >= 0.0:
@@ -386,7 +386,7 @@ def float64_net_kernel(form: Form) -> Any:
                         total[to + 3] += float(gu)
                         gq += gu * axes
                     zero = d(0.0)
-                    moved = through64(
+                    moved = chord_backward64(
                         c, wide[r, W.TC], depth_floor, zero, wp.dot(gq, c.e), zero, zero, zero, gq, wp.vec3d()
                     )
                     for k in range(3):

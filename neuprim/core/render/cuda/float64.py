@@ -13,9 +13,9 @@ from typing import Any
 from neuprim.core.compute.warp import OPTIONS, Doubles2d, Floats, Floats2d, Ints, Shorts2d, Vec2s, wp
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.block_ops import row_sums, row_type
+from neuprim.core.render.cuda.block_ops import gradient_row_sums, gradient_row_type
 from neuprim.core.render.cuda.chord import pixel_of_slot
-from neuprim.core.render.cuda.layout import CUT_AT, Form
+from neuprim.core.render.cuda.layout import CUT_AT, KernelForm
 
 d = wp.float64
 _TWO_PI = 6.283185307179586
@@ -49,7 +49,7 @@ def _vector(wide: Doubles2d, r: int, c: int):
 
 
 @wp.func
-def chord64(wide: Doubles2d, r: int, X: int, Y: int):
+def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
     """Of pixel (X, Y) and row ``r``."""
     c = Chord64()
     zero, one = d(0.0), d(1.0)
@@ -85,7 +85,7 @@ class Weight:
 
 
 @wp.func
-def weight_of(c: Chord64, edge: int):
+def edge_polynomial64(c: Chord64, edge: int):
     """(D - a (shift + half u)^2)^p."""
     w = Weight()
     two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
@@ -174,7 +174,7 @@ class Moments:
 
 
 @wp.func
-def dot64(w: Weight, M: vec6d):
+def weighted_moments64(w: Weight, M: vec6d):
     """The moments of a weight."""
     out = Moments()
     out.even = w.q[0] * M[0] + w.q[2] * M[2] + w.q[4] * M[4]
@@ -194,12 +194,12 @@ class Pull64:
 
 
 @wp.func
-def through64(
+def chord_backward64(
     c: Chord64, tc: wp.float64, depth_floor: float, g_half: wp.float64, g_mid: wp.float64, g_tm: wp.float64,
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """As :func:`~neuprim.core.render.cuda.chord.through`, with dh/dD from the floor on D."""
+    """As :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`, with dh/dD from the floor on D."""
     half, two = d(0.5), d(2.0)
     gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
     tm, g_h = g_tm + gt0 + gt1, gt1 - gt0
@@ -240,8 +240,8 @@ def float64_opacity_kernel(depth: bool) -> Any:
             for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
                 at = pixel_of_slot(spans, n, s)
                 X, Y = tx + at[0], ty + at[1]
-                c = chord64(wide, r, X, Y)
-                w = weight_of(c, edge)
+                c = intersect_chord64(wide, r, X, Y)
+                w = edge_polynomial64(c, edge)
                 alpha = float(0.0)
                 if c.half > d(0.0) and w.mean > d(0.0):
                     total = w.mean * wide[r, W.OFFSET]
@@ -249,7 +249,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
                         o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
                         v = _vector(wide, r, o)
                         phase = phase64(c, v, wide[r, o + W.PHASE])
-                        m = dot64(w, moments(rate64(c, v)))
+                        m = weighted_moments64(w, moments(rate64(c, v)))
                         total += wide[r, o + W.AMPLITUDE] * (wp.cos(phase) * m.even - wp.sin(phase) * m.odd)
                     I = d(2.0) * total * c.half * ray_norm(lens, X, Y)
                     if I > d(0.0):
@@ -267,11 +267,11 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 
 @functools.cache
-def float64_pairs_kernel(form: Form, depth: bool) -> Any:
+def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
-    row_of, add_lanes = row_type(width), row_sums(width)
+    row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_pairs(
@@ -299,8 +299,8 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
                         total[L.G_ERROR] += hit[1] * error[pixel]
                         for k in range(wp.static(C)):
                             total[wp.static(L.G_NEURONS + 5 * K + k)] += hit[1] * g_rgb[pixel, k]
-                        c = chord64(wide, r, X, Y)
-                        w = weight_of(c, P)
+                        c = intersect_chord64(wide, r, X, Y)
+                        w = edge_polynomial64(c, P)
                         g = two * d(hit[0]) * ray_norm(lens, X, Y)  # dL/d(mean half)
                         gh = g * c.half
                         mean = w.mean * wide[r, W.OFFSET]
@@ -315,7 +315,7 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
                             v = _vector(wide, r, o)
                             phase = phase64(c, v, wide[r, o + W.PHASE])
                             M = moments(rate64(c, v))
-                            m = dot64(w, M)
+                            m = weighted_moments64(w, M)
                             cosine, sine, amplitude = wp.cos(phase), wp.sin(phase), wide[r, o + W.AMPLITUDE]
                             one = cosine * m.even - sine * m.odd
                             mean += amplitude * one
@@ -343,7 +343,7 @@ def float64_pairs_kernel(form: Form, depth: bool) -> Any:
                             gA = -gh * (shift * shift * rest0 + two * shift * c.half * rest1 + c.half * c.half * rest2)
                         if wp.static(depth):
                             g_mid += d(hit[1] * g_z[pixel]) * wide[r, W.UNIT]
-                        pull = through64(c, wide[r, W.TC], depth_floor, g_half, g_mid, g_tm, gD, gA, gq, gv)
+                        pull = chord_backward64(c, wide[r, W.TC], depth_floor, g_half, g_mid, g_tm, gD, gA, gq, gv)
                         for k in range(3):
                             total[k] += float(pull.e[k])
                             total[3 + k] += float(c.du * pull.G[k])

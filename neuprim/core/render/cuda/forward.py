@@ -15,13 +15,13 @@ from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Longs, Short
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import any_thread, hit_at, int_at, set_hit, span_of
-from neuprim.core.render.cuda.chord import chord, phase, pixel_of_lane, ray_of, slot_of_pixel, xyz
-from neuprim.core.render.cuda.layout import CUT_AT, Form
-from neuprim.core.render.cuda.trigonometry import band_of, cos_turns, opacity
+from neuprim.core.render.cuda.chord import intersect_chord, load_ray, neuron_phase, pixel_of_lane, slot_of_pixel, xyz
+from neuprim.core.render.cuda.layout import CUT_AT, KernelForm
+from neuprim.core.render.cuda.trigonometry import cos_turns, edge_profiles, opacity_of_depth
 
 
 @wp.func
-def key_of(pixel: int, entry: float):
+def entry_sort_key(pixel: int, entry: float):
     """Sorts by pixel, then by entry: floats in the order of integers."""
     bits = wp.int64(wp.cast(entry, wp.int32))
     if bits < wp.int64(0):
@@ -35,16 +35,16 @@ BATCH = 16  # rows in shared memory at a time
 
 
 @functools.cache
-def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
+def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
     """``keep``: fill the slots, and take float64 primitives from there; ``depth``: also the sum of w z.
 
     ``listing``: only list every hit, its key and pair, for :func:`composite_kernel`; ``several``: images in a row.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
-    width = L.columns(K, C)
-    amplitudes, colours = L.amplitudes(K), L.colours(K)
-    value, _ = band_of(P)
+    width = L.row_columns(K, C)
+    amplitudes, colours = L.amplitude_column(K), L.colour_column(K)
+    value, _ = edge_profiles(P)
     H = form.hidden
     each = L.net_columns(C)
     net_width = max(H * each, 1)
@@ -111,7 +111,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                 for k in range(wp.static(C)):
                                     tint[k] = hues[slot, k]
                         else:
-                            c = chord(ray_of(staged, j), px, py)
+                            c = intersect_chord(load_ray(staged, j), px, py)
                             if c.half > 0.0:
                                 q = c.x + (c.mid - c.tm) * c.e
                                 v = c.half * c.e
@@ -121,7 +121,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                     if wp.static(k % 4 == 0):
                                         w2 = staged[j, wp.static(amplitudes + k // 4)]
                                     w = staged[j, wp.static(L.NEURONS + k)]
-                                    u = phase(q, w)
+                                    u = neuron_phase(q, w)
                                     r = u - wp.rint(u)
                                     field += w2[wp.static(k % 4)] * cos_turns(r * r) * value(wp.dot(v, xyz(w)))
                                 I = field * c.half * norm
@@ -130,13 +130,13 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                                 if wp.static(P == 2):
                                     I *= c.D * c.D
                                 if I > 0.0:
-                                    alpha = wp.min(opacity(I), limits[1])
+                                    alpha = wp.min(opacity_of_depth(I), limits[1])
                                     if alpha < limits[0]:
                                         alpha = 0.0
                                 if wp.static(H > 0):
                                     for h in range(wp.static(H)):
                                         w = units[j, wp.static(each * h)]
-                                        u = phase(q, w)
+                                        u = neuron_phase(q, w)
                                         r = u - wp.rint(u)
                                         wave = cos_turns(r * r)
                                         for k in range(wp.static(C)):
@@ -154,7 +154,9 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
                         if wp.static(listing):
                             weight = 0.0
                             before = 0.0  # of slots that are no hits, which nothing else will touch
-                            keys[slot] = key_of(wp.where(alpha > 0.0, Y * size[0] + X, size[0] * size[1]), entry)
+                            keys[slot] = entry_sort_key(
+                                wp.where(alpha > 0.0, Y * size[0] + X, size[0] * size[1]), entry
+                            )
                             owners[slot] = base + j
                         for k in range(wp.static(C)):
                             if wp.static(H >= 0):
@@ -196,7 +198,7 @@ def forward_kernel(form: Form, keep: bool, depth: bool, listing: bool = False, s
 
 
 @wp.func
-def _begin(keys: Longs, count: int, pixel: int):
+def _first_hit(keys: Longs, count: int, pixel: int):
     """The first of the sorted keys that belongs to this pixel or a later one."""
     low, high = int(0), int(count)
     while low < high:
@@ -209,10 +211,10 @@ def _begin(keys: Longs, count: int, pixel: int):
 
 
 @functools.cache
-def composite_kernel(form: Form, depth: bool) -> Any:
+def composite_kernel(form: KernelForm, depth: bool) -> Any:
     """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last."""
     C, H = form.channels, form.hidden
-    colours = L.colours(form.neurons)
+    colours = L.colour_column(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
@@ -223,11 +225,11 @@ def composite_kernel(form: Form, depth: bool) -> Any:
     ):  # fmt: skip
         """``begins[pixel]`` receives where its hits begin in ``order``."""
         n = wp.tid()
-        first = _begin(keys, count, n)
+        first = _first_hit(keys, count, n)
         begins[n] = first
         T, z = float(1.0), float(0.0)
         color = colour_type()
-        for k in range(first, _begin(keys, count, n + 1)):
+        for k in range(first, _first_hit(keys, count, n + 1)):
             slot = int(order[k])
             alpha = hits[slot][0]
             if T < limits[2]:
@@ -255,10 +257,10 @@ def composite_kernel(form: Form, depth: bool) -> Any:
 
 
 @functools.cache
-def uncomposite_kernel(form: Form, depth: bool) -> Any:
+def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
     """Back to front: (alpha, T) becomes (dL/dI, weight), as in ``pixels_kernel``."""
     C, H = form.channels, form.hidden
-    colours = L.colours(form.neurons)
+    colours = L.colour_column(form.neurons)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def uncomposite(

@@ -10,16 +10,16 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.warp import array, launch, wp
+from neuprim.core.compute.warp import array, launch_kernel, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count_tiles
 from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
 from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.render.layout import SPAN_WIDTH, min_visible_depth
-from neuprim.core.render.rasterize import Request
+from neuprim.core.render.rasterize import RasterRequest
 
 
-class NotFinite(ValueError):
+class NotFinitePrimitive(ValueError):
     """Primitive ``row`` is not finite, or outside float32; the caller says which of its numbers."""
 
     def __init__(self, row: int) -> None:
@@ -72,10 +72,10 @@ class Frame:
     @property
     def inputs(self) -> tuple[Any, ...]:
         """The parameters as Warp arrays."""
-        return as_arrays(self.parameters)
+        return parameter_arrays(self.parameters)
 
 
-def as_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
+def parameter_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
     """Return parameters, or their gradients, as Warp arrays of numbers and vectors."""
     double = parameters[0].dtype == torch.float64
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
@@ -83,7 +83,7 @@ def as_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
 
 
 def prepare_frame(
-    request: Request,
+    request: RasterRequest,
     viewmat: Tensor,
     palette: Tensor,
     tensors: Sequence[Tensor],
@@ -112,10 +112,10 @@ def prepare_frame(
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
 
-    rows, spans, boxes = empty(N, L.columns(K, C), 4), empty(N, SPAN_WIDTH), empty(N, 4, dtype=torch.int32)
+    rows, spans, boxes = empty(N, L.row_columns(K, C), 4), empty(N, SPAN_WIDTH), empty(N, 4, dtype=torch.int32)
     depth, status, counts = empty(N, dtype=torch.float64), empty(N, dtype=torch.uint8), empty(2, N, dtype=torch.int32)
     bad = torch.full((1,), N, dtype=torch.int32, device=device)
-    inputs, colours = as_arrays(parameters), array(palette.detach().float().contiguous(), wp.float32)
+    inputs, colours = parameter_arrays(parameters), array(palette.detach().float().contiguous(), wp.float32)
     view = (array(matrix, wp.float64), projection.intrinsics)
     least = min_visible_depth(settings.alpha_min)
     size = (camera.width, camera.height, projection.near, projection.turns, request.edge, least, K, C)
@@ -129,12 +129,20 @@ def prepare_frame(
         array(bad, wp.int32),
     )
     asked = None if forced is None else array(forced.contiguous(), wp.bool)
-    launch(prepare_kernel(double), N, (*inputs, colours, asked, *view, *size, *filled), device, PER_BLOCK)
+    launch_kernel(prepare_kernel(double), N, (*inputs, colours, asked, *view, *size, *filled), device, PER_BLOCK)
     counted = count_tiles(counts, bad)
     if counted.bad >= 0:
-        raise NotFinite(counted.bad)
+        raise NotFinitePrimitive(counted.bad)
     lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera, images)
     wide = empty(counted.in_float64, L.wide_width(K), dtype=torch.float64)
-    wanted = (array(which, wp.int32), *inputs, *view, projection.near, projection.turns, K, array(wide, wp.float64))
-    launch(wide_kernel(double), counted.in_float64, wanted, device, PER_BLOCK)
+    wanted = (
+        array(which, wp.int32),
+        *inputs,
+        *view,
+        projection.near,
+        projection.turns,
+        K,
+        array(wide, wp.float64),
+    )
+    launch_kernel(wide_kernel(double), counted.in_float64, wanted, device, PER_BLOCK)
     return Frame(projection, parameters, rows, wide, slots, which, spans, boxes, depth, status, lists)

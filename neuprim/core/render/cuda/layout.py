@@ -37,7 +37,7 @@ CUT_AT = -1e30  # entry of every chord that the near plane cuts: in front of all
 
 
 @dataclass(frozen=True)
-class Form:
+class KernelForm:
     """What a kernel is compiled for: neurons K, exponent p, channels C, hidden units H (-1: constant colours)."""
 
     neurons: int
@@ -46,19 +46,19 @@ class Form:
     hidden: int = -1
 
 
-def amplitudes(neurons: int) -> int:
+def amplitude_column(neurons: int) -> int:
     """First column of the neurons' amplitudes, four in each."""
     return NEURONS + neurons
 
 
-def colours(neurons: int) -> int:
+def colour_column(neurons: int) -> int:
     """First column of the colours, four channels in each."""
-    return amplitudes(neurons) + -(-neurons // 4)
+    return amplitude_column(neurons) + -(-neurons // 4)
 
 
-def columns(neurons: int, channels: int) -> int:
+def row_columns(neurons: int, channels: int) -> int:
     """float4 columns of a primitive's row."""
-    return colours(neurons) + -(-channels // 4)
+    return colour_column(neurons) + -(-channels // 4)
 
 
 def wide_width(neurons: int) -> int:

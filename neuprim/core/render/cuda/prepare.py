@@ -11,16 +11,16 @@ from neuprim.core.compute.warp import Bools, Bytes, Doubles, Doubles2d, Floats2d
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.binning import ellipse, tile_range
+from neuprim.core.render.cuda.binning import silhouette_ellipse, tile_range
 from neuprim.core.render.cuda.projection import (
     EXACT,
     ProjectedPrimitive,
     Ray,
     View,
+    load_view,
     project_primitive,
-    rounded,
-    view_of,
-    whiten,
+    round_to_float32,
+    whiten_rays,
 )
 
 d, f = wp.float64, wp.float32
@@ -50,31 +50,31 @@ _STORE = """
 
 
 @wp.func_native(_STORE)
-def store(rows: Vec4s2d, i: int, j: int, x: float, y: float, z: float, w: float): ...
+def store_float4(rows: Vec4s2d, i: int, j: int, x: float, y: float, z: float, w: float): ...
 
 
 @wp.func
-def _put(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64):
+def _store_vector(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64):
     """16 bytes at once: Warp's own store of a vector is four."""
-    store(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
+    store_float4(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
 
 
 @wp.func
-def _largest(v: wp.vec3d):
+def _largest_component(v: wp.vec3d):
     return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
 
 
 @wp.func
-def _spread(p: ProjectedPrimitive, i: int, j: int):
+def _covariance(p: ProjectedPrimitive, i: int, j: int):
     """Entry (i, j) of the covariance in camera axes, in units of m^2."""
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
 @wp.func
-def _extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
+def _silhouette_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
     """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
-    sii, siz = square * _spread(p, axis, axis), square * _spread(p, axis, 2)
+    sii, siz = square * _covariance(p, axis, axis), square * _covariance(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
     root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - szz
     return wp.vec2d(
@@ -83,7 +83,7 @@ def _extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: 
 
 
 @wp.struct
-class Outline:
+class SilhouetteSpans:
     """A silhouette's row spans; whether it is an ellipse, and too coarse for float32."""
 
     skew: wp.float64
@@ -95,9 +95,9 @@ class Outline:
 
 
 @wp.func
-def _outline(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
+def _silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
     """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, as row spans: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
-    o = Outline()
+    o = SilhouetteSpans()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
     k0 = wp.cross(r.xa, r.e0)
@@ -111,11 +111,11 @@ def _outline(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.
         yc = -d1 / d2
         peak = d0 + d1 * yc
         if peak > d(0.0):
-            o.skew = rounded(-q4 / q3)
-            o.xc = rounded(-(q1 + q4 * yc) / q3)
-            o.yc = rounded(yc)
-            o.hx = rounded(wp.sqrt(peak) / -q3)
-            o.hy = rounded(wp.sqrt(-peak / d2))
+            o.skew = round_to_float32(-q4 / q3)
+            o.xc = round_to_float32(-(q1 + q4 * yc) / q3)
+            o.yc = round_to_float32(yc)
+            o.hx = round_to_float32(wp.sqrt(peak) / -q3)
+            o.hy = round_to_float32(wp.sqrt(-peak / d2))
             # the pixel offsets that meet the silhouette on the screen
             ux, uy, half = p.anchor[1], p.anchor[2], d(0.5)
             tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
@@ -134,14 +134,14 @@ def _outline(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.
 
 
 @wp.func
-def _wave(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
+def _whitened_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
     """A neuron's frequencies on whitened axes, in turns."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
 
 
 @wp.func
-def _longest(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
+def _longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
     """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes."""
     bound, one = d(1.0), d(1.0)
     if r.tc != d(0.0):
@@ -160,7 +160,7 @@ def _longest(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
 
 
 @wp.func
-def _choose(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
+def _choose_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
     """An array would be a stack: its index is not known to the compiler."""
     number = hard
     if edge == 1:
@@ -173,17 +173,17 @@ def _choose(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
 @wp.func
 def _is_too_faint(most: wp.float64, edge: int, least: wp.float64):
     """Whether no chord can reach the depth ``least``, however long."""
-    return most <= d(0.0) or most * _choose(edge, _N0, _N1, _N2) <= least
+    return most <= d(0.0) or most * _choose_by_edge(edge, _N0, _N1, _N2) <= least
 
 
 @wp.func
 def _visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
     """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
-    square, share = d(0.0), least / (most * _choose(edge, _N0, _N1, _N2) * bound)
-    if share <= _choose(edge, _W0, _W1, _W2):
+    square, share = d(0.0), least / (most * _choose_by_edge(edge, _N0, _N1, _N2) * bound)
+    if share <= _choose_by_edge(edge, _W0, _W1, _W2):
         square = d(1.0)
     elif share < d(1.0):
-        square = rounded(d(1.0) - wp.exp(wp.log(share) * _choose(edge, _P0, _P1, _P2)))
+        square = round_to_float32(d(1.0) - wp.exp(wp.log(share) * _choose_by_edge(edge, _P0, _P1, _P2)))
     return square
 
 
@@ -225,32 +225,33 @@ def prepare_kernel(double: bool) -> Any:
             counts[0, i] = 0
             counts[1, i] = 0
             return
-        v = view_of(matrix, intrinsics, near)
+        v = load_view(matrix, intrinsics, near)
         p = project_primitive(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
-        r = whiten(p, v)
+        r = whiten_rays(p, v)
         m, z, ux, uy = p.m, p.centre[2], p.anchor[1], p.anchor[2]
         offset = d(b2[i])
         biggest = wp.max(
-            wp.max(_largest(r.xa), _largest(r.e0)), wp.max(wp.max(r.tc, wp.abs(r.near)), wp.max(m, wp.abs(offset)))
+            wp.max(_largest_component(r.xa), _largest_component(r.e0)),
+            wp.max(wp.max(r.tc, wp.abs(r.near)), wp.max(m, wp.abs(offset))),
         )
         total = r.tc + r.near + m + offset
         for a in range(3):
             total += r.e0[a] + r.ex[a] + r.ey[a] + r.xa[a]
         fastest = d(0.0)
         for k in range(neurons):
-            wave, phase, amplitude = _wave(wp.vec3d(W1[i, k]), p, turns), turns * d(b1[i, k]), d(w2[i, k])
+            wave, phase, amplitude = _whitened_frequency(wp.vec3d(W1[i, k]), p, turns), turns * d(b1[i, k]), d(w2[i, k])
             speed = wp.sqrt(wp.dot(wave, wave))
             fastest = wp.max(fastest, speed)
             biggest = wp.max(biggest, wp.max(speed, wp.abs(amplitude)))
             total += speed + phase + amplitude
-            _put(rows, i, _NEURONS + k, wave, phase - wp.rint(phase))
+            _store_vector(rows, i, _NEURONS + k, wave, phase - wp.rint(phase))
         column = _NEURONS + neurons
         for q in range((neurons + 3) // 4):
             four = wp.vec4()
             for j in range(4):
                 if 4 * q + j < neurons:
                     four[j] = f(w2[i, 4 * q + j])
-            store(rows, i, column + q, four[0], four[1], four[2], four[3])
+            store_float4(rows, i, column + q, four[0], four[1], four[2], four[3])
         column += (neurons + 3) // 4
         for q in range((channels + 3) // 4):
             four = wp.vec4()
@@ -258,7 +259,7 @@ def prepare_kernel(double: bool) -> Any:
                 if 4 * q + j < channels:
                     four[j] = palette[i, 4 * q + j]
                     total += d(four[j])
-            store(rows, i, column + q, four[0], four[1], four[2], four[3])
+            store_float4(rows, i, column + q, four[0], four[1], four[2], four[3])
 
         in_float64 = wp.int32(0)
         thinnest, ratio = wp.min(wp.min(p.axes[0], p.axes[1]), p.axes[2]), _RATIO
@@ -275,13 +276,13 @@ def prepare_kernel(double: bool) -> Any:
         if forced:
             if forced[i]:
                 in_float64 = 1
-        s22 = _spread(p, 2, 2)
+        s22 = _covariance(p, 2, 2)
         reach = wp.sqrt(m * m * s22)
         if edge > 0 and z - reach < near + _CUT * reach:  # only there are integrals of cut chords with a soft edge
             in_float64 = 1
 
         state, box, tiles = int(_CULLED), wp.vec4i(), wp.int32(0)
-        o = Outline()
+        o = SilhouetteSpans()
         if not wp.isfinite(total):
             state = int(_NON_FINITE)
         elif z + reach > near:
@@ -294,14 +295,21 @@ def prepare_kernel(double: bool) -> Any:
                 o.hx = _UNBOUNDED
                 o.hy = _UNBOUNDED
                 if z - reach > d(1e-3) * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
-                    half, one, square = d(0.5), d(1.0), _visible_square(most, _longest(p, r, v, reach), edge, least)
+                    half, one, square = (
+                        d(0.5),
+                        d(1.0),
+                        _visible_square(most, _longest_half_chord(p, r, v, reach), edge, least),
+                    )
                     if square == d(0.0):
                         x1 = x0  # nothing can be seen of it
                     else:
-                        across, down = _extent(p, v, 0, s22, square), _extent(p, v, 1, s22, square)
+                        across, down = (
+                            _silhouette_extent(p, v, 0, s22, square),
+                            _silhouette_extent(p, v, 1, s22, square),
+                        )
                         x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
                         y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
-                        o = _outline(p, r, width, height, square)
+                        o = _silhouette_spans(p, r, width, height, square)
                         if o.in_float64 > 0:
                             in_float64 = 1
                 if x1 > x0 and y1 > y0:
@@ -313,20 +321,20 @@ def prepare_kernel(double: bool) -> Any:
             xu, xv, tu, tv = xu + r.tu * r.e0, xv + r.tv * r.e0, d(r.tu), d(r.tv)
         if state != int(_VISIBLE):
             in_float64 = 0
-        _put(rows, i, _E0, r.e0, ux)
-        _put(rows, i, _EX, r.ex, uy)
-        _put(rows, i, _EY, r.ey, r.near)
-        _put(rows, i, _XA, r.xa, offset)
-        _put(rows, i, _XU, xu, tu)
-        _put(rows, i, _XV, xv, tv)
-        store(rows, i, _REST, f(r.tc), f(m), f(p.anchor[0]), f(in_float64))
-        store(spans, i, 0, f(o.skew), f(o.xc), f(o.yc), f(o.hx))
-        store(spans, i, 1, f(o.hy), f(0.0), f(0.0), f(0.0))
+        _store_vector(rows, i, _E0, r.e0, ux)
+        _store_vector(rows, i, _EX, r.ex, uy)
+        _store_vector(rows, i, _EY, r.ey, r.near)
+        _store_vector(rows, i, _XA, r.xa, offset)
+        _store_vector(rows, i, _XU, xu, tu)
+        _store_vector(rows, i, _XV, xv, tv)
+        store_float4(rows, i, _REST, f(r.tc), f(m), f(p.anchor[0]), f(in_float64))
+        store_float4(spans, i, 0, f(o.skew), f(o.xc), f(o.yc), f(o.hx))
+        store_float4(spans, i, 1, f(o.hy), f(0.0), f(0.0), f(0.0))
         boxes[i] = box
         depth[i] = z
         status[i] = wp.uint8(state)
         if state == int(_VISIBLE):
-            e = ellipse(spans[i, 0], spans[i, 1][0], f(ux), f(uy), box)
+            e = silhouette_ellipse(spans[i, 0], spans[i, 1][0], f(ux), f(uy), box)
             for ty in range(box[1] // _TILE, (box[3] - 1) // _TILE + 1):
                 lo_hi = tile_range(e, ty)
                 tiles += wp.max(lo_hi[1] - lo_hi[0], 0)
@@ -339,7 +347,7 @@ def prepare_kernel(double: bool) -> Any:
 
 
 @wp.func
-def _put_wide(wide: Doubles2d, n: int, column: int, v: wp.vec3d):
+def _store_wide_vector(wide: Doubles2d, n: int, column: int, v: wp.vec3d):
     for a in range(3):
         wide[n, column + a] = v[a]
 
@@ -357,15 +365,15 @@ def wide_kernel(double: bool) -> Any:
     ):  # fmt: skip
         n = wp.tid()
         i = which[n]
-        v = view_of(matrix, intrinsics, near)
+        v = load_view(matrix, intrinsics, near)
         p = project_primitive(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
-        r = whiten(p, v)
-        _put_wide(wide, n, W.E0, r.e0)
-        _put_wide(wide, n, W.EX, r.ex)
-        _put_wide(wide, n, W.EY, r.ey)
-        _put_wide(wide, n, W.XA, r.xa)
-        _put_wide(wide, n, W.XU, r.tc * r.ex + r.tu * r.e0)
-        _put_wide(wide, n, W.XV, r.tc * r.ey + r.tv * r.e0)
+        r = whiten_rays(p, v)
+        _store_wide_vector(wide, n, W.E0, r.e0)
+        _store_wide_vector(wide, n, W.EX, r.ex)
+        _store_wide_vector(wide, n, W.EY, r.ey)
+        _store_wide_vector(wide, n, W.XA, r.xa)
+        _store_wide_vector(wide, n, W.XU, r.tc * r.ex + r.tu * r.e0)
+        _store_wide_vector(wide, n, W.XV, r.tc * r.ey + r.tv * r.e0)
         wide[n, W.TC] = r.tc
         wide[n, W.TU] = r.tu
         wide[n, W.TV] = r.tv
@@ -377,7 +385,7 @@ def wide_kernel(double: bool) -> Any:
         wide[n, W.ANCHOR_Z] = p.anchor[0]
         for k in range(neurons):
             column, phase = W.NEURONS + W.PER_NEURON * k, turns * d(b1[i, k])
-            _put_wide(wide, n, column, _wave(wp.vec3d(W1[i, k]), p, turns))
+            _store_wide_vector(wide, n, column, _whitened_frequency(wp.vec3d(W1[i, k]), p, turns))
             wide[n, column + W.PHASE] = phase - wp.rint(phase)
             wide[n, column + W.AMPLITUDE] = d(w2[i, k])
 

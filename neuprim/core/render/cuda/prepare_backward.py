@@ -7,10 +7,21 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import Doubles, Doubles2d, Floats, Floats2d, Vec3s, Vec3s2d, Vec4s, array, launch, wp
+from neuprim.core.compute.warp import (
+    Doubles,
+    Doubles2d,
+    Floats,
+    Floats2d,
+    Vec3s,
+    Vec3s2d,
+    Vec4s,
+    array,
+    launch_kernel,
+    wp,
+)
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import Frame, as_arrays
-from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, project_primitive, view_of, whiten
+from neuprim.core.render.cuda.frame import Frame, parameter_arrays
+from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, load_view, project_primitive, whiten_rays
 from neuprim.core.render.layout import E0, EX, EY, XA
 
 d, f = wp.float64, wp.float32
@@ -19,7 +30,7 @@ _G_OFFSET, _G_LOG_M, _G_WEIGHT, _G_NEURONS, _PER_NEURON = L.G_OFFSET, L.G_LOG_M,
 
 
 @wp.func
-def _three(grads: Floats2d, i: int, column: int):
+def _load_gradient_vector(grads: Floats2d, i: int, column: int):
     return wp.vec3d(d(grads[i, column]), d(grads[i, column + 1]), d(grads[i, column + 2]))
 
 
@@ -43,7 +54,7 @@ def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
 
 
 @functools.cache
-def _kernel(double: bool) -> Any:
+def _prepare_backward_kernel(double: bool) -> Any:
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -56,13 +67,16 @@ def _kernel(double: bool) -> Any:
     ):  # fmt: skip
         i = wp.tid()
         if grads[i, _G_WEIGHT] > f(0.0):
-            v = view_of(matrix, intrinsics, near)
+            v = load_view(matrix, intrinsics, near)
             mean, logs, quat = wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
             p = project_primitive(mean, logs, quat, v)
-            r = whiten(p, v)
-            gx = _three(grads, i, _XA)
-            gA = wp.outer(_three(grads, i, _E0), r.ref) + wp.outer(gx, r.w)
-            ge, gy = _three(grads, i, _EX) / v.focal[0], _three(grads, i, _EY) / v.focal[1]
+            r = whiten_rays(p, v)
+            gx = _load_gradient_vector(grads, i, _XA)
+            gA = wp.outer(_load_gradient_vector(grads, i, _E0), r.ref) + wp.outer(gx, r.w)
+            ge, gy = (
+                _load_gradient_vector(grads, i, _EX) / v.focal[0],
+                _load_gradient_vector(grads, i, _EY) / v.focal[1],
+            )
             gB, gl = wp.mat33d(), wp.vec3d()  # dL/dB, dL/d log_scales
             for a in range(3):
                 row = wp.vec3d(gA[a, 0] + ge[a], gA[a, 1] + gy[a], gA[a, 2])
@@ -74,7 +88,7 @@ def _kernel(double: bool) -> Any:
             gL = wp.mat33d()  # dL/d rotation
             for k in range(neurons):
                 column, W = _G_NEURONS + _PER_NEURON * k, wp.vec3d(W1[i, k])
-                gw = turns * wp.cw_mul(_three(grads, i, column), p.axes)
+                gw = turns * wp.cw_mul(_load_gradient_vector(grads, i, column), p.axes)
                 gL += wp.outer(W, gw)
                 scaled = wp.cw_mul(gw, wp.transpose(p.local) * W)  # W on whitened axes scales with s_j/m
                 gl += scaled
@@ -122,12 +136,12 @@ def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tu
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in frame.parameters)
     g_view = torch.empty(grads.shape[0], 12, dtype=torch.float64, device=grads.device) if want_view else None
     p = frame.projection
-    launch(
-        _kernel(frame.double), grads.shape[0],
+    launch_kernel(
+        _prepare_backward_kernel(frame.double), grads.shape[0],
         (
             *frame.inputs, array(p.matrix, wp.float64), p.intrinsics, p.near, p.turns, frame.neurons,
             array(grads.contiguous(), wp.float32),
-            *as_arrays(out), None if g_view is None else array(g_view, wp.float64),
+            *parameter_arrays(out), None if g_view is None else array(g_view, wp.float64),
         ), grads.device, PER_BLOCK,
     )  # fmt: skip
     return out, None if g_view is None else g_view.sum(0).view(3, 4)

@@ -38,7 +38,7 @@ def cos_turns(y: float):
     return (((((_C6 * y + _C5) * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + _C0
 
 
-def _polynomial(coefficients: tuple[float, ...]) -> Function:
+def _warp_polynomial(coefficients: tuple[float, ...]) -> Function:
     c0, c1, c2, c3, c4, c5 = coefficients
 
     @wp.func
@@ -48,7 +48,7 @@ def _polynomial(coefficients: tuple[float, ...]) -> Function:
     return polynomial
 
 
-_B = tuple(_polynomial(c) for c in BANDS)
+_B = tuple(_warp_polynomial(c) for c in BANDS)
 _sinc = _B[0]
 
 
@@ -58,7 +58,7 @@ def sin_turns(r: float):
     return TAU * r * _sinc(r * r)
 
 
-def band_of(edge: int) -> tuple[Function, Function]:
+def edge_profiles(edge: int) -> tuple[Function, Function]:
     """Warp functions v -> B_p and v -> (B_p, B_(p+1)), p = 0, 1, 2, for any v."""
     low, high = _B[edge], _B[edge + 1]
 
@@ -98,7 +98,7 @@ def band_of(edge: int) -> tuple[Function, Function]:
 
 
 @wp.func
-def opacity(I: float):  # type: ignore[no-untyped-def]
+def opacity_of_depth(I: float):  # type: ignore[no-untyped-def]
     """1 - exp(-I), I >= 0; a faint one keeps its digits, which the difference would lose."""
     if I < 0.25:
         return I * (((((-I / 720.0 + 1.0 / 120.0) * I - 1.0 / 24.0) * I + 1.0 / 6.0) * I - 0.5) * I + 1.0)

@@ -55,7 +55,7 @@ class _Contributions(torch.autograd.Function):
         return grad, None, None, None
 
 
-class _Prepared:
+class _PreparedPrimitives:
     """Per-primitive quantities of one view, in float64, in camera axes."""
 
     def __init__(self, lowered: Lowered, camera: AnyCamera) -> None:
@@ -78,7 +78,7 @@ class _Prepared:
 
 def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
     """Draw a frame in float64 and return it in the model's dtype; see :data:`neuprim.core.render.draw.Draw`."""
-    frame = _Prepared(lowered, camera)
+    frame = _PreparedPrimitives(lowered, camera)
     count = lowered.geometry.count
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
     channels = lowered.colour.channels
@@ -91,7 +91,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
             rays, touched = seen.block(y0, x0, h, w)
             ys, xs = torch.meshgrid(torch.arange(y0, y0 + h), torch.arange(x0, x0 + w), indexing="ij")
             pixels = (ys * camera.width + xs).reshape(-1)
-            out = _trace(lowered, frame, rays, touched, pixels, channels, settings, stats)
+            out = _trace_block(lowered, frame, rays, touched, pixels, channels, settings, stats)
             line.append(out.reshape(h, w, channels + 2))
         rows_of_blocks.append(torch.cat(line, 1))
     image = (
@@ -108,10 +108,10 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 
-def _trace(
+def _trace_block(
     lowered: Lowered,
-    frame: _Prepared,
-    rays: Rays,
+    frame: _PreparedPrimitives,
+    rays: ReferenceRays,
     rows: Tensor,
     pixels: Tensor,
     channels: int,
@@ -198,7 +198,7 @@ def _trace(
 
 
 @dataclass(frozen=True)
-class Rays:
+class ReferenceRays:
     """Rays from the camera centre, float64."""
 
     directions: Tensor  # (..., 3) unit vectors in camera axes; a zero vector meets nothing
@@ -209,17 +209,19 @@ class Rays:
 class FrameRays(ABC):
     """The rays (H, W) of one frame, and its primitives front to back."""
 
-    rays: Rays  # one per pixel
+    rays: ReferenceRays  # one per pixel
     order: Tensor  # (N,) primitive rows, front to back
 
     @abstractmethod
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:
         """(N,) whether a ray of the h x w pixels at (y, x) may meet each primitive; never false for one that is met."""
 
-    def block(self, y: int, x: int, h: int, w: int) -> tuple[Rays, Tensor]:
+    def block(self, y: int, x: int, h: int, w: int) -> tuple[ReferenceRays, Tensor]:
         """The h*w rays of a block of pixels, flat, and the rows they may meet, front to back."""
         window, r = (slice(y, y + h), slice(x, x + w)), self.rays
-        rays = Rays(r.directions[window].reshape(-1, 3), r.near[window].reshape(-1), r.depth[window].reshape(-1))
+        rays = ReferenceRays(
+            r.directions[window].reshape(-1, 3), r.near[window].reshape(-1), r.depth[window].reshape(-1)
+        )
         return rays, self.order[self.touched(y, x, h, w)[self.order]]
 
 
@@ -232,12 +234,12 @@ def pixel_directions(camera: Camera) -> Tensor:
     return d / d.norm(dim=-1, keepdim=True)
 
 
-class _Pinhole(FrameRays):
+class _PinholeRays(FrameRays):
     """Near is a camera-z plane, depth is camera-z, the order is that of the centres' z, the cull exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = pixel_directions(camera)
-        self.rays = Rays(d, near / d[..., 2], d[..., 2])
+        self.rays = ReferenceRays(d, near / d[..., 2], d[..., 2])
         with torch.no_grad():
             self.order = torch.argsort(center[:, 2], stable=True)
             self.boxes = screen_boxes(geometry, camera, near)
@@ -247,12 +249,12 @@ class _Pinhole(FrameRays):
         return (b[:, 0] < x + w) & (b[:, 2] > x) & (b[:, 1] < y + h) & (b[:, 3] > y)
 
 
-class _Central(FrameRays):
+class _CentralRays(FrameRays):
     """Near, depth and the order are distances from the camera; the cull is a cone round each block's rays."""
 
     def __init__(self, camera: RayCamera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = camera.directions.double()
-        self.rays = Rays(d, torch.full_like(d[..., 0], near), torch.ones_like(d[..., 0]))
+        self.rays = ReferenceRays(d, torch.full_like(d[..., 0], near), torch.ones_like(d[..., 0]))
         with torch.no_grad():
             distance = center.norm(dim=-1)
             self.order = torch.argsort(distance, stable=True)
@@ -276,7 +278,7 @@ class _Central(FrameRays):
 
 def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
     """The frame's rays; ``center`` (N, 3) are the primitives' centres in camera axes, float64."""
-    make = _Central if isinstance(camera, RayCamera) else _Pinhole
+    make = _CentralRays if isinstance(camera, RayCamera) else _PinholeRays
     return make(camera, geometry, center, near)  # type: ignore[arg-type]
 
 

@@ -20,7 +20,7 @@ from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, Vie
 from neuprim.core.data.dataset import PointSamples, PointSupervision
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
-from neuprim.core.io.plain import read_arrays
+from neuprim.core.io.plain import read_npz_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
@@ -245,7 +245,7 @@ _POINTS_FILE = {
 def read_points_file(path: Path, *names: str) -> dict[str, Any]:
     """Read arrays of a frame's points file; DataError if it is damaged."""
     try:
-        return read_arrays(path, {name: _POINTS_FILE[name] for name in names})
+        return read_npz_arrays(path, {name: _POINTS_FILE[name] for name in names})
     except DataError as error:
         raise DataError(f"{error}; delete its folder to render the frame again") from error
 
@@ -320,7 +320,7 @@ class MediumVoxels:
         Raises:
             DataError: damaged, or not the voxels of a grid.
         """
-        found = read_arrays(path, _VOXEL_ARRAYS)
+        found = read_npz_arrays(path, _VOXEL_ARRAYS)
         index, values, matrix = found["index"], found["values"], found["scene_from_index"]
         x, y, z = (int(n) for n in found["shape"])
         ascending = not len(index) or (index[0] >= 0 and index[-1] < x * y * z and bool((np.diff(index) > 0).all()))

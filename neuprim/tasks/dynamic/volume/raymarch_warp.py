@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
 
 d, f = wp.float64, wp.float32
 _LOW, _HIGH = 0.5 - math.sqrt(3.0) / 6.0, 0.5 + math.sqrt(3.0) / 6.0
@@ -237,7 +237,7 @@ def march_images(
     image = torch.empty(size[1] * size[0], 4, dtype=torch.float32, device=values.device)
     arrays = (array(values, wp.vec4), array(skips, wp.uint8), array(pose, d), array(lens, d))
     inputs = (*arrays, wp.vec2i(*size), samples, subdivisions, array(image, wp.vec4))
-    launch(_image_kernel(), size[1] * size[0], inputs, values.device)
+    launch_kernel(_image_kernel(), size[1] * size[0], inputs, values.device)
     return image.view(size[1], size[0], 4)
 
 
@@ -249,5 +249,5 @@ def march_depths(sigma: Tensor, skips: Tensor, way: Tensor) -> Tensor:
     """
     result = torch.zeros_like(sigma)
     inputs = (array(sigma, f), array(skips, wp.uint8), array(way, d), array(result, f))
-    launch(_depth_kernel(), sigma.shape, inputs, sigma.device)
+    launch_kernel(_depth_kernel(), sigma.shape, inputs, sigma.device)
     return result

@@ -110,10 +110,10 @@ def test_blocks_may_be_of_any_size(
         called = kernel.key.partition("__")[0]
         one = isinstance(dim, Sequence) and len(dim) == 2 and dim[1] == block
         (together if one else changed).add(called)
-        warp.launch(kernel, dim, inputs, device, block if one else threads)
+        warp.launch_kernel(kernel, dim, inputs, device, block if one else threads)
 
     for module in (binning, frame, colour_net, backend, prepare_backward):
-        monkeypatch.setattr(module, "launch", through)
+        monkeypatch.setattr(module, "launch_kernel", through)
     assert_same_bits(plain[name], everything(name))
     assert {"row_spans", "sum_pairs", "_kernels", "_kernel"} <= changed  # of those made in a function, its name
     assert {"forward_kernel", "pairs_kernel"} <= together

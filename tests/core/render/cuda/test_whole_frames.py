@@ -14,7 +14,7 @@ import torch
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.cuda.backend import Composited
+from neuprim.core.render.cuda.backend import CompositedFrame
 from neuprim.core.render.cuda.frame import Frame
 from tests import scenes
 from tests.backends import by
@@ -22,7 +22,7 @@ from tests.backends import by
 
 def frames_alive() -> int:
     gc.collect()
-    return sum(type(x) in (Composited, Frame) for x in gc.get_objects())
+    return sum(type(x) in (CompositedFrame, Frame) for x in gc.get_objects())
 
 
 def frame(backend: str = "cuda", **knobs: Any) -> tuple[RenderOutput, torch.Tensor]:

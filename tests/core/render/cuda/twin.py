@@ -13,13 +13,13 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.render import layout as P
-from neuprim.core.render.cpu.backend import _view
+from neuprim.core.render.cpu.backend import _camera_view
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
-from neuprim.core.render.cpu.prepare import Parameters, Projected, View, prepare, prepare_wide
+from neuprim.core.render.cpu.prepare import PrimitiveArrays, Projected, View, prepare_primitives, prepare_wide
 from neuprim.core.render.cuda.frame import Frame, prepare_frame
 from neuprim.core.render.layout import NON_FINITE, VISIBLE, min_visible_depth
 from neuprim.core.render.output import RenderStats
-from neuprim.core.render.rasterize import PARAMETERS, Request
+from neuprim.core.render.rasterize import PARAMETERS, RasterRequest
 from neuprim.core.settings import RenderSettings
 from tests import scenes
 
@@ -97,7 +97,7 @@ class Numba:
     """What the numba backend makes of a frame; neurons by ``order``."""
 
     case: Case
-    parameters: Parameters
+    parameters: PrimitiveArrays
     view: View
     projected: Projected
     which: Array
@@ -119,11 +119,14 @@ class Numba:
 
 
 def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
-    parameters = Parameters(*(t[name].numpy() for name in PARAMETERS))
+    parameters = PrimitiveArrays(*(t[name].numpy() for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
-    projected, view = Projected.allocate(count, K), _view(case.camera, case.camera.viewmat, case.near, case.turns)
+    projected, view = (
+        Projected.allocate(count, K),
+        _camera_view(case.camera, case.camera.viewmat, case.near, case.turns),
+    )
     projected.order[:], projected.rows[:] = 0, 0  # which are not filled for what is too faint
-    prepare(0, count, parameters, view, case.edge, LEAST, projected)
+    prepare_primitives(0, count, parameters, view, case.edge, LEAST, projected)
     which = np.flatnonzero(projected.in_float64 & (projected.status == VISIBLE))
     wide = np.empty((len(which), projected.rows.shape[1]))
     prepare_wide(0, len(which), which, parameters, view, projected.order, wide)
@@ -143,7 +146,7 @@ def both(name: str, device: str) -> tuple[Numba, Frame]:
 def frame_of(case: Case, t: dict[str, Tensor], device: str, forced: Tensor | None = None) -> Frame:
     t = {key: value.to(device) for key, value in t.items()}
     settings = RenderSettings(near=case.near, alpha_min=1 / 255)
-    request = Request(case.camera, case.turns, case.edge, settings, RenderStats("cuda", case.count))
+    request = RasterRequest(case.camera, case.turns, case.edge, settings, RenderStats("cuda", case.count))
     return prepare_frame(request, case.camera.viewmat, t["colors"], [t[name] for name in PARAMETERS], forced)
 
 

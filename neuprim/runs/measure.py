@@ -28,7 +28,7 @@ from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import check_dataset, check_pixels
 from neuprim.core.data.ray_points import GIVE_POINTS
 from neuprim.core.io import images
-from neuprim.core.metrics import means, psnr, psnr_gain, ssim, ssim_3dgs, to_json
+from neuprim.core.metrics import mean_metrics, metric_to_json, psnr, psnr_gain, ssim, ssim_3dgs
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
@@ -241,11 +241,11 @@ def summarize_metrics(
         "dataset": dataset.name,
         "preset": config.preset,
         "split": split,
-        **to_json("psnr", float(np.mean([v.psnr for v in views]))),
+        **metric_to_json("psnr", float(np.mean([v.psnr for v in views]))),
         "ssim": float(np.mean([v.ssim for v in views])),
-        **means([v.more for v in views]),
+        **mean_metrics([v.more for v in views]),
         **_lpips_entries(views, lpips),
-        **to_json("psnr_worst", worst.psnr),
+        **metric_to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
         "worse_than_black_image": [v.name for v in views if v.psnr < min(v.black, _VISIBLE_PSNR)],
         "per_view": [_view_entry(v) for v in views],
@@ -282,9 +282,9 @@ def summarize_metrics(
 
 
 def _view_entry(view: ViewMetrics) -> dict[str, Any]:
-    entry = {"name": view.name, **to_json("psnr", view.psnr), "ssim": view.ssim, "seconds": view.seconds}
+    entry = {"name": view.name, **metric_to_json("psnr", view.psnr), "ssim": view.ssim, "seconds": view.seconds}
     for name, value in view.more.items():
-        entry |= to_json(name, value)
+        entry |= metric_to_json(name, value)
     return entry
 
 
@@ -306,10 +306,10 @@ def _frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[st
         return {}
     frames = []
     for same in zip(*own, strict=True):
-        entry = to_json("psnr", float(np.mean([v.psnr for v in same])))
+        entry = metric_to_json("psnr", float(np.mean([v.psnr for v in same])))
         entry["ssim"] = float(np.mean([v.ssim for v in same]))
         for name in ("psnr_mask", "psnr_black_image"):
             if values := [v.more[name] for v in same if name in v.more]:
-                entry |= to_json(name, float(np.mean(values)))
+                entry |= metric_to_json(name, float(np.mean(values)))
         frames.append(entry)
     return {"per_frame": frames}

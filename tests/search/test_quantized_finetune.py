@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuprim.config import Job
-from neuprim.core.compression import Quantizers, bit_table, canonicalize, fit_quantizers
+from neuprim.core.compression import Quantizers, bit_table, canonical_model, fit_quantizers
 from neuprim.core.compression.quantizers import ColumnQuantizer
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
@@ -115,7 +115,7 @@ def equal(a: Primitives, b: Primitives) -> bool:
 
 def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, data: TrainingData) -> None:
     model, quality = load_run(run_dir).model, TrainingQuality(data.dataset, data.config.renderer)
-    table, plain = bit_table(5, [], model.specs), canonicalize(model)
+    table, plain = bit_table(5, [], model.specs), canonical_model(model)
     at_once = quality(dequantize(plain, fit_quantizers(plain, table)))
     fewer, again = (finetune_for_table(data, model, table, 150, ignore) for _ in range(2))
     assert fewer.steps == 150 and fewer.notes == () and equal(again.model, fewer.model)
@@ -129,7 +129,7 @@ def test_a_tolerance_is_kept(run_dir: Path, data: TrainingData, steps: int) -> N
     for allowed in (0.1, 0.5):
         fewer = quantize_within(data, model, allowed, steps, ignore)
         assert base - quality(dequantize(fewer.model, fewer.quantizers)) <= allowed + 1e-6
-        assert torch.equal(fewer.model.params["W1"], canonicalize(model).params["W1"]) == (steps == 0)
+        assert torch.equal(fewer.model.params["W1"], canonical_model(model).params["W1"]) == (steps == 0)
 
 
 def test_training_that_spoils_the_model_is_not_stored(
@@ -142,7 +142,7 @@ def test_training_that_spoils_the_model_is_not_stored(
     assert equal(found.model, plain.model) and found.notes == plain.notes and found.steps == 20
     fewer = finetune_for_table(data, model, bit_table(1, [], model.specs), 20, ignore)
     assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
-    assert equal(fewer.model, canonicalize(model))
+    assert equal(fewer.model, canonical_model(model))
 
 
 @pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.compression.bits import LEVELS
-from neuprim.core.compression.codec import canonicalize, fake_quantize, fit_quantizers
+from neuprim.core.compression.codec import canonical_model, fake_quantize, fit_quantizers
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -162,7 +162,7 @@ def test_labels_survive_every_level_of_compression() -> None:
     count = 40
     seams = tuple((n / count, (n + 0.5) / count) for n in range(1, count))
     whole = join_chunks([three()[0]] * count, range(count), seams)
-    small = canonicalize(whole)
+    small = canonical_model(whole)
     for table in LEVELS.values():
         back = fake_quantize(small.params, fit_quantizers(small, table))["chunk"]
         assert torch.equal(back.round(), small.params["chunk"])

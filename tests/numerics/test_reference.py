@@ -16,7 +16,7 @@ from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
 from tests.backends import BACKENDS, FAST, by
 from tests.numerics.cases import case
-from tests.numerics.test_fuzz import render_block
+from tests.numerics.wild import render_block
 
 OPAQUE = CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)
 

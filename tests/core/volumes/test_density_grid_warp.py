@@ -70,7 +70,7 @@ def test_blocks_may_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
             genuine(kernel, dim, (density_grid_warp.array(alone, inputs[0].dtype), *inputs[1:]), where, block)
             blocks.append(tile)
 
-    monkeypatch.setattr(density_grid_warp, "launch", one_by_one)
+    monkeypatch.setattr(density_grid_warp, "launch_kernel", one_by_one)
     assert torch.equal(filled(), whole) and len(blocks) == 6 * 3 * 4
 
 

@@ -299,10 +299,10 @@ def _find_vdb_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return files, frames in their order, and notes on the folder."""
     if not path.is_dir():
         return [path], []
-    from neuprim.core.io.vdb import sequence
+    from neuprim.core.io.vdb import vdb_sequence
 
     try:
-        frames = sequence(path)
+        frames = vdb_sequence(path)
     except DataError as error:
         files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
         if not files:

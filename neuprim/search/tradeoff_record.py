@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from neuprim.core.io.files import read_json_record, write_json, write_text
-from neuprim.core.metrics import from_json, to_json
+from neuprim.core.metrics import metric_from_json, metric_to_json
 from neuprim.core.validation import Range, coerce, validate
 from neuprim.search.pareto import Objectives, pareto_front
 
@@ -122,7 +122,9 @@ class TradeoffPoint:
     def to_dict(self) -> dict[str, Any]:
         """Return JSON-able values; times are derived, for readers of the file."""
         fields = asdict(self)
-        quality = {key: entry for name, value in self.quality.items() for key, entry in to_json(name, value).items()}
+        quality = {
+            key: entry for name, value in self.quality.items() for key, entry in metric_to_json(name, value).items()
+        }
         data = {"name": self.name, "quality": quality, **{name: fields[name] for name in _DRAWN}}
         if self.run_dir:
             data |= {name: fields[name] for name in _TRAINED} | {"ms_per_step": self.ms_per_step}
@@ -135,7 +137,7 @@ class TradeoffPoint:
     def from_dict(cls, data: Mapping[str, Any]) -> TradeoffPoint:
         """Invert :meth:`to_dict`; raises KeyError, TypeError, ValueError or ConfigError for anything else."""
         names = [name.removesuffix("_infinite") for name in data["quality"]]
-        quality = {name: value for name in names if (value := from_json(data["quality"], name)) is not None}
+        quality = {name: value for name in names if (value := metric_from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in (*_DRAWN, *(_TRAINED if data.get("run_dir") else ()))}
         return replace(validate(cls, {**own, "quality": {}}, "points"), quality=quality)
 

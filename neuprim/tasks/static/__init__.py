@@ -48,8 +48,8 @@ class SphericalHarmonics(ColourField):
         self.active = min(self.degree, int(progress / self.sh_every + 1e-9)) if self.sh_every > 0 else self.degree
 
     def parameters(self) -> list[ParameterSpec]:
-        C, rest = self.channels, sh.coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 2e-2, lambda c: sh.initial_dc(c.colors))]
+        C, rest = self.channels, sh.sh_coefficient_count(self.degree) - 1
+        specs = [ParameterSpec("sh_dc", (C,), 2e-2, lambda c: sh.initial_sh_dc(c.colors))]
         if rest:
             specs.append(ParameterSpec("sh_rest", (rest, C), 2e-3, lambda c: torch.zeros(c.count, rest, C)))
         return specs
@@ -60,20 +60,22 @@ class SphericalHarmonics(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[SphericalHarmonics, dict[str, Tensor]]:
-        return SphericalHarmonics(value, self.channels), sh.truncate_bands(params, "sh_rest", value)
+        return SphericalHarmonics(value, self.channels), sh.truncate_sh_bands(params, "sh_rest", value)
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
         return params["sh_dc"], params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients, each of one channel."""
-        return sh.coefficients(self.degree, self.channels, "sh_rest")
+        return sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest")
 
     def script(self) -> str:
         return read_script(__package__, "fields.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
-        return Constant(sh.colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active))
+        return Constant(
+            sh.sh_colors(geometry.means, params["sh_dc"], params.get("sh_rest"), camera.position, self.active)
+        )
 
 
 def _build_static_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.ply import PlyElement, read_elements
+from neuprim.core.io.ply import PlyElement, read_ply_elements
 from neuprim.core.notices import warn_once
 from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
@@ -57,7 +57,7 @@ def read_ply_mesh(folder: ModelFolder) -> Model:
 
 def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     """Read all triangles and count the vertices."""
-    elements = read_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
+    elements = read_ply_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
     vertices = elements["vertex"]
     if not {"x", "y", "z"} <= set(vertices.names):
         raise DataError(f"{path}: vertices have no x, y, z but {', '.join(vertices.names)[:80]}; expected a mesh")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from neuprim.core.conditions import flag
 from neuprim.core.io.files import write_text
-from neuprim.core.metrics import from_json
+from neuprim.core.metrics import metric_from_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import report_page as page
 from neuprim.report.charts import HELD_OUT, Chart, Points, curve_chart, view_chart
@@ -145,11 +145,11 @@ def _report_headline(run: RunRecord) -> str:
 
 
 def _report_final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
-    mean, worst, ssim = (from_json(metrics, key) for key in ("psnr", "psnr_worst", "ssim"))
+    mean, worst, ssim = (metric_from_json(metrics, key) for key in ("psnr", "psnr_worst", "ssim"))
     views, split = len(per_view(run)), escape(metrics.get("split") or "held-out")
     shown = f"{format_count(views)} {split} view{'s' if views != 1 else ''}" if views else ""
     empty, worst_name = metrics.get("views_empty"), _worst_view_name(run)
-    displayed = from_json(metrics, "ssim_3dgs")
+    displayed = metric_from_json(metrics, "ssim_3dgs")
     rule = "" if displayed is None else f"; as displayed, by 3DGS’s rule: {format_decimal(displayed, 4)}"
     each, steps = metrics.get("parameters_per_primitive"), metrics.get("iterations")
     per_primitive = "" if each is None else f"{format_count(each)} per primitive"
@@ -177,17 +177,17 @@ def _decibel_tile(label: str, value: float | None, text: str) -> Tile:
 
 
 def _report_lpips_tile(metrics: Mapping[str, object]) -> list[Tile]:
-    value, reasons = from_json(metrics, "lpips"), metrics.get("not_measured")
+    value, reasons = metric_from_json(metrics, "lpips"), metrics.get("not_measured")
     if value is None:
         reason = reasons.get("lpips") if isinstance(reasons, Mapping) else None
         return [] if reason is None else [("LPIPS", MISSING, "", f"not measured: {escape(reason)}")]
-    rule = from_json(metrics, "lpips_3dgs")
+    rule = metric_from_json(metrics, "lpips_3dgs")
     more = "" if rule is None else f"; by 3DGS’s rule: {format_decimal(rule, 4)}"
     return [("LPIPS", format_decimal(value, 4), "", f"{escape(metrics.get('lpips_network'))}, mean over views{more}")]
 
 
 def _report_mask_tile(metrics: Mapping[str, object]) -> list[Tile]:
-    inside, black = from_json(metrics, "psnr_mask"), from_json(metrics, "psnr_black_image_mask")
+    inside, black = metric_from_json(metrics, "psnr_mask"), metric_from_json(metrics, "psnr_black_image_mask")
     if inside is None:
         return []
     compared = "" if black is None else f"; a black image: {format_decimal(black, 1)} dB"
@@ -200,7 +200,7 @@ def _report_volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
     for key, frames in metrics.items():
         if not key.endswith("_frames") or not isinstance(frames, list):
             continue
-        found = [from_json(frame, "max_error") for frame in frames if isinstance(frame, Mapping)]
+        found = [metric_from_json(frame, "max_error") for frame in frames if isinstance(frame, Mapping)]
         errors = [value for value in found if value is not None]
         if errors:
             what = "extinction" if key == "sigma_frames" else escape(key.removesuffix("_frames"))
@@ -227,7 +227,9 @@ def _report_interim_tiles(run: RunRecord) -> list[Tile]:
 
 
 def _worst_view_name(run: RunRecord) -> str | None:
-    known = [(value, entry.get("name")) for entry in per_view(run) if (value := from_json(entry, "psnr")) is not None]
+    known = [
+        (value, entry.get("name")) for entry in per_view(run) if (value := metric_from_json(entry, "psnr")) is not None
+    ]
     name = min(known, key=lambda pair: pair[0])[1] if known else None
     return None if name is None else str(name)
 
@@ -289,8 +291,8 @@ def _report_view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
         figures += page.picture(shown, caption, f"{caption} of view {name}", path is not None)
         compressed = compressed or (shown is not None and shown.compressed)
     numbers = [
-        (format_decimal(from_json(entry, "psnr"), 2), "dB PSNR"),
-        (format_decimal(from_json(entry, "ssim"), 4), "SSIM"),
+        (format_decimal(metric_from_json(entry, "psnr"), 2), "dB PSNR"),
+        (format_decimal(metric_from_json(entry, "ssim"), 4), "SSIM"),
     ]
     if (seconds := as_number(entry.get("seconds"))) is not None:
         numbers.append((format_decimal(seconds, 3), "s to render"))
@@ -321,12 +323,12 @@ def _report_worst_regions(run: RunRecord) -> str:
 
 
 def _report_curves(run: RunRecord) -> str:
-    views = [from_json(entry, "psnr") for entry in per_view(run)]
-    mean, frames = from_json(run.metrics or {}, "psnr"), run.field("per_frame")
+    views = [metric_from_json(entry, "psnr") for entry in per_view(run)]
+    mean, frames = metric_from_json(run.metrics or {}, "psnr"), run.field("per_frame")
     known = [
         (i, value)
         for i, entry in enumerate(frames if isinstance(frames, list) else [])
-        if isinstance(entry, Mapping) and (value := from_json(entry, "psnr")) is not None
+        if isinstance(entry, Mapping) and (value := metric_from_json(entry, "psnr")) is not None
     ]
     film = Points([i for i, _ in known], [value for _, value in known], HELD_OUT)
     lines = [
@@ -364,7 +366,10 @@ def _report_view_table(run: RunRecord) -> str:
         return ""
     rows = []
     for entry in entries:
-        psnr, ssim = format_decimal(from_json(entry, "psnr"), 3), format_decimal(from_json(entry, "ssim"), 5)
+        psnr, ssim = (
+            format_decimal(metric_from_json(entry, "psnr"), 3),
+            format_decimal(metric_from_json(entry, "ssim"), 5),
+        )
         seconds = format_decimal(as_number(entry.get("seconds")), 3)
         rows.append(page.table_row(escape(entry.get("name")), (psnr, ssim, seconds)))
     table = page.number_table(("view", "PSNR, dB", "SSIM", "render, s"), rows)

@@ -12,7 +12,7 @@ from pathlib import Path
 from urllib.parse import quote
 
 from neuprim.core.io.files import write_text
-from neuprim.core.metrics import from_json
+from neuprim.core.metrics import metric_from_json
 from neuprim.report import report_page as page
 from neuprim.report.charts import LARGE, Points, curve_chart
 from neuprim.report.report_page import (
@@ -77,7 +77,7 @@ class SweepRun:
     def numbers(self) -> dict[str, float]:
         """Metric -> value of the single numbers of ``metrics.json``; none of a run that has not finished."""
         metrics = {} if self.run is None else self.run.metrics or {}
-        found = {name: from_json(metrics, name) for name in metrics if not name.endswith("_infinite")}
+        found = {name: metric_from_json(metrics, name) for name in metrics if not name.endswith("_infinite")}
         return {name: value for name, value in found.items() if value is not None}
 
 
@@ -236,7 +236,7 @@ def _views_side_by_side(members: Sequence[tuple[SweepRun, RunRecord]]) -> str:
         for run, record in shown:
             same = next((own for own in record.views if (own.index, own.stem) == (view.index, view.stem)), None)
             if same is not None:
-                psnr, of = format_decimal(from_json(record.view_numbers(same), "psnr"), 2), escape(run.name)
+                psnr, of = format_decimal(metric_from_json(record.view_numbers(same), "psnr"), 2), escape(run.name)
                 caption, attribute = f"{of} <b>{psnr}</b> dB", f' data-run="{of}"'
                 figures += page.figure(same.render, caption, f"view {name}, {of}", attribute)
         html += f'<h3>{name}</h3><div class="pictures">{figures}</div>'

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core.io.files import write_text
 from neuprim.core.io.images import write_png
-from neuprim.core.metrics import from_json
+from neuprim.core.metrics import metric_from_json
 from neuprim.report import report_page as elements
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.report.pictures import InlinedPicture, color_bar, error_map, inline_picture
@@ -80,7 +80,7 @@ class _TradeoffPage:
     # ------------------------------------------------------------ numbers
 
     def quality(self, number: int, name: str = "psnr") -> float:
-        value = from_json(self.points[number]["quality"], name)
+        value = metric_from_json(self.points[number]["quality"], name)
         return math.nan if value is None else value
 
     def ratio(self, number: int) -> float:

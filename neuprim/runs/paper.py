@@ -18,7 +18,7 @@ import yaml
 
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.metrics import from_json
+from neuprim.core.metrics import metric_from_json
 from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
 
 _OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
@@ -193,6 +193,6 @@ def compare_with_paper(
     """
     paper, beside = planned.row.figures[planned.scene], planned.row.beside[1].get(planned.scene)
     for kind, name in _OWN_NAMES.items():
-        ours = from_json(metrics, name) if kind != "lpips" or metrics.get("lpips_network") == "vgg" else None
+        ours = metric_from_json(metrics, name) if kind != "lpips" or metrics.get("lpips_network") == "vgg" else None
         yield kind.upper(), ours, getattr(paper, kind), None if beside is None else getattr(beside, kind)
     yield "primitives", float(metrics["primitives"]), paper.primitives, None

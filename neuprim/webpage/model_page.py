@@ -21,12 +21,12 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.cameras.world import World
-from neuprim.core.compression import bit_table, canonicalize, fit_quantizers, storage_order
-from neuprim.core.compression.quantizers import Rotations
-from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack
+from neuprim.core.compression import bit_table, canonical_model, fit_quantizers, storage_order
+from neuprim.core.compression.quantizers import RotationQuantizer
+from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack_section
 from neuprim.core.conditions import FRAMES
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.edge import EDGES, profile
+from neuprim.core.model.edge import EDGES, edge_profile
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.near_plane import resolve_near
@@ -255,7 +255,7 @@ def shader_constants(edge: int) -> dict[str, list[float]]:
     return {
         "cos": _fit_polynomial(lambda v: np.cos(turn * v)),
         "sinc": _fit_polynomial(lambda v: np.sinc(2 * v)),
-        "edge": _fit_polynomial(lambda v: profile(torch.from_numpy(turn * v), edge).numpy()),
+        "edge": _fit_polynomial(lambda v: edge_profile(torch.from_numpy(turn * v), edge).numpy()),
         "nodes": nodes[_QUADRATURE_POINTS // 2 :].tolist(),
         "weights": weights[_QUADRATURE_POINTS // 2 :].tolist(),
     }
@@ -312,7 +312,7 @@ def _pack_exact(model: Primitives) -> _PackedParameters:
 
 
 def _pack_quantized(model: Primitives, level: int) -> _PackedParameters:
-    model = canonicalize(model)
+    model = canonical_model(model)
     quantizers = fit_quantizers(model, bit_table(level, (), model.specs))
     order = storage_order(model, quantizers)
     packed: _PackedParameters = []
@@ -320,13 +320,13 @@ def _pack_quantized(model: Primitives, level: int) -> _PackedParameters:
         quantizer = quantizers[spec.name]
         codes = quantizer.codes(model.params[spec.name].reshape(model.count, spec.size)[order])
         part: dict[str, Any] = {"name": spec.name, "shape": list(spec.shape)}
-        if isinstance(quantizer, Rotations):
+        if isinstance(quantizer, RotationQuantizer):
             kind = ROTATIONS
             part |= {"coding": "rotations", "bits": quantizer.bits}
         else:
             kind = COLUMNS
             table = {key: getattr(quantizer, key).tolist() for key in ("bits", "low", "high")}
             part |= {"coding": "columns", **table}
-        section = pack(spec.name, spec.shape, quantizer, codes.numpy(), kind)
+        section = pack_section(spec.name, spec.shape, quantizer, codes.numpy(), kind)
         packed.append((part, b"".join(section.planes), quantizer.values(codes).reshape(model.count, *spec.shape)))
     return packed

@@ -14,7 +14,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import OPTIONS, array, launch, wp
+from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
 from neuprim.core.train.ssim_cpu import SSIM_TAPS, SSIM_WINDOW
 
 # ---------------------------------------------------------------- Adam
@@ -120,10 +120,10 @@ def adam_rows(
         groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, own_rates))
     flag = array(bad, wp.int32)
     for total, pointers, ends_, _, _ in groups:
-        launch(check, total, (pointers[1], ends_, flag), device)
+        launch_kernel(check, total, (pointers[1], ends_, flag), device)
     constants = (*betas, *(1 - beta for beta in betas), *map(math.log, betas), array(age, wp.int64), flag)
     for total, pointers, ends_, widths, own_rates in groups:
-        launch(step_numbers, total, (*pointers, ends_, widths, own_rates, *constants), device)
+        launch_kernel(step_numbers, total, (*pointers, ends_, widths, own_rates, *constants), device)
     return int(bad) == 0
 
 
@@ -229,11 +229,11 @@ def ssim_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[
     window = _Window(*SSIM_WINDOW)
     first, second = array(a, wp.float32), array(b, wp.float32)
     along_rows, compare, back_along_columns, gradient = ssim_kernels()
-    launch(along_rows, (H, w, C), (first, second, window, array(rows, _vec5)), device)
-    launch(compare, (h, w, C), (array(rows, _vec5), window, array(S, wp.float32), array(maps, wp.vec3)), device)
-    launch(back_along_columns, (H, w, C), (array(maps, wp.vec3), window, array(columns, wp.vec3)), device)
+    launch_kernel(along_rows, (H, w, C), (first, second, window, array(rows, _vec5)), device)
+    launch_kernel(compare, (h, w, C), (array(rows, _vec5), window, array(S, wp.float32), array(maps, wp.vec3)), device)
+    launch_kernel(back_along_columns, (H, w, C), (array(maps, wp.vec3), window, array(columns, wp.vec3)), device)
     by_l1, by_ssim = (1 - weight) / a.numel(), weight / S.numel()
-    launch(
+    launch_kernel(
         gradient, (H, W, C),
         (first, second, array(columns, wp.vec3), window, by_l1, by_ssim, array(difference, wp.float32),
             array(grad, wp.float32)), device,

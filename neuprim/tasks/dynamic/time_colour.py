@@ -60,8 +60,8 @@ class TimeHarmonics(ColourField):
         self.active = min(self.degree, int(progress / self.sh_every + 1e-9)) if self.sh_every > 0 else self.degree
 
     def parameters(self) -> list[ParameterSpec]:
-        C, rest = self.channels, sh.coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_dc(c.colors))]
+        C, rest = self.channels, sh.sh_coefficient_count(self.degree) - 1
+        specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_sh_dc(c.colors))]
         specs += [ParameterSpec(name, (n, C), 5e-3, _zeros(n, C)) for name, n in self._term_counts() if n]
         return specs + ([ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C))] if rest else [])
 
@@ -78,7 +78,7 @@ class TimeHarmonics(ColourField):
         """Fit fewer terms in time to all terms, by least squares over the sequence."""
         field = TimeHarmonics(**{**self.settings(), name: value})
         if name == "degree":
-            return field, sh.truncate_bands(params, "sh_rest", value)
+            return field, sh.truncate_sh_bands(params, "sh_rest", value)
         times = (torch.arange(_FITTED_TIMES, dtype=torch.float64) + 0.5) / _FITTED_TIMES
         all_terms, fewer_terms = (
             torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times])
@@ -88,7 +88,9 @@ class TimeHarmonics(ColourField):
         fit = torch.linalg.pinv(fewer_terms, rtol=_MIN_SINGULAR) @ all_terms
         stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME_TENSORS if key in params)], 1)
         sizes = {key: len(basis) for key, basis in field._terms(times[0]).items()}
-        dc, *rest = (device.to_like(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
+        dc, *rest = (
+            (device.to_device_like(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
+        )
         others = {key: value for key, value in params.items() if key not in _TIME_TENSORS}
         kept = {key: part.contiguous() for key, part in zip(sizes, rest, strict=True) if sizes[key]}
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
@@ -104,21 +106,21 @@ class TimeHarmonics(ColourField):
         dc, xi = params["sh_dc"], get_frame_time(conditions)
         for name, basis in self._terms(xi).items():
             if name in params:
-                dc = dc + (params[name] * device.to_like(basis, dc)[:, None]).sum(1)
+                dc = dc + (params[name] * device.to_device_like(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
         """Coefficients of the direction, per channel, and single terms in time."""
         terms = ((name, i) for name, count in self._term_counts() for i in range(count))
         units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
-        return (*sh.coefficients(self.degree, self.channels, "sh_rest"), *units)
+        return (*sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest"), *units)
 
     def script(self) -> str:
         return read_script(__package__, "colour.js")
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         dc, rest = self.harmonics(params, conditions)
-        return Constant(sh.colors(geometry.means, dc, rest, camera.position, self.active))
+        return Constant(sh.sh_colors(geometry.means, dc, rest, camera.position, self.active))
 
 
 def _zeros(terms: int, channels: int) -> Any:

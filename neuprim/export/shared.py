@@ -30,7 +30,7 @@ class Harmonics:
     """
 
     def __init__(self, dc: Tensor, rest: Tensor | None, residual: float) -> None:
-        bands = sh.coefficient_count(_DEGREE) - 1
+        bands = sh.sh_coefficient_count(_DEGREE) - 1
         full = torch.zeros(len(dc), bands, dc.shape[1], dtype=torch.float64)
         if rest is not None:
             full[:, : rest.shape[1]] = rest
@@ -38,7 +38,7 @@ class Harmonics:
 
     def evaluate(self, rows: Tensor, directions: Tensor) -> Tensor:
         """Return (P, C) colours of primitives ``rows`` (P,) along unit ``directions`` (P, 3), camera to primitive."""
-        basis = sh.basis(directions.double(), _DEGREE)
+        basis = sh.sh_basis(directions.double(), _DEGREE)
         mixed = basis[:, :1] * self.dc[rows] + (basis[:, 1:, None] * self.rest[rows]).sum(1)
         return (mixed + 0.5).clamp_min(0.0)
 
@@ -47,7 +47,7 @@ class Harmonics:
         if rotation is None:
             return self
         directions = fibonacci_sphere(_DIRECTIONS)
-        after, before = (sh.basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
+        after, before = (sh.sh_basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
         rest = torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest)
         return Harmonics(self.dc, rest, self.residual)
 
@@ -88,7 +88,7 @@ def fit_harmonics(run: TrainedModel, conditions: Conditions) -> Harmonics:
             return Harmonics(exact[0], exact[1], 0.0)
         directions = fibonacci_sphere(_DIRECTIONS)
         seen = torch.stack([_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, C)
-        basis = sh.basis(directions, _DEGREE)
+        basis = sh.sh_basis(directions, _DEGREE)
         fitted = torch.einsum("bv,nvc->nbc", torch.linalg.pinv(basis), seen - 0.5)
         residual = float((torch.einsum("vb,nbc->nvc", basis, fitted) + 0.5 - seen).square().mean().sqrt())
         return Harmonics(fitted[:, 0], fitted[:, 1:], residual)

@@ -18,7 +18,7 @@ from neuprim.config.task_files import Level, read_effort_levels
 from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest, drawn_range, random_condition
 from neuprim.core import checkpoint
 from neuprim.core.channels import find_channels
-from neuprim.core.compression import LEVELS, canonicalize
+from neuprim.core.compression import LEVELS, canonical_model
 from neuprim.core.conditions import read_conditions
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, FormError, NeuprimError
@@ -313,13 +313,13 @@ def _require_equal_tensors(t: TaskUnderTest, where: str, a: dict[str, Tensor], b
 def check_save_load(t: TaskUnderTest) -> None:
     """A model comes back from its files with the same bits and picture; compressing it again changes nothing more."""
     model = t.perturbed_model(torch.float32)
-    canonical = canonicalize(model)
+    canonical = canonical_model(model)
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / "model.safetensors"
         checkpoint.save_model(path, model, t.task.name, {})
         loaded = checkpoint.load_model(path, t.task)[0]
         _require_equal_tensors(t, "after loading", model.params, loaded.params)
-        _require_equal_tensors(t, "after folding twice", canonical.params, canonicalize(canonical).params)
+        _require_equal_tensors(t, "after folding twice", canonical.params, canonical_model(canonical).params)
         for view in t.views[:3]:
             image = t.draw("saved", model, view)
             for where, other, tolerance in (("loading", loaded, 0.0), ("folding", canonical, 1e-4)):

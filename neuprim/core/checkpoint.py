@@ -20,10 +20,10 @@ from torch import Tensor
 from neuprim.core import compression
 from neuprim.core.errors import CheckpointError, cut, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.plain import finite, load_json
+from neuprim.core.io.plain import finite_number, load_json
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.sparse_storage import load_sparse, store_sparse
+from neuprim.core.model.prunable import dense_parameters, sparse_parameters
 from neuprim.core.task import TaskSpec
 
 FORMAT = 1
@@ -51,7 +51,7 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
         CheckpointError: missing, truncated, foreign or of another format version.
     """
     if compression.is_compressed(path):
-        return _check_model_header(path, compression.read_head(path), kind)
+        return _check_model_header(path, compression.read_model_header(path), kind)
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
@@ -79,11 +79,11 @@ def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
             f"{path}: format version is {cut(repr(header.get('format')))}; this neuprim reads {FORMAT}"
         )
     for name in _NUMBERS:  # in any header; null: not known
-        number = 0.0 if header.get(name) is None else finite(header[name])
+        number = 0.0 if header.get(name) is None else finite_number(header[name])
         if number is None or number < 0:
             raise CheckpointError(f"{path}: {name} is {cut(repr(header[name]))}; expected a number of at least 0")
     background = header.get("background", [])
-    if not isinstance(background, list) or any(finite(value) is None for value in background):
+    if not isinstance(background, list) or any(finite_number(value) is None for value in background):
         raise CheckpointError(f"{path}: background is {cut(repr(background))}; expected finite numbers")
     return header
 
@@ -126,10 +126,10 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
 
     Args:
-        without_zeros: leave out zeros of the fields, as in pruned models (:mod:`neuprim.core.model.sparse_storage`).
+        without_zeros: leave out zeros of the fields, as in pruned models (:mod:`neuprim.core.model.prunable`).
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
-    tensors, sparse = store_sparse(model.params, specs)
+    tensors, sparse = sparse_parameters(model.params, specs)
     write_tensors(
         path, "model", tensors, {**model_header(model, task, extra), **({"sparse": sparse} if sparse else {})}
     )
@@ -150,7 +150,7 @@ def save_compressed(
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
     """
     if isinstance(bits, compression.BitTable):
-        model = compression.canonicalize(model)
+        model = compression.canonical_model(model)
         made = compression.fit_quantizers(model, bits)
     else:
         made = bits
@@ -198,7 +198,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         raise CheckpointError(f"{path}: density and colour fields are {found}; expected one of each")
     own = (*density.parameters(), *colour.parameters())
     if "sparse" in header:
-        tensors = load_sparse(tensors, header.pop("sparse"), own, str(path))
+        tensors = dense_parameters(tensors, header.pop("sparse"), own, str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -14,8 +14,16 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import read_grid, scale_transform, vdb_sequence, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_cameras
-from neuprim.tasks.dynamic.volume.medium import black_body_rgb, black_body_xyz, build_medium
-from neuprim.tasks.dynamic.volume.optics import EMBERGEN_FIRE, OPTICS_PRESETS, Axis, Light, Optics
+from neuprim.tasks.dynamic.volume.optics import (
+    EMBERGEN_FIRE,
+    OPTICS_PRESETS,
+    Axis,
+    Light,
+    Optics,
+    black_body_rgb,
+    black_body_xyz,
+    build_medium,
+)
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, render_medium
 from neuprim.tasks.dynamic.volume.survey import SceneNormalisation
 from tests.core.io.vdb.vdb_bytes import real_folder

@@ -30,8 +30,7 @@ from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
 from neuprim.core.volumes.density_truth import GridExtent, Placement
-from neuprim.tasks.dynamic.volume.medium import build_medium
-from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics
+from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics, build_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.survey import GridReader, SceneNormalisation
 

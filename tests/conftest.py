@@ -11,6 +11,14 @@ SLOW = 3600.0
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Let slow tests take their time, and move the extremes behind the tests of searches.
+
+    Two workers that draw the extremes early would compile the same kernels at once.
+    """
+    extremes = [item for item in items if item.path.name == "test_extremes.py"]
+    others = [item for item in items if item.path.name != "test_extremes.py"]
+    after = [at for at, item in enumerate(others, 1) if item.path.parent.name == "search"] or [len(others)]
+    items[:] = others[: after[-1]] + extremes + others[after[-1] :]
     for item in items:
         if item.get_closest_marker("slow") and not item.get_closest_marker("timeout"):
             item.add_marker(pytest.mark.timeout(SLOW))

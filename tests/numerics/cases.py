@@ -37,7 +37,7 @@ CONSTANT: dict[str, tuple[Knobs, Knobs, Knobs]] = {
     "K=8 C=3": ({"neurons": 8}, {}, {}),
     "K=16 C=1": ({"neurons": 16, "channels": 1}, {}, {}),
     "off-centre": ({}, {"shift": (19.3, -11.7)}, {}),
-    "principal point outside": ({}, {"shift": (-40.0, 5.0)}, {}),
+    "principal point outside": ({}, {"shift": (-30.0, 4.0)}, {}),
     "inside": ({"count": 90}, {"distance": 0.15, "fov": 70.0}, {}),
     "near plane": ({}, {}, {"near": 2.9}),
     "wide": ({}, {"distance": 1.2, "fov": 120.0}, {}),
@@ -46,8 +46,8 @@ CONSTANT: dict[str, tuple[Knobs, Knobs, Knobs]] = {
     "one row": ({}, {"width": 50, "height": 1}, {}),
     "one pixel": ({"count": 30}, {"width": 1, "height": 1, "fov": 5.0}, {}),
     "one primitive": ({"count": 1}, {}, {}),
-    "many small": ({"count": 700, "radius": 0.04, "neurons": 2}, {}, {}),
-    "opaque": ({"count": 250, "radius": 0.35, "neurons": 2}, {}, {}),
+    "many small": ({"count": 700, "radius": 0.04}, {}, {}),
+    "opaque": ({"count": 250, "radius": 0.35}, {}, {}),
     "no depth": ({}, {}, {"depth": False}),
     "low ceiling": ({}, {}, {"alpha_max": 0.2}),
     "cuts off": ({}, {}, {"alpha_min": 0.0, "transmittance_min": 0.0}),
@@ -58,15 +58,16 @@ NETWORK: dict[str, tuple[Knobs, Knobs, Knobs]] = {
     "depth": ({}, {}, {"depth": True}),
     "depth C=5": ({"channels": 5}, {}, {"depth": True}),
     "off-centre": ({}, {"shift": (19.3, -11.7)}, {}),
-    "principal point outside": ({}, {"shift": (-40.0, 5.0)}, {}),
+    "principal point outside": ({}, {"shift": (-30.0, 4.0)}, {}),
     "inside": ({"count": 90}, {"distance": 0.15, "fov": 70.0}, {"depth": True}),
     "near plane": ({}, {}, {"near": 2.9}),
     "wide": ({}, {"distance": 1.2, "fov": 120.0}, {}),
     "one pixel": ({"count": 30}, {"width": 1, "height": 1, "fov": 5.0}, {}),
-    "many small": ({"count": 700, "radius": 0.04, "neurons": 2}, {}, {}),
-    "opaque": ({"count": 250, "radius": 0.35, "neurons": 2}, {}, {}),
+    "many small": ({"count": 700, "radius": 0.04}, {}, {}),
+    "opaque": ({"count": 250, "radius": 0.35}, {}, {}),
     "cuts off": ({}, {}, {"alpha_min": 0.0, "transmittance_min": 0.0}),
     "low ceiling": ({}, {}, {"alpha_max": 0.2}),
+    "no units": ({"hidden": 0}, {}, {}),
     "two rays a side": ({}, {"width": 24, "height": 17}, {"samples": 2}),
     "30 rad over a chord": ({"colour_frequency": 15.0}, {}, {}),
     "100 rad over a chord": ({"colour_frequency": 50.0}, {}, {}),
@@ -133,7 +134,8 @@ def spheres(means: list[list[float]], radii: list[float], density: list[float]) 
     """Homogeneous spheres of the colours red, green, blue; ``density`` times the diameter is a central chord's optical
     depth."""
     count = len(radii)
-    t = scenes.tensors(count, 0, dtype=torch.float64)
+    t = scenes.tensors(count, dtype=torch.float64)
+    t["w2"] *= 0
     t["means"] = torch.tensor(means, dtype=torch.float64)
     radius = torch.tensor(radii, dtype=torch.float64)
     t["log_scales"] = radius.log()[:, None].repeat(1, 3)

@@ -95,7 +95,7 @@ CASES = {
 @pytest.mark.parametrize("name", CASES)
 def test_against_the_loop(name: str) -> None:
     settings, distance, extra = CASES[name]
-    t = scenes.tensors(25, 3, seed=21, radius=0.35)
+    t = scenes.tensors(25, seed=21, radius=0.35)
     t["b2"] += extra
     camera = scenes.camera(14, 10, distance=distance, fov=45 if distance > 1 else 90, shift=(0.8, 0.4))
     settings = replace(settings, depth=True)
@@ -120,7 +120,8 @@ def test_against_the_loop(name: str) -> None:
 def test_the_primitive_that_crosses_the_limit_still_counts(backend: str) -> None:
     """Three opaque spheres in a row, T_min = 0.05: the second takes T from 0.1 to 0.01 and is drawn, the third is
     not."""
-    t = scenes.tensors(3, 0)
+    t = scenes.tensors(3)
+    t["w2"] *= 0
     t["quats"][:] = torch.tensor([1.0, 0, 0, 0])
     t["log_scales"][:] = math.log(0.2)
     t["b2"][:] = 50.0
@@ -136,8 +137,8 @@ def test_the_primitive_that_crosses_the_limit_still_counts(backend: str) -> None
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_clamped_pair_has_no_gradient_in_its_density(backend: str) -> None:
-    t = scenes.tensors(1, 0)
-    t["means"] *= 0
+    t = scenes.tensors(1)
+    t["means"], t["w2"] = t["means"] * 0, t["w2"] * 0
     t["b2"][:] = 50.0
     t = {k: v.clone().requires_grad_() for k, v in t.items()}
     camera = scenes.camera(3, 3, fov=1.0)
@@ -150,7 +151,7 @@ def test_a_clamped_pair_has_no_gradient_in_its_density(backend: str) -> None:
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_negative_integrals_are_empty_space(backend: str) -> None:
-    t = scenes.tensors(5, 0)
-    t["b2"] = -t["b2"].abs()
+    t = scenes.tensors(5)
+    t["b2"], t["w2"] = -t["b2"].abs(), t["w2"] * 0
     out = render_lowered(scenes.lowered(t), scenes.camera(16, 16), RenderSettings(**by(backend), alpha_min=0.0))
     assert out.alpha.abs().max() == 0

@@ -71,7 +71,7 @@ def by_hand(t: dict[str, Tensor], camera: Camera, s: RenderSettings) -> tuple[Te
     ],
 )
 def test_against_the_order_by_hand(distance: float, extra: float, knobs: dict[str, float]) -> None:
-    t = scenes.tensors(25, 3, seed=21, radius=0.35)
+    t = scenes.tensors(25, seed=21, radius=0.35)
     t["b2"] += extra
     camera = scenes.camera(14, 10, distance=distance, fov=45 if distance > 1 else 90, shift=(0.8, 0.4))
     settings = replace(ENTRY, **knobs)  # type: ignore[arg-type]
@@ -128,7 +128,7 @@ def test_chords_that_the_near_plane_cuts_keep_the_order_of_centres(backend: str)
 
 @pytest.mark.parametrize("sort", ["center", "entry"])
 def test_coincident_primitives_keep_their_index_order(sort: str) -> None:
-    t = scenes.tensors(12, 2, seed=4, radius=0.4)
+    t = scenes.tensors(12, seed=4, radius=0.4)
     t = {k: torch.cat([v, v]) for k, v in t.items()}
     t["colors"][12:] = 1 - t["colors"][12:]
     camera, settings = scenes.camera(33, 25), replace(ENTRY, sort=sort)

@@ -19,9 +19,11 @@ from tests.numerics.equivalence import assert_same_bits, draw, row_errors, same,
 
 SORTS = ("center", "entry")
 NET = ("Wx", "bias", "Wout", "base")
-OWN_KERNELS = ("K=0 C=1", "K=1 C=3", "K=16 C=1", "many small", "opaque", "no depth")
-"""Cases with kernels of their own on a GPU. A backend that is not where it belongs compiles these for minutes; there it
-draws them with a hard edge, in the order of centres."""
+OWN_KERNELS = ("K=0 C=1", "K=1 C=3", "K=3 C=5", "K=16 C=1", "no depth")
+"""Cases with kernels of their own on a GPU. A GPU's backend on a CPU compiles them for minutes. It draws them with a
+hard edge, in the order of centres."""
+EDGE_1 = "inside"
+"""The case that is drawn with edge 1 unless slow tests run: edge 1 is edge 2 but for a polynomial."""
 
 
 def worth_compiling(name: str, backend: str) -> bool:
@@ -31,10 +33,10 @@ def worth_compiling(name: str, backend: str) -> bool:
 HARD = [
     (name, sort, b) for name in CONSTANT for sort in SORTS for b in FAST if sort == "center" or worth_compiling(name, b)
 ]
-SOFT = [(name, edge, "center") for name in CONSTANT for edge in (1, 2)]
-SOFT += [(name, edge, "entry") for name in ("K=3 C=5", "inside", "near plane") for edge in (1, 2)]
+SOFT = [(name, "center") for name in CONSTANT] + [(name, "entry") for name in ("K=3 C=5", "inside", "near plane")]
 # at distance/radius 1e5 entries differ by less than float32 knows of their depth
-NETWORKS = [(name, sort) for name in NETWORK for sort in SORTS if sort == "center" or "1e5" not in name]
+NETWORKS = [(name, "center") for name in NETWORK]
+NETWORKS += [(name, "entry") for name in NETWORK if "1e5" not in name and name != "no units"]
 
 
 @pytest.mark.parametrize(("name", "sort", "backend"), HARD)
@@ -46,9 +48,16 @@ def test_hard_edges(name: str, sort: str, backend: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "edge", "sort", "backend"), [(*soft, b) for soft in SOFT for b in FAST if worth_compiling(soft[0], b)]
+    ("name", "sort", "edge", "backend"),
+    [
+        pytest.param(name, sort, edge, b, marks=[pytest.mark.slow] if edge == 1 and name != EDGE_1 else [])
+        for name, sort in SOFT
+        for edge in (1, 2)
+        for b in FAST
+        if worth_compiling(name, b)
+    ],
 )
-def test_soft_edges(name: str, edge: int, sort: str, backend: str) -> None:
+def test_soft_edges(name: str, sort: str, edge: int, backend: str) -> None:
     _, slow = same(backend, REFERENCE, make_case(name, edge, sort))
     assert slow.output.alpha.max() > 0.05
 
@@ -82,17 +91,20 @@ COMMON: dict[str, Any] = {"derandomize": True, "deadline": None, "database": Non
 COMMON["suppress_health_check"] = list(HealthCheck)
 
 
-def drawn_cases(neurons: list[int], hidden: list[int | None], channels: list[int]) -> st.SearchStrategy[Case]:
-    def build(model: dict[str, Any], view: dict[str, Any], knobs: dict[str, Any], edge: int) -> Case:
-        return Case(scenes.tensors(**model), scenes.camera(**view), replace(DEFAULT, **knobs), edge)
+def drawn_cases(
+    units: st.SearchStrategy[tuple[int, int | None]], channels: list[int], edges: list[int]
+) -> st.SearchStrategy[Case]:
+    """Cases with ``units``: the neurons of a density, and those of a colour network or None."""
+
+    def build(units: tuple[int, int | None], model: Any, view: Any, knobs: Any, edge: int) -> Case:
+        t = scenes.tensors(neurons=units[0], hidden=units[1], **model)
+        return Case(t, scenes.camera(**view), replace(DEFAULT, **knobs), edge)
 
     model = st.fixed_dictionaries({
         "count": st.sampled_from([1, 8, 40]),
-        "neurons": st.sampled_from(neurons),
         "channels": st.sampled_from(channels),
         "seed": st.integers(0, 999),
         "radius": st.sampled_from([0.1, 0.2, 0.35]),
-        "hidden": st.sampled_from(hidden),
     })  # fmt: skip
     view = st.fixed_dictionaries({
         "width": st.integers(1, 40),
@@ -104,11 +116,10 @@ def drawn_cases(neurons: list[int], hidden: list[int | None], channels: list[int
     knobs = st.fixed_dictionaries({
         "sort": st.sampled_from(SORTS),
         "near": st.sampled_from([0.01, 0.3, 2.9]),
-        "depth": st.booleans(),
         "alpha_max": st.sampled_from([0.2, 0.99]),
         "depth_floor": st.just(1e-3),
     })  # fmt: skip
-    return st.builds(build, model, view, knobs, st.sampled_from([0, 1, 2]))
+    return st.builds(build, units, model, view, knobs, st.sampled_from(edges))
 
 
 def check_drawn(backend: str, drawn: Case) -> None:
@@ -121,15 +132,25 @@ def check_drawn(backend: str, drawn: Case) -> None:
         raise
 
 
+ANY_UNITS = st.tuples(st.sampled_from([0, 1, 3, 8, 16]), st.sampled_from([None, 0, 1, 5, 16]))
+
+
 @settings(max_examples=40, **COMMON)
-@given(drawn_cases([0, 1, 3, 8, 16], [None, 0, 1, 5, 16], [1, 3, 5]))
+@given(drawn_cases(ANY_UNITS, [1, 3, 5], [0, 2]))
 def test_drawn_cases(drawn: Case) -> None:
+    check_drawn("cpu", drawn)
+
+
+@pytest.mark.slow
+@settings(max_examples=400, **COMMON)
+@given(drawn_cases(ANY_UNITS, [1, 3, 5], [0, 1, 2]))
+def test_many_drawn_cases(drawn: Case) -> None:
     check_drawn("cpu", drawn)
 
 
 @pytest.mark.parametrize("backend", [name for name in FAST if name != "cpu"])
 @settings(max_examples=10, **COMMON)
-@given(drawn=drawn_cases([3], [None, 5], [3]))  # forms that other tests have compiled kernels for
+@given(drawn=drawn_cases(st.sampled_from([(8, None), (3, 5)]), [3], [0, 2]))  # other tests compile these kernels too
 def test_drawn_cases_on_other_backends(backend: str, drawn: Case) -> None:
     check_drawn(backend, drawn)
 
@@ -139,12 +160,9 @@ def test_drawn_cases_on_other_backends(backend: str, drawn: Case) -> None:
 
 @pytest.mark.parametrize("sort", SORTS)
 @pytest.mark.parametrize("hidden", [None, 5])
-@pytest.mark.parametrize("backend", FAST)
-def test_any_number_of_threads_gives_the_same_bits(backend: str, hidden: int | None, sort: str) -> None:
-    if backend != "cpu" and (hidden or sort == "entry"):
-        pytest.skip("the number of threads is a setting of the cpu backend")
+def test_any_number_of_threads_gives_the_same_bits(hidden: int | None, sort: str) -> None:
     t, camera = scenes.tensors(1500, 5, seed=3, radius=0.06, hidden=hidden), scenes.camera(100, 70)
-    first, *others = (draw(backend, t, camera, replace(DEFAULT, threads=n, sort=sort)) for n in (1, 2, 3))  # type: ignore[arg-type]
+    first, *others = (draw("cpu", t, camera, replace(DEFAULT, threads=n, sort=sort)) for n in (1, 2, 3))  # type: ignore[arg-type]
     for other in others:
         assert_same_bits(first, other)
     assert first.output.alpha.max() > 0.5
@@ -160,7 +178,7 @@ def test_order_of_primitives_does_not_matter(backend: str) -> None:
 
 
 @pytest.mark.parametrize("sort", SORTS)
-@pytest.mark.parametrize("hidden", [None, 3])
+@pytest.mark.parametrize("hidden", [None, 8])
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_nothing_to_draw(backend: str, hidden: int | None, sort: str) -> None:
     """No primitives, primitives far away, and a camera that looks away: the background and its gradient alone."""
@@ -183,7 +201,7 @@ def test_nothing_to_draw(backend: str, hidden: int | None, sort: str) -> None:
 @pytest.mark.parametrize("backend", FAST)
 def test_the_floor_on_grazing_rays_is_shared(backend: str) -> None:
     """A large floor changes the gradients of both backends alike and the image of neither."""
-    made = make_case("K=3 C=5")
+    made = make_case("K=8 C=3")
     fast, _ = same(backend, REFERENCE, replace(made, settings=replace(made.settings, depth_floor=0.2)))
     plain = draw(backend, made.tensors, made.camera, made.settings)
     assert torch.equal(fast.output.rgb, plain.output.rgb)
@@ -201,7 +219,7 @@ def test_a_far_camera_loses_no_digits(backend: str) -> None:
 @pytest.mark.parametrize("backend", FAST)
 def test_float64_pixels_are_sorted_too(backend: str) -> None:
     """Needles and discs near the camera, which fast backends draw in float64."""
-    t = scenes.tensors(40, 4, seed=2, radius=0.3)
+    t = scenes.tensors(40, seed=2, radius=0.3)
     t["log_scales"][:, 0] -= 4.0
     knobs = replace(DEFAULT, sort="entry", depth_floor=1e-3)
     fast, _ = same(backend, REFERENCE, Case(t, scenes.camera(40, 30, distance=0.5, fov=60), knobs))

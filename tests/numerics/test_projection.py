@@ -84,7 +84,8 @@ def test_boxes_across_the_near_plane_are_the_whole_screen() -> None:
 def shapes(count: int, log_scales: Tensor, seed: int, depth: float) -> dict[str, Tensor]:
     """Constant-density ellipsoids of the given shape at random places and angles; ``depth``: optical depth through the
     middle, at most."""
-    t = scenes.tensors(count, 0, seed=seed)
+    t = scenes.tensors(count, seed=seed)
+    t["w2"] *= 0
     t["log_scales"] = log_scales.expand(count, 3).clone()
     t["b2"][:] = depth / 2
     return t

@@ -14,9 +14,8 @@ from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, Ray
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from neuprim.core.render.reference.backend import pixel_directions
 from tests import scenes
-from tests.backends import BACKENDS, FAST, by
+from tests.backends import BACKENDS, by
 from tests.numerics.cases import case
-from tests.numerics.wild import render_block
 
 OPAQUE = CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)
 
@@ -123,7 +122,7 @@ def test_silhouettes_of_soft_edges_need_no_floor() -> None:
     """dI/dD goes as D^(p - 1/2): the floor that tames a hard edge changes nothing."""
     t, camera, settings = case("many small")
     for backend in BACKENDS:
-        for edge in (0, 1, 2):
+        for edge in (0, 2):
             grads = []
             for floor in (1e-12, 1e-2):
                 leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
@@ -133,10 +132,3 @@ def test_silhouettes_of_soft_edges_need_no_floor() -> None:
                 assert leaves["means"].grad is not None and bool(torch.isfinite(leaves["means"].grad).all())
                 grads.append(leaves["means"].grad)
             assert torch.equal(*grads) == (edge > 0), (backend, edge)
-
-
-@pytest.mark.parametrize("edge", [1, 2])
-@pytest.mark.parametrize("backend", FAST)
-def test_wild_primitives_with_soft_edges_stay_finite(backend: str, edge: int) -> None:
-    with scenes.soft(edge):
-        assert max(render_block(seed, backend) for seed in range(6)) > 0.3

@@ -40,7 +40,7 @@ def model(count: int = 20) -> Primitives:
 )  # fmt: skip
 def test_impossible_numbers_are_refused_by_name(backend: str, name: str, value: float) -> None:
     """Anywhere, behind the camera too. Of a quaternion only all zeros are impossible."""
-    t = scenes.tensors(20, hidden=3 if name in NET else None)
+    t = scenes.tensors(20, hidden=8 if name in NET else None)
     t["means"][13] = CAMERA.position.float() * 3
     t[name][13].view(-1)[0 if value == 0 else -1 :] = value
     with pytest.raises(NonFiniteError, match=rf"\b{name} of primitive 13\b"):
@@ -54,16 +54,19 @@ def test_a_whole_model_is_refused_by_name(backend: str, name: str) -> None:
     m.params[name][7].view(-1)[0] = float("nan")
     named = "colors" if name.startswith("sh") else name
     with pytest.raises(NonFiniteError, match=rf"\b({name}|{named}) of primitive 7\b"):
-        render(m, scenes.camera(20, 20), settings=settings(backend))
+        render(m, CAMERA, settings=settings(backend))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-@pytest.mark.parametrize("name", [*NAMES, "colors"])
-def test_denormals_are_drawn(backend: str, name: str) -> None:
-    t = {k: v.requires_grad_() for k, v in scenes.tensors(20).items()}
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [*((name, 1e-42) for name in (*NAMES, "colors", *NET)), ("Wx", 1e30), ("bias", 1e30), ("Wout", 1e6), ("base", 1e6)],
+)
+def test_denormals_and_huge_networks_are_drawn(backend: str, name: str, value: float) -> None:
+    t = {k: v.requires_grad_() for k, v in scenes.tensors(20, hidden=8 if name in NET else None).items()}
     with torch.no_grad():
-        t[name][5] = 1e-42
-    out = render_lowered(scenes.lowered(t), scenes.camera(20, 20), settings(backend))
+        t[name][5] = value
+    out = render_lowered(scenes.lowered(t), CAMERA, settings(backend))
     assert torch.isfinite(out.rgb).all() and out.alpha.max() > 0.2
     out.rgb.sum().backward()
     for k, v in t.items():
@@ -76,16 +79,14 @@ def test_denormals_are_drawn(backend: str, name: str) -> None:
 def test_spherical_harmonics_far_outside_their_range_are_drawn(backend: str, value: float) -> None:
     m = model()
     m.params["sh_rest"][4] = value
-    out = render(m, scenes.camera(20, 20), settings=settings(backend))
-    assert torch.isfinite(out.rgb).all() and torch.isfinite(out.alpha).all()
-    assert out.alpha.max() > 0.2
+    out = render(m, CAMERA, settings=settings(backend))
+    assert torch.isfinite(out.rgb).all() and torch.isfinite(out.alpha).all() and out.alpha.max() > 0.2
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_spherical_harmonics_that_overflow_are_refused_by_name(backend: str) -> None:
     m = model()
-    camera = scenes.camera(20, 20)
-    way = m.params["means"][4] - camera.position.float()
+    way = m.params["means"][4] - CAMERA.position.float()
     m.params["sh_rest"][4] = 3e38 * sh.sh_basis(way / way.norm(), 3)[1:, None].sign()  # every band adds up
     with pytest.raises(NonFiniteError, match=r"of primitive 4\b"):
-        render(m, camera, settings=settings(backend))
+        render(m, CAMERA, settings=settings(backend))

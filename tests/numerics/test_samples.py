@@ -22,7 +22,7 @@ def frame(t: dict[str, Tensor], settings: RenderSettings, scale: int = 1) -> Ren
 
 
 def leaves() -> dict[str, Tensor]:
-    return {k: v.requires_grad_() for k, v in scenes.tensors(40, 4, seed=6).items()}
+    return {k: v.requires_grad_() for k, v in scenes.tensors(40, seed=6).items()}
 
 
 def blocks(image: Tensor, n: int) -> Tensor:

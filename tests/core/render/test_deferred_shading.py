@@ -18,7 +18,7 @@ BACKGROUND = torch.tensor([0.3, 0.6, 0.9])
 
 
 def lowered() -> Lowered:
-    return scenes.lowered(scenes.tensors(12, 3, seed=4))
+    return scenes.lowered(scenes.tensors(12, seed=4))
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
@@ -54,7 +54,7 @@ def test_gradients_are_those_of_the_product(backend: str) -> None:
     weights = torch.randn(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(1))
     grads = []
     for shaded in (True, False):
-        t = {k: v.clone().requires_grad_() for k, v in scenes.tensors(12, 3, seed=4).items()}
+        t = {k: v.clone().requires_grad_() for k, v in scenes.tensors(12, seed=4).items()}
         scene = scenes.lowered(t)
         if shaded:
             rgb = render_lowered(replace(scene, shade=lambda p: torch.sigmoid(p[:, 0])), camera, settings).rgb

@@ -20,7 +20,7 @@ COUNT = 4
 
 def scene(distance: float, fov: float) -> tuple[Lowered, Tensor, Any]:
     """Before the camera, or around it, where many are drawn in float64; slab 2 has no primitives."""
-    low = scenes.lowered(scenes.tensors(80, 1, seed=5))
+    low = scenes.lowered(scenes.tensors(80, seed=5))
     slabs = torch.randint(0, COUNT, (80,), generator=torch.Generator().manual_seed(1))
     slabs[slabs == 2] = 3
     return low, slabs, scenes.camera(37, 29, distance=distance, fov=fov)

@@ -23,9 +23,9 @@ Launch = Callable[..., None]
 SCENES: dict[str, tuple[dict[str, Any], dict[str, Any], dict[str, Any]]] = {
     "center, depth": ({"neurons": 8}, {}, {"depth": True}),
     "soft edge": ({"neurons": 2, "channels": 5, "edge": 2}, {"width": 61, "height": 47}, {}),
-    "inside": ({"neurons": 3}, {"distance": 0.15, "fov": 70.0}, {"depth": True}),
-    "colour networks": ({"neurons": 2, "hidden": 3}, {"distance": 0.5, "fov": 80.0, "near": 0.05}, {}),
-    "entry": ({"neurons": 2, "edge": 1}, {"distance": 0.5, "fov": 60.0}, {"sort": "entry", "depth": True}),
+    "inside": ({"neurons": 8}, {"distance": 0.15, "fov": 70.0}, {"depth": True}),
+    "colour networks": ({"neurons": 3, "hidden": 5}, {"distance": 0.5, "fov": 80.0, "near": 0.05}, {"depth": True}),
+    "entry": ({"neurons": 8, "edge": 2}, {"distance": 0.5, "fov": 60.0}, {"sort": "entry", "depth": True}),
 }
 """Model, view and settings: pairs in float32 and float64, tiles that end early, sizes that are no multiples of a
 tile."""
@@ -85,7 +85,7 @@ def intercept(
     monkeypatch: pytest.MonkeyPatch, wrapped: Callable[[Launch, Any, Any, Sequence[Any], torch.device, int], None]
 ) -> None:
     """Have every launch of the pixel kernels go through ``wrapped(launch, kernel, dim, inputs, device, block)``."""
-    genuine = backend.launch
+    genuine = backend.launch_kernel
 
     def through(kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int = 256) -> None:
         wrapped(genuine, kernel, dim, inputs, device, block)

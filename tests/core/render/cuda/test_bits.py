@@ -115,7 +115,12 @@ def test_blocks_may_be_of_any_size(
     for module in (binning, frame, colour_net, backend, prepare_backward):
         monkeypatch.setattr(module, "launch_kernel", through)
     assert_same_bits(plain[name], everything(name))
-    assert {"row_spans", "sum_pairs", "_kernels", "_kernel"} <= changed  # of those made in a function, its name
+    assert {
+        "row_spans",
+        "sum_pairs",
+        "_binning_kernels",
+        "_prepare_backward_kernel",
+    } <= changed
     assert {"forward_kernel", "pairs_kernel"} <= together
 
 

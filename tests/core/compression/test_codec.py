@@ -3,6 +3,7 @@ every time."""
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -53,22 +54,8 @@ def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: i
         inside = x.clamp(scheme.low, scheme.high)
         half = (scheme.high - scheme.low).double() / scheme.last / 2
         assert bool(((back - inside).double().abs() <= half * 1.001 + 1e-6).all()), key
-        assert float((x != inside).double().mean() if x.numel() else 0.0) <= 0.06, (
-            key
-        )  # at most 1% at either end, of 40 rows
-
-
-@pytest.mark.parametrize("name", FIELDS)
-def test_compressing_again_changes_nothing(tmp_path: Path, name: str) -> None:
-    task, model = example(name, 300)
-    files = []
-    for i in range(3):
-        path = tmp_path / f"{i}.neuprim"
-        checkpoint.save_compressed(path, model, task.name, {}, LEVELS[3])
-        model, _ = checkpoint.load_model(path, task)
-        files.append((path.read_bytes(), model.params))
-    assert files[0][0] == files[1][0] == files[2][0]
-    assert all(torch.equal(value, files[2][1][key]) for key, value in files[0][1].items())
+        outside = float((x != inside).double().mean()) if x.numel() else 0.0
+        assert outside <= 0.06, key  # at most 1% at either end, of 40 rows
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -162,9 +149,7 @@ def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: 
     found = fake_quantize(leaves, made)
     for key, value in found.items():
         if key == "quats":
-            assert torch.allclose(
-                angles(value.detach(), again.params[key]), torch.zeros(model.count, dtype=torch.float64), atol=1e-3
-            )
+            assert float(angles(value.detach(), again.params[key]).max()) < 1e-3
         else:
             assert torch.equal(value.detach(), again.params[key]), key
     total = torch.stack([(value * (i + 1)).sum() for i, value in enumerate(found.values())]).sum()
@@ -178,11 +163,8 @@ def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: 
 
 def effects_of(model: Primitives) -> dict[str, torch.Tensor]:
     """Some effect of every number, of very different sizes."""
-    generator = torch.Generator().manual_seed(3)
-    return {
-        s.name: 10 ** (2 * torch.rand(s.size, generator=generator, dtype=torch.float64)) * model.count
-        for s in model.specs
-    }
+    draw = partial(torch.rand, generator=torch.Generator().manual_seed(3), dtype=torch.float64)
+    return {s.name: 10 ** (2 * draw(s.size)) * model.count for s in model.specs}
 
 
 @pytest.mark.parametrize("name", FIELDS)
@@ -215,18 +197,16 @@ def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) ->
 
 def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> None:
     model = canonical_model(without_pieces(example("soft", 400)[1]))
-    effects = {
-        name: torch.zeros_like(value) if name == "log_gain" else value for name, value in effects_of(model).items()
-    }
+    effects = effects_of(model)
+    effects["log_gain"] *= 0
     back = fake_quantize(model.params, fit_quantizers_to_error(model, effects, 1e-3))
     assert len(back["log_gain"].unique()) == 1
     for name in ("sh_rest", "w2"):
         gone = model.params[name] == 0
         assert bool(gone.any()) and bool((back[name][gone] == 0).all())
     for unknown in (torch.nan, torch.inf):
-        fine = fit_quantizers_to_error(
-            model, {name: torch.full_like(value, unknown) for name, value in effects.items()}, 1e-3
-        )
+        without = {name: torch.full_like(value, unknown) for name, value in effects.items()}
+        fine = fit_quantizers_to_error(model, without, 1e-3)
         for name, value in fake_quantize(model.params, fine).items():
             near = angles(value, model.params[name]) if name == "quats" else value - model.params[name]
             assert float(near.abs().max()) < 1e-3 if name == "quats" else 1e-5, name
@@ -237,30 +217,21 @@ def test_what_changes_nothing_takes_nothing_and_what_is_gone_stays_gone() -> Non
 # ---------------------------------------------------------------- what cannot be stored
 
 
-def altered(**params: torch.Tensor) -> Primitives:
-    model = example("static")[1]
-    return Primitives(model.density, model.colour, {**model.params, **params})
-
-
 @pytest.mark.parametrize(
     ("params", "message"),
     [
-        (
-            {"b1": torch.full((40, 3), float("nan"))},
-            "parameter b1 of primitive 0 is [nan, nan, nan], which cannot be compressed",
-        ),
-        (
-            {"b2": torch.cat([torch.zeros(39, 1), torch.full((1, 1), float("inf"))])},
-            "parameter b2 of primitive 39 is [inf]",
-        ),
+        ({"b1": torch.full((40, 3), torch.nan)}, "parameter b1 of primitive 0 is [nan, nan, nan], which cannot be"),
+        ({"b2": 1 / (torch.arange(40.0)[:, None] < 39)}, "parameter b2 of primitive 39 is [inf]"),
         ({"quats": torch.zeros(40, 4)}, "parameter quats of primitive 0 is [0.0, 0.0, 0.0, 0.0]"),
         ({"b2": torch.zeros(40, 1, dtype=torch.int64)}, "parameter b2 is torch.int64; only torch.float32"),
         ({"b2": torch.zeros(40, 1, dtype=torch.float64)}, "parameter b2 is torch.float64; only torch.float32"),
     ],
 )
 def test_numbers_that_cannot_be_stored(tmp_path: Path, params: dict[str, torch.Tensor], message: str) -> None:
+    model = example("static")[1]
+    model.params |= params
     with pytest.raises(CheckpointError) as caught:
-        checkpoint.save_compressed(tmp_path / "m", altered(**params), "static", {}, LEVELS[3])
+        checkpoint.save_compressed(tmp_path / "m", model, "static", {}, LEVELS[3])
     assert message in str(caught.value) and not (tmp_path / "m").exists()
 
 
@@ -269,10 +240,8 @@ def test_a_model_of_nothing_but_zeros_is_no_bomb(tmp_path: Path) -> None:
     task, model = example("static", 40_000)
     params = {name: torch.zeros_like(value) for name, value in model.params.items()}
     params["quats"][:, 0] = 1.0
-    path = tmp_path / "m"
-    checkpoint.save_compressed(
-        path, Primitives(model.density, model.colour, params), task.name, {}, LEVELS[3], "task: static\n"
-    )
+    path, zeros = tmp_path / "m", Primitives(model.density, model.colour, params)
+    checkpoint.save_compressed(path, zeros, task.name, {}, LEVELS[3], "task: static\n")
     numbers = 4 * 40_000 * model.parameters_per_primitive
     assert numbers > 2**20 and path.stat().st_size * 64 + 2**20 >= numbers > 10 * path.stat().st_size
     assert all(torch.equal(value, params[name]) for name, value in read_compressed(path)[1].items())

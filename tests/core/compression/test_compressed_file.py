@@ -65,19 +65,10 @@ def table_rows(table: bytes, sections: int) -> list[dict[str, Any]]:
         coding, packing, dimensions = table[at : at + 3]
         shape = struct.unpack_from(f"<{dimensions}I", table, at + 3)
         at += 3 + 4 * dimensions
-        planes, size, crc = struct.unpack_from("<QQI", table, at)
+        numbers = (coding, packing, shape, *struct.unpack_from("<QQI", table, at))
         at += 20
-        rows.append(
-            {
-                "name": name,
-                "coding": coding,
-                "packing": packing,
-                "shape": shape,
-                "planes": planes,
-                "size": size,
-                "crc": crc,
-            }
-        )
+        keys = ("name", "coding", "packing", "shape", "planes", "size", "crc")
+        rows.append(dict(zip(keys, (name, *numbers), strict=True)))
     assert at == len(table)
     return rows
 
@@ -129,9 +120,9 @@ def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray]
             if row["coding"] == 2:
                 b = records[0][0]
                 keys = np.cumsum(codes(3 * b))
+                bits = [(i, 1 << i) for i in range(b)]
                 cells = [
-                    np.array([sum(int(key) >> (3 * i + axis) & 1 and 1 << i for i in range(b)) for key in keys])
-                    for axis in range(3)
+                    np.array([sum(bit for i, bit in bits if int(k) >> 3 * i + a & 1) for k in keys]) for a in range(3)
                 ]
             else:
                 cells = [codes(b, len(rows)) for (b, _, _), rows in zip(records, own, strict=True)]
@@ -201,30 +192,15 @@ def assembled(
     rows, parts = [], []
     for name, (coding, shape, head, planes) in sections.items():
         part = head + planes
-        sizes = {
-            "planes": len(planes),
-            "size": len(part),
-            "crc": zlib.crc32(part),
-            "packing": packing,
-            **table.get(name, {}),
-        }
-        label = sizes.get("label", name.encode())
-        row = (
-            bytes([len(label)])
-            + label
-            + bytes([coding, sizes["packing"], len(shape)])
-            + struct.pack(f"<{len(shape)}I", *shape)
-        )
+        sizes = {"planes": len(planes), "size": len(part), "crc": zlib.crc32(part), "packing": packing}
+        sizes |= {"label": name.encode(), "part": part, **table.get(name, {})}
+        row = bytes([len(sizes["label"]), *sizes["label"], coding, sizes["packing"], len(shape)])
+        row += struct.pack(f"<{len(shape)}I", *shape)
         rows.append(row + struct.pack("<QQI", sizes["planes"], sizes["size"], sizes["crc"]))
-        parts.append(sizes.get("part", part))
+        parts.append(sizes["part"])
     start = struct.pack("<IIQII", version, table.get("number", len(rows)), count, len(text), len(b"".join(rows)))
-    return (
-        b"\x89NEUPRIM"
-        + start
-        + struct.pack("<I", zlib.crc32(start + text + b"".join(rows)))
-        + text
-        + b"".join(rows + parts)
-    )
+    check = struct.pack("<I", zlib.crc32(start + text + b"".join(rows)))
+    return b"\x89NEUPRIM" + start + check + text + b"".join(rows + parts)
 
 
 def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
@@ -236,11 +212,8 @@ def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
     assert p["log_scales"].tolist() == [[-2.0, -2.0, 0.5], [-1.0, 0.0, 0.5]]
     assert p["quats"][0].tolist() == [1.0, 0.0, 0.0, 0.0]
     assert p["quats"][1].tolist() == pytest.approx([0.5**0.5, 0.0, -(0.5**0.5), 0.0])
-    assert (
-        p["b2"].tolist() == [[258.0], [4095.0]]
-        and p["sh_dc"].tolist() == [[0.5] * 3] * 2
-        and p["W1"].shape == (2, 0, 3)
-    )
+    assert p["b2"].tolist() == [[258.0], [4095.0]] and p["sh_dc"].tolist() == [[0.5] * 3] * 2
+    assert p["W1"].shape == (2, 0, 3)
     assert header["task"] == "static" and checkpoint.stored_config(path) is None and is_compressed(path)
     assert checkpoint.read_header(path, "model") == header
     with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):

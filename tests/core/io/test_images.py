@@ -71,10 +71,9 @@ def test_exr_is_linear_and_never_clamped(tmp_path: Path, half: bool, dtype: torc
 
 def test_missing_empty_foreign_and_folder(tmp_path: Path) -> None:
     refuse(tmp_path / "none.png", "not found")
-    (tmp_path / "empty.png").touch()
-    refuse(tmp_path / "empty.png", "empty")
-    (tmp_path / "text.png").write_text("no image")
-    refuse(tmp_path / "text.png", "expected PNG, JPEG, WebP or OpenEXR")
+    for content, word in ((b"", "empty"), (b"no image", "expected PNG, JPEG, WebP or OpenEXR")):
+        (tmp_path / "a.png").write_bytes(content)
+        refuse(tmp_path / "a.png", word)
     for kind in ("BMP", "GIF", "TIFF"):
         Image.fromarray(noise(4, 4, 3)).save(tmp_path / "a.png", format=kind)
         refuse(tmp_path / "a.png", f"image is {kind}", "convert it")
@@ -142,10 +141,9 @@ def test_what_8_bit_rgb_cannot_hold_is_refused(tmp_path: Path) -> None:
 
 
 def test_wrong_size(tmp_path: Path) -> None:
-    images.write_png(tmp_path / "a.png", torch.zeros(4, 6, 3))
-    write_exr(tmp_path / "a.exr", torch.zeros(4, 6, 3))
-    refuse(tmp_path / "a.png", "6x4", "expected 4x6", size=(4, 6))
-    refuse(tmp_path / "a.exr", "6x4", "expected 4x6", size=(4, 6))
+    for write, name in ((images.write_png, "a.png"), (write_exr, "a.exr")):
+        write(tmp_path / name, torch.zeros(4, 6, 3))
+        refuse(tmp_path / name, "6x4", "expected 4x6", size=(4, 6))
 
 
 @pytest.mark.filterwarnings("ignore::PIL.Image.DecompressionBombWarning")
@@ -204,11 +202,9 @@ def test_failed_writes_leave_the_old_file_and_no_rubbish(tmp_path: Path, monkeyp
 
 
 def test_exr_write_refuses_what_it_cannot_hold(tmp_path: Path) -> None:
-    path = tmp_path / "a.exr"
-    with pytest.raises(DataError, match="half=False"):
-        write_exr(path, torch.full((1, 1, 3), 1e6))
-    with pytest.raises(DataError, match="channel R: value inf at row 0, column 0"):
-        write_exr(path, torch.full((1, 1, 3), float("inf")))
+    for value, words in ((1e6, "half=False"), (torch.inf, "channel R: value inf at row 0, column 0")):
+        with pytest.raises(DataError, match=words):
+            write_exr(tmp_path / "a.exr", torch.full((1, 1, 3), value))
     assert not os.listdir(tmp_path)
 
 
@@ -225,17 +221,15 @@ def test_transfer_curve() -> None:
 
 
 def test_masks_are_colours_that_are_not_zero(tmp_path: Path) -> None:
-    grey = np.array([[0, 1], [128, 255]], np.uint8)
-    opaque_black = Image.fromarray(np.array([[[0, 0, 0, 255]]], np.uint8))
+    grey = Image.fromarray(np.array([[0, 1], [128, 255]], np.uint8))
     palette = Image.fromarray(np.array([[0, 1, 2]], np.uint8), "P")
     palette.putpalette([0, 0, 0, 255, 255, 255, 0, 0, 0])
-    bits = Image.fromarray(np.array([[True, False]]))
     for image, expected in (
-        (Image.fromarray(grey), [[False, True], [True, True]]),
-        (Image.fromarray(grey).convert("RGB"), [[False, True], [True, True]]),
-        (opaque_black, [[False]]),
+        (grey, [[False, True], [True, True]]),
+        (grey.convert("RGB"), [[False, True], [True, True]]),
+        (Image.fromarray(np.array([[[0, 0, 0, 255]]], np.uint8)), [[False]]),  # opaque black
         (palette, [[False, True, False]]),
-        (bits, [[True, False]]),
+        (Image.fromarray(np.array([[True, False]])), [[True, False]]),
     ):
         image.save(tmp_path / "m.png")
         assert images.read_mask(tmp_path / "m.png").tolist() == expected

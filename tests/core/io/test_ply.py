@@ -82,10 +82,8 @@ def test_elements_in_any_order_with_lists_of_any_length(tmp_path: Path, order: s
 
 def test_rows_that_cost_nothing_are_not_counted_through(tmp_path: Path) -> None:
     path = tmp_path / "a.ply"
-    path.write_text(
-        "ply\nformat binary_little_endian 1.0\nelement none 999999999999\nelement vertex 1\nproperty uchar "
-        "x\nend_header\n7"
-    )
+    head = "ply\nformat binary_little_endian 1.0\nelement none 999999999999\n"
+    path.write_text(head + "element vertex 1\nproperty uchar x\nend_header\n7")
     assert read_ply(path).rows["x"].tolist() == [ord("7")]
 
 

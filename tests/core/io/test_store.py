@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import sys
 import threading
+import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -179,8 +180,6 @@ def test_a_header_that_claims_more_than_there_is(tmp_path: Path) -> None:
     np.savez(file, a=np.zeros((2, 3), np.float32), b=np.float64(1))
     data = file.read_bytes()
     assert data.count(b"(2, 3), }                       ") == 1
-    import zipfile
-
     with zipfile.ZipFile(file) as archive:
         array = archive.read("a.npy").replace(b"(2, 3), }           ", b"(9000000000, 3), }  ")
     with zipfile.ZipFile(file, "w") as archive:

@@ -22,23 +22,14 @@ def images(size: int) -> tuple[Tensor, Tensor]:
 
 @pytest.mark.parametrize("network", ["alex", "vgg"])
 def test_it_is_the_distance_of_the_features_of_the_network(tmp_path: Path, network: str) -> None:
-    state = weights(network)
+    state, net = weights(network), features(network)
     found = Lpips.load(written(tmp_path, state))
     assert found.network == network
-    net = features(network)
-    net.load_state_dict(
-        {key.removeprefix("features."): value for key, value in state.items() if key.startswith("features.")}
-    )
+    net.load_state_dict({key.removeprefix("features."): x for key, x in state.items() if key.startswith("features.")})
     rendered, truth = images(33)
+    mean, deviation = torch.tensor([-0.030, -0.088, -0.188]), torch.tensor([0.458, 0.448, 0.450])
     for call, mapped in ((found, lambda x: 2 * x - 1), (found.unmapped, lambda x: x)):
-        total, xs = (
-            0.0,
-            [
-                ((mapped(i) - torch.tensor([-0.030, -0.088, -0.188])) / torch.tensor([0.458, 0.448, 0.450]))
-                for i in images(33)
-            ],
-        )
-        xs = [x.permute(2, 0, 1)[None] for x in xs]
+        total, xs = 0.0, [((mapped(i) - mean) / deviation).permute(2, 0, 1)[None] for i in images(33)]
         with torch.no_grad():
             for index, layer in enumerate(net):
                 xs = [layer(x) for x in xs]
@@ -65,10 +56,8 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
     assert Lpips.load(tmp_path / "all.safetensors")(*images(40)) == plain
     parts = tmp_path / "parts"
     parts.mkdir()
-    backbone = {key: value for key, value in state.items() if key.startswith("features")} | {
-        "classifier.1.weight": torch.zeros(2, 2)
-    }
-    torch.save(backbone, parts / "alexnet-owt-7be5be79.pth")
+    backbone = {key: value for key, value in state.items() if key.startswith("features")}
+    torch.save({**backbone, "classifier.1.weight": torch.zeros(2, 2)}, parts / "alexnet-owt-7be5be79.pth")
     torch.save({key: value for key, value in state.items() if key.startswith("lin")}, parts / "alex.pth")
     (parts / "README.md").write_text("not weights")
     assert Lpips.load(parts)(*images(40)) == plain
@@ -77,19 +66,10 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
 @pytest.mark.parametrize(
     ("change", "text"),
     [
-        (
-            lambda s: {k: v for k, v in s.items() if k != "lin3.model.1.weight"},
-            "lin3.model.1.weight of LPIPS (alex): missing",
-        ),
-        (
-            lambda s: {k: v for k, v in s.items() if k.startswith("lin")},
-            "convolutions none; expected those of AlexNet or VGG16",
-        ),
+        (lambda s: {k: v for k, v in s.items() if k != "lin3.model.1.weight"}, "lin3.model.1.weight of LPIPS (alex): "),
+        (lambda s: {k: v for k, v in s.items() if k.startswith("lin")}, "convolutions none; expected those of AlexNet"),
         (lambda s: s | {"features.3.bias": torch.zeros(3)}, "features.3.bias of LPIPS (alex): shape (3,)"),
-        (
-            lambda s: s | {"features.3.bias": torch.full((192,), torch.nan)},
-            "or not finite; expected finite numbers of shape (192,)",
-        ),
+        (lambda s: s | {"features.3.bias": torch.full((192,), torch.nan)}, "expected finite numbers of shape (192,)"),
         (lambda s: s | {"features.12.weight": torch.zeros(1)}, "convolutions [0, 3, 6, 8, 10, 12]"),
         (lambda s: list(s), "found list; expected a state dictionary"),
         (lambda s: {"model": nn.Linear(2, 2)}, "cannot be read as weights"),
@@ -98,11 +78,8 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
 def test_other_files_are_refused_in_one_line(tmp_path: Path, change, text: str) -> None:  # type: ignore[no-untyped-def]
     with pytest.raises(DataError) as caught:
         Lpips.load(written(tmp_path, change(weights("alex"))))
-    assert (
-        str(caught.value).startswith(str(tmp_path / "weights.pth"))
-        and text in str(caught.value)
-        and "\n" not in str(caught.value)
-    )
+    message = str(caught.value)
+    assert message.startswith(str(tmp_path / "weights.pth")) and text in message and "\n" not in message
 
 
 class _Hostile:
@@ -117,8 +94,7 @@ class _Hostile:
 
 def test_no_code_in_a_file_is_run(tmp_path: Path) -> None:
     touched = tmp_path / "touched"
-    path = tmp_path / "weights.pth"
-    torch.save({**weights("alex"), "more": _Hostile(touched)}, path)
+    path = written(tmp_path, {**weights("alex"), "more": _Hostile(touched)})
     torch.load(path, weights_only=False)
     assert touched.exists()
     touched.unlink()

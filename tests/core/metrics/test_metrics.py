@@ -30,12 +30,8 @@ def pair(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """A smooth image with an edge, and the same with noise."""
     rng = np.random.default_rng(seed)
-    y, x = np.mgrid[:height, :width]
-    base = (
-        0.5
-        + 0.3 * np.sin(x / 3.0)[..., None] * np.cos(y[..., None] / 4.0 + np.arange(channels))
-        + 0.2 * (x > width // 2)[..., None]
-    )
+    y, x, c = np.mgrid[:height, :width, :channels]
+    base = 0.5 + 0.3 * np.sin(x / 3.0) * np.cos(y / 4.0 + c) + 0.2 * (x > width // 2)
     return torch.from_numpy(base + noise * rng.standard_normal(base.shape)), torch.from_numpy(base)
 
 
@@ -45,13 +41,12 @@ def plain_ssim(a: np.ndarray, b: np.ndarray, window: int, peak: float = 1.0) -> 
     weights = np.outer(taps, taps)[..., None] / taps.sum() ** 2
     c1, c2 = (0.01 * peak) ** 2, (0.03 * peak) ** 2
     values = []
-    for i in range(a.shape[0] - window + 1):
-        for j in range(a.shape[1] - window + 1):
-            p, q = a[i : i + window, j : j + window], b[i : i + window, j : j + window]
-            mp, mq = (weights * p).sum((0, 1)), (weights * q).sum((0, 1))
-            vp, vq = (weights * (p - mp) ** 2).sum((0, 1)), (weights * (q - mq) ** 2).sum((0, 1))
-            cov = (weights * (p - mp) * (q - mq)).sum((0, 1))
-            values.append((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2)))
+    for i, j in np.ndindex(a.shape[0] - window + 1, a.shape[1] - window + 1):
+        p, q = a[i : i + window, j : j + window], b[i : i + window, j : j + window]
+        mp, mq = (weights * p).sum((0, 1)), (weights * q).sum((0, 1))
+        vp, vq = (weights * (p - mp) ** 2).sum((0, 1)), (weights * (q - mq) ** 2).sum((0, 1))
+        cov = (weights * (p - mp) * (q - mq)).sum((0, 1))
+        values.append((2 * mp * mq + c1) * (2 * cov + c2) / ((mp**2 + mq**2 + c1) * (vp + vq + c2)))
     return float(np.mean(values))
 
 
@@ -73,15 +68,6 @@ def test_identical_images() -> None:
     assert ssim(image, image) == pytest.approx(1.0, abs=1e-12)
     black = torch.zeros(16, 16, 3)
     assert ssim(black, black) == 1.0
-
-
-@pytest.mark.parametrize("channels", [1, 2, 3, 4, 7])
-def test_ssim_equals_the_plain_implementation(channels: int) -> None:
-    rendered, truth = pair(23, 19, channels, seed=channels)
-    expected = plain_ssim(rendered.numpy(), truth.numpy(), SSIM_WINDOW)
-    assert 0.05 < expected < 0.95
-    assert ssim(rendered, truth) == pytest.approx(expected, abs=1e-12)
-    assert ssim(rendered.float(), truth.float()) == pytest.approx(expected, abs=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -142,21 +128,21 @@ def test_infinite_values_survive_strict_json() -> None:
     for value in (math.inf, 31.25):
         text = json.dumps(metric_to_json("psnr", value), allow_nan=False)
         assert metric_from_json(json.loads(text), "psnr") == value
-    assert json.loads(json.dumps(metric_to_json("psnr", math.inf))) == {"psnr": None, "psnr_infinite": True}
-    assert metric_from_json({"psnr": None}, "psnr") is None
-    assert metric_from_json({}, "psnr") is None
-    assert metric_from_json({"psnr": True}, "psnr") is None
-    assert metric_from_json({"psnr": "12"}, "psnr") is None
+    assert metric_to_json("psnr", math.inf) == {"psnr": None, "psnr_infinite": True}
+    for record in ({"psnr": None}, {}, {"psnr": True}, {"psnr": "12"}):
+        assert metric_from_json(record, "psnr") is None
 
 
-@pytest.mark.parametrize("channels", [1, 2, 5, 31])
+@pytest.mark.parametrize("channels", [1, 3, 4, 31])
 def test_any_number_of_channels_is_the_mean_over_them(channels: int) -> None:
     rendered, truth = pair(17, 23, channels)
+    expected = plain_ssim(rendered.numpy(), truth.numpy(), SSIM_WINDOW)
+    assert 0.05 < expected < 0.95 and ssim(rendered, truth) == pytest.approx(expected, abs=1e-12)
+    assert ssim(rendered.float(), truth.float()) == pytest.approx(expected, abs=1e-6)
     alone = [(rendered[..., i : i + 1], truth[..., i : i + 1]) for i in range(channels)]
     assert ssim(rendered, truth) == pytest.approx(np.mean([ssim(a, b) for a, b in alone]), abs=1e-12)
     errors = [10 ** (-psnr(a, b) / 10) for a, b in alone]
     assert psnr(rendered, truth) == pytest.approx(-10 * math.log10(float(np.mean(errors))), abs=1e-9)
-    assert ssim(rendered, truth) == pytest.approx(plain_ssim(rendered.numpy(), truth.numpy(), SSIM_WINDOW), abs=1e-9)
 
 
 def test_psnr_after_the_best_gain() -> None:

@@ -46,9 +46,7 @@ def quadrature(t: dict[str, Tensor], origin: Tensor, d: Tensor, near_z: Tensor, 
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(points))
     s = t0[:, None] + length[:, None] * (x + 1) / 2
     where = (origin + s[..., None] * d[:, None, :]).reshape(-1, 3)
-    sigma = CosineDensity(t["W1"].shape[1]).density(
-        {k: t[k] for k in DENSITY}, g, torch.zeros(len(where), dtype=torch.int64), where, {}
-    )
+    sigma = sigma_at(t, torch.zeros(len(where), dtype=torch.int64), where)
     return (sigma.reshape(s.shape) @ w) * length / 2
 
 
@@ -77,11 +75,9 @@ def test_density_is_the_formula_of_the_paper() -> None:
         u = [(x[0, j].item() - t["means"][row, j].item()) / m for j in range(3)]
         f = t["b2"][row, 0].item()
         for k in range(3):
-            f += t["w2"][row, k].item() * math.cos(
-                30 * (sum(t["W1"][row, k, j].item() * u[j] for j in range(3)) + t["b1"][row, k].item())
-            )
-        sigma = CosineDensity(3).density({n: t[n] for n in DENSITY}, geometry(t), torch.tensor([row]), x, {})
-        assert sigma.item() == pytest.approx(f / m, rel=1e-12)
+            phase = sum(t["W1"][row, k, j].item() * u[j] for j in range(3)) + t["b1"][row, k].item()
+            f += t["w2"][row, k].item() * math.cos(30 * phase)
+        assert sigma_at(t, torch.tensor([row]), x).item() == pytest.approx(f / m, rel=1e-12)
 
 
 def points_inside(g: Geometry, each: int, seed: int = 0) -> tuple[Tensor, Tensor]:
@@ -94,9 +90,10 @@ def points_inside(g: Geometry, each: int, seed: int = 0) -> tuple[Tensor, Tensor
     return rows, g.means.double()[rows] + (R @ (g.scales.double()[rows] * u)[:, :, None])[..., 0]
 
 
-def sigma_at(t: dict[str, Tensor], rows: Tensor, x: Tensor) -> Tensor:
+def sigma_at(t: dict[str, Tensor], rows: Tensor, x: Tensor, density: CosineDensity | None = None) -> Tensor:
     wide = {k: v.double() for k, v in t.items()}
-    return CosineDensity(t["W1"].shape[1]).density({k: wide[k] for k in DENSITY}, geometry(wide), rows, x, {})
+    density = density or CosineDensity(t["W1"].shape[1])
+    return density.density({k: wide[k] for k in DENSITY}, geometry(wide), rows, x, {})
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float32, 1e-6), (torch.float64, 1e-14)])
@@ -116,12 +113,11 @@ def test_split_carries_sigma(dtype: torch.dtype, bound: float, neurons: int, fac
 
     # the children lie inside their parents' support, apart from each other, and copying the weights would not have done
     g = geometry({k: v.double() for k, v in t.items()})
-    inside = ((child.means.double() - g.means[parents.repeat(2)])[:, None, :] @ g.rotations[parents.repeat(2)])[
-        :, 0
-    ] / g.scales[parents.repeat(2)]
+    twice = parents.repeat(2)
+    inside = ((child.means.double() - g.means[twice])[:, None, :] @ g.rotations[twice])[:, 0] / g.scales[twice]
     assert torch.allclose(inside.norm(dim=1), torch.tensor(0.5, dtype=torch.float64), atol=1e-5)
     assert torch.allclose(inside[:40], -inside[40:], atol=1e-5)
-    copies = {**children, **{k: t[k][parents.repeat(2)] for k in DENSITY}}
+    copies = {**children, **{k: t[k][twice] for k in DENSITY}}
     assert ((sigma_at(copies, rows, x) - before).abs() / largest).max() > 0.1
 
 
@@ -133,25 +129,13 @@ def test_split_wraps_phases_at_the_density_s_own_turn(omega0: float) -> None:
     density = CosineDensity(8, omega0)
     assert type(density)(**density.settings()).omega0 == omega0 and CosineDensity(8).settings() == {"neurons": 8}
     old = geometry(t)
-    new = Geometry(
-        old.means + 0.3 * old.length_scale[:, None] * torch.tensor([1.0, 0.0, 0.0]),
-        old.log_scales + math.log(0.6),
-        old.quats,
-    )
-    own = {k: t[k] for k in DENSITY}
-    child = density.on_split(own, old, new)
+    moved = old.means + 0.3 * old.length_scale[:, None] * torch.tensor([1.0, 0.0, 0.0])
+    new = Geometry(moved, old.log_scales + math.log(0.6), old.quats)
+    child = density.on_split({k: t[k] for k in DENSITY}, old, new)
     assert child["b1"].abs().max() <= math.pi / omega0 * (1 + 1e-6) < t["b1"].abs().max()
     rows, x = points_inside(new, 20)
-    before, after = (
-        density.density(
-            {k: v.double() for k, v in p.items()},
-            Geometry(*(y.double() for y in (g.means, g.log_scales, g.quats))),
-            rows,
-            x,
-            {},
-        )
-        for p, g in ((own, old), (child, new))
-    )
+    children = {**child, "means": new.means, "log_scales": new.log_scales, "quats": new.quats}
+    before, after = (sigma_at(p, rows, x, density) for p in (t, children))
     assert (before - after).abs().max() <= 1e-5 * before.abs().max()
 
 
@@ -188,14 +172,8 @@ def test_scaling_the_scene_leaves_the_image(scale: float) -> None:
 
 @pytest.mark.parametrize("neurons", [0, 1, 8])
 def test_a_fresh_primitive_has_the_opacity_asked_for(neurons: int) -> None:
-    n = 5
-    context = InitContext(
-        torch.zeros(n, 3),
-        torch.full((n,), 0.3),
-        torch.full((n, 3), 0.5),
-        torch.Generator().manual_seed(0),
-        {"alpha": 0.6},
-    )
+    n, generator = 5, torch.Generator().manual_seed(0)
+    context = InitContext(torch.zeros(n, 3), torch.full((n,), 0.3), torch.full((n, 3), 0.5), generator, {"alpha": 0.6})
     fresh = Primitives.initialise(CosineDensity(neurons), SphericalHarmonics(0), context)
     b2 = fresh.params["b2"]
     assert torch.allclose(1 - torch.exp(-2 * b2), torch.full((n, 1), 0.6)), "a central chord has optical depth 2 b2"

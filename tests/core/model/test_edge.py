@@ -77,16 +77,12 @@ def test_gradients_of_a_part_of_a_chord() -> None:
 def test_a_chord_is_the_integral_of_the_density(edge: int) -> None:
     """Whole chords and parts of them, of a lowered form, against quadrature of the density at points."""
     t = scenes.tensors(8, 4, seed=2, dtype=F64)
-    geometry, form = (
-        Geometry(t["means"], t["log_scales"], t["quats"]),
-        Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 20.0, edge),
-    )
+    geometry = Geometry(t["means"], t["log_scales"], t["quats"])
+    form = Cosine(t["W1"], t["b1"], t["w2"], t["b2"], 20.0, edge)
     g = torch.Generator().manual_seed(3)
     prim = torch.arange(8).repeat(10)
-    d = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1)
-    y = torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1) * torch.rand(
-        80, 1, generator=g, dtype=F64
-    )
+    d, y = (torch.nn.functional.normalize(torch.randn(80, 3, generator=g, dtype=F64), dim=-1) for _ in range(2))
+    y = y * torch.rand(80, 1, generator=g, dtype=F64)
     start = geometry.means[prim] + (geometry.rotations[prim] @ (geometry.scales[prim] * y)[:, :, None])[..., 0]
     v = (geometry.rotations[prim].transpose(1, 2) @ d[:, :, None])[..., 0] / geometry.scales[prim]
     a, b = v.square().sum(-1), (y * v).sum(-1)
@@ -96,9 +92,8 @@ def test_a_chord_is_the_integral_of_the_density(edge: int) -> None:
     found = form.optical_depth(Pairs.of(geometry, prim, start, d, t0, t1))
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(200))
     at = t0[:, None] + (t1 - t0)[:, None] * (x + 1) / 2
-    sigma = cosine_density(
-        form, geometry, prim.repeat_interleave(200), (start[:, None] + at[..., None] * d[:, None]).reshape(-1, 3)
-    )
+    points = (start[:, None] + at[..., None] * d[:, None]).reshape(-1, 3)
+    sigma = cosine_density(form, geometry, prim.repeat_interleave(200), points)
     exact = (sigma.reshape(80, 200) * w).sum(-1) * (t1 - t0) / 2
     largest = (t1 - t0) * (t["b2"].abs()[:, 0] + t["w2"].abs().sum(-1))[prim] / geometry.length_scale[prim]
     assert ((found - exact).abs() / largest).max() <= 1e-12
@@ -113,10 +108,10 @@ def test_a_sphere_starts_as_opaque_whatever_its_edge() -> None:
 
 
 def test_another_form_takes_none_of_the_presets_settings() -> None:
-    assert compose(["task=static"], check_output=False).model.density == {"form": "cosine", "edge": 2, "gain": True}
-    for words in (["model.density.form=gaussian"], ["model.density={form: gaussian}"]):
-        assert compose(["task=static", *words], check_output=False).model.density == {"form": "gaussian"}
-    own = compose(
-        ["task=static", "model.density.form=cosine", "model.density.edge=1"], check_output=False
-    ).model.density
-    assert own == {"form": "cosine", "edge": 1, "gain": True}
+    for words, density in (
+        ([], {"form": "cosine", "edge": 2, "gain": True}),
+        (["model.density.form=gaussian"], {"form": "gaussian"}),
+        (["model.density={form: gaussian}"], {"form": "gaussian"}),
+        (["model.density.form=cosine", "model.density.edge=1"], {"form": "cosine", "edge": 1, "gain": True}),
+    ):
+        assert compose(["task=static", *words], check_output=False).model.density == density

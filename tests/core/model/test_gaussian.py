@@ -28,11 +28,8 @@ from tests.core import tiny
 
 def tensors(count: int, seed: int = 0, dtype: torch.dtype = torch.float64) -> dict[str, Tensor]:
     t = scenes.tensors(count, 0, seed=seed, dtype=dtype)
-    return {
-        **{k: t[k] for k in ("means", "log_scales", "quats")},
-        "log_amplitude": (t["b2"].abs() + 0.1).log(),
-        "sh_dc": t["colors"] * 4 - 2,
-    }
+    own = {"log_amplitude": (t["b2"].abs() + 0.1).log(), "sh_dc": t["colors"] * 4 - 2}
+    return {**{k: t[k] for k in ("means", "log_scales", "quats")}, **own}
 
 
 def geometry(t: dict[str, Tensor]) -> Geometry:
@@ -56,12 +53,9 @@ def chords(t: dict[str, Tensor], distance: float, seed: int = 0) -> tuple[Tensor
     """(o, d, t0, t1): one ray per primitive that meets it, ``distance`` scene units away."""
     gen = torch.Generator().manual_seed(seed)
     g, n = geometry(t), len(t["means"])
-    d = torch.nn.functional.normalize(torch.randn(n, 3, generator=gen, dtype=torch.float64), dim=1)
-    u = torch.nn.functional.normalize(torch.randn(n, 3, generator=gen, dtype=torch.float64), dim=1)
-    inside = (
-        g.means
-        + (g.rotations @ (g.scales * u * torch.rand(n, 1, generator=gen, dtype=torch.float64))[:, :, None])[..., 0]
-    )
+    d, u = (torch.nn.functional.normalize(torch.randn(n, 3, generator=gen).double(), dim=1) for _ in range(2))
+    u = u * torch.rand(n, 1, generator=gen)
+    inside = g.means + (g.rotations @ (g.scales * u)[:, :, None])[..., 0]
     o = inside - distance * d
     to_sphere = g.rotations.transpose(1, 2) / g.scales[:, :, None]
     y, v = (to_sphere @ (inside - g.means)[:, :, None])[..., 0], (to_sphere @ d[:, :, None])[..., 0]
@@ -128,14 +122,8 @@ def test_gradients_are_finite_differences() -> None:
     def both(*values: Tensor) -> Tensor:
         now = dict(zip(names, values[:4], strict=True))
         o, d, a, b = values[4:]
-        whole = integral(field, now, prim, o, d, a, b)
-        return torch.cat(
-            [
-                whole,
-                integral(field, now, prim, o, d, middle, b),
-                integral(field, now, prim, o, d, middle, middle + 1e-3),
-            ]
-        )
+        ends = ((a, b), (middle, b), (middle, middle + 1e-3))
+        return torch.cat([integral(field, now, prim, o, d, *pair) for pair in ends])
 
     inputs = [v.clone().requires_grad_() for v in (*(t[n] for n in names), o, d, t0, t1)]
     assert torch.autograd.gradcheck(both, inputs, atol=1e-7, rtol=1e-5)
@@ -163,9 +151,8 @@ def test_parameters_and_start() -> None:
         context = InitContext(unit["means"], torch.ones(1), torch.ones(1, 3), torch.Generator(), settings)
         start = {**unit, "log_amplitude": field.parameters()[0].init(context)}
         ends = torch.tensor([1.0]), torch.tensor([3.0])
-        depth = integral(
-            field, start, torch.tensor([0]), torch.tensor([[-2.0, 0, 0]]), torch.tensor([[1.0, 0, 0]]), *ends
-        )
+        ray = torch.tensor([[-2.0, 0, 0]]), torch.tensor([[1.0, 0, 0]])
+        depth = integral(field, start, torch.tensor([0]), *ray, *ends)
         assert 1 - math.exp(-depth.item()) == pytest.approx(alpha, rel=1e-6)
 
 

@@ -17,21 +17,15 @@ from neuprim.tasks.static import SphericalHarmonics
 
 
 def build(count: int = 4, neurons: int = 8, degree: int = 3, channels: int = 3) -> Primitives:
-    context = InitContext(
-        torch.arange(3.0 * count).reshape(count, 3),
-        torch.full((count,), 0.2),
-        torch.rand(count, channels),
-        torch.Generator().manual_seed(0),
-    )
+    means, colours = torch.arange(3.0 * count).reshape(count, 3), torch.rand(count, channels)
+    context = InitContext(means, torch.full((count,), 0.2), colours, torch.Generator().manual_seed(0))
     return Primitives.initialise(CosineDensity(neurons), SphericalHarmonics(degree, channels), context)
 
 
 def test_ninety_nine_parameters() -> None:
     model = build()
-    assert model.parameters_per_primitive == 99
-    assert sum(s.size for s in GEOMETRY_SPECS) == 10
-    assert sum(s.size for s in model.density.parameters()) == 41
-    assert sum(s.size for s in model.colour.parameters()) == 48
+    specs = (GEOMETRY_SPECS, model.density.parameters(), model.colour.parameters())
+    assert [sum(s.size for s in own) for own in specs] == [10, 41, 48] and model.parameters_per_primitive == 99
     assert sum(v.numel() for v in model.params.values()) == 99 * 4
 
 

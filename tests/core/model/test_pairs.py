@@ -84,10 +84,8 @@ def test_colours_along_chords_and_at_centres() -> None:
     assert isinstance(varies, RayNet) and varies.flat is None and varies.per_primitive
     phase = (varies.Wx[pairs.prim] * pairs.local[:, None]).sum(-1) + varies.bias[pairs.prim]
     expected = (varies.base[pairs.prim] + (varies.Wout[pairs.prim] * phase.cos()[:, None]).sum(-1)).clamp_min(0)
-    assert (
-        torch.allclose(net.chord_colours(pairs), expected)
-        and (net.chord_colours(pairs) - net.center_colors(position)[pairs.prim]).abs().max() > 0.01
-    )
+    assert torch.allclose(net.chord_colours(pairs), expected)
+    assert (net.chord_colours(pairs) - net.center_colors(position)[pairs.prim]).abs().max() > 0.01
     code = CustomColour(lambda prim, x, d: torch.cat([x, d[:, :1]], 1), 4)
     opaque = replace(low, colour=code)
     assert code.flat is None and not code.per_primitive

@@ -68,9 +68,8 @@ def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) 
     for name, piece in prunable_units_by_name(model.density, model.colour).items():
         everywhere = torch.ones(COUNT, dtype=torch.bool)
         empty = Primitives(model.density, model.colour, zero_units({name: (piece, everywhere)}, model.params))
-        assert not bool(primitives_with_unit(piece, empty.params).any()) and bool(
-            primitives_with_unit(piece, model.params).all()
-        )
+        assert not bool(primitives_with_unit(piece, empty.params).any())
+        assert bool(primitives_with_unit(piece, model.params).all())
         empty.lower(camera(), CONDITIONS).check()
         untouched = [key for key in model.params if key not in piece.places]
         assert all(empty.params[key] is model.params[key] for key in untouched)
@@ -80,13 +79,10 @@ def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
     model = made(*PAIRS[0])
     piece = prunable_units_by_name(model.density, model.colour)["density.neuron 1"]
     empty = zero_units({"": (piece, torch.ones(COUNT, dtype=torch.bool))}, model.params)
-    fewer = {
-        name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value
-        for name, value in model.of(model.density).items()
-    }
+    own = model.of(model.density)
+    fewer = {name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value for name, value in own.items()}
     prim, x = torch.arange(COUNT), model.params["means"] + 0.02
-    own = {name: empty[name] for name in model.of(model.density)}
-    found = model.density.density(own, model.geometry, prim, x, {})
+    found = model.density.density({name: empty[name] for name in own}, model.geometry, prim, x, {})
     expected = CosineDensity(2, edge=2, gain=True).density(fewer, model.geometry, prim, x, {})
     assert torch.allclose(found, expected, atol=1e-6)
 
@@ -115,9 +111,8 @@ def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field)
     stored, sparse = sparse_parameters(model.params, own)
     again = dense_parameters(stored, sparse, own, "file")
     assert sparse and again.keys() == model.params.keys()
-    assert all(
-        torch.equal(again[name].view(torch.int32), value.view(torch.int32)) for name, value in model.params.items()
-    )
+    for name, value in model.params.items():
+        assert torch.equal(again[name].view(torch.int32), value.view(torch.int32)), name
     assert sum(t.numel() * t.element_size() for t in stored.values()) < 4 * model.count * model.parameters_per_primitive
 
 
@@ -129,13 +124,8 @@ def task() -> TaskSpec:
 @pytest.fixture
 def file(tmp_path: Path, task: TaskSpec) -> Path:
     path = tmp_path / "model.safetensors"
-    checkpoint.save_model(
-        path,
-        pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3))),
-        task.name,
-        {},
-        without_zeros=True,
-    )
+    model = pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3)))
+    checkpoint.save_model(path, model, task.name, {}, without_zeros=True)
     return path
 
 
@@ -151,14 +141,11 @@ def test_a_pruned_model_loads_as_it_was(file: Path, task: TaskSpec) -> None:
 
 LIES = {
     "no mask": (lambda t: t.pop("sh_rest|there"), "sh_rest|there is missing"),
-    "a short mask": (
-        lambda t: t.update({"sh_rest|there": torch.zeros(1, dtype=torch.uint8)}),
-        f"expected torch.uint8 ({BITS},)",
-    ),
+    "a short mask": (lambda t: t.update({"sh_rest|there": torch.zeros(1).byte()}), f"expected torch.uint8 ({BITS},)"),
     "a mask of floats": (lambda t: t.update({"sh_rest|there": torch.zeros(BITS)}), f"expected torch.uint8 ({BITS},)"),
     "numbers too few": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"][:-1]}), "sh_rest|numbers is"),
     "numbers too many": (
-        lambda t: t.update({"sh_rest|there": torch.zeros(BITS, dtype=torch.uint8)}),
+        lambda t: t.update({"sh_rest|there": torch.zeros(BITS).byte()}),
         "expected torch.float32 (0,)",
     ),
     "another type": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"].double()}), "is torch.float64"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import pytest
 import torch
@@ -86,22 +86,16 @@ def test_dropped_bands_are_the_basis_cut_off() -> None:
 def inside(geometry: Geometry, count: int, generator: torch.Generator) -> Tensor:
     """(N, count, 3) points, uniform in each ellipsoid."""
     y = torch.randn((geometry.count, count, 3), generator=generator, dtype=torch.float64)
-    y = (
-        y
-        / y.norm(dim=-1, keepdim=True)
-        * torch.rand((geometry.count, count, 1), generator=generator, dtype=torch.float64) ** (1 / 3)
-    )
-    return (
-        geometry.means.double()[:, None]
-        + (geometry.rotations.double()[:, None] @ (geometry.scales.double()[:, None] * y)[..., None])[..., 0]
-    )
+    radius = torch.rand((geometry.count, count, 1), generator=generator, dtype=torch.float64) ** (1 / 3)
+    y = geometry.scales.double()[:, None] * y / y.norm(dim=-1, keepdim=True) * radius
+    return geometry.means.double()[:, None] + (geometry.rotations.double()[:, None] @ y[..., None])[..., 0]
 
 
-def sigma(model: Primitives, x: Tensor) -> Tensor:
+def sigma(model: Primitives, x: Tensor, conditions: Mapping[str, Tensor] = CONDITIONS) -> Tensor:
     """(N, count) densities."""
     n, count, _ = x.shape
-    form = model.density.lower(model.of(model.density), model.geometry, CONDITIONS)
-    wide = Geometry(*(t.double() for t in (model.params["means"], model.params["log_scales"], model.params["quats"])))
+    form = model.density.lower(model.of(model.density), model.geometry, conditions)
+    wide = Geometry(*(model.params[name].double() for name in ("means", "log_scales", "quats")))
     prim = torch.arange(n).repeat_interleave(count)
     return cosine_density(form, wide, prim, x.reshape(-1, 3)).reshape(n, count)
 
@@ -127,21 +121,8 @@ def test_means_of_phases_that_advance_are_those_over_the_sequence() -> None:
     model.params["W_t"] *= 3
     x = inside(model.geometry, 1500, torch.Generator().manual_seed(2))
     params = prune_neurons(model.of(model.density), model.geometry, 0, OMEGA0)
-    form = [
-        TimeDensity(3, "phase").lower(model.of(model.density), model.geometry, {"time": torch.tensor(t)})
-        for t in torch.linspace(0, 1, 41).tolist()
-    ]
-    prim = torch.arange(COUNT).repeat_interleave(1500)
-    wide = Geometry(*(t.double() for t in (model.params["means"], model.params["log_scales"], model.params["quats"])))
-    weights = torch.ones(41, dtype=torch.float64)
-    weights[0] = weights[-1] = 0.5
-    mean = (
-        sum(
-            w * cosine_density(f, wide, prim, x.reshape(-1, 3)).reshape(COUNT, -1).mean(1)
-            for w, f in zip(weights, form, strict=True)
-        )
-        / 40
-    )
+    means = torch.stack([sigma(model, x, {"time": t}).mean(1) for t in torch.linspace(0, 1, 41)])
+    mean = torch.trapezoid(means, dx=1 / 40, dim=0)
     amplitude = model.params["w2"].abs().sum(1) / model.geometry.length_scale
     assert ((mean * model.geometry.length_scale - params["b2"][:, 0]).abs() / amplitude.clamp_min(1e-6)).median() < 0.05
 
@@ -179,9 +160,8 @@ def test_a_still_phase_is_the_mean_of_the_moving_one() -> None:
     assert field.settings()["time"] == "none" and "W_t" not in params
     prim, x = torch.arange(COUNT), model.params["means"] + 0.01
     times = (torch.arange(400) + 0.5) / 400
-    mean = torch.stack([density.density(model.of(density), model.geometry, prim, x, {"time": t}) for t in times]).mean(
-        0
-    )
+    moving = [density.density(model.of(density), model.geometry, prim, x, {"time": t}) for t in times]
+    mean = torch.stack(moving).mean(0)
     still = field.density(params, model.geometry, prim, x, CONDITIONS)
     assert torch.allclose(still, mean, rtol=1e-3, atol=1e-3 * float(mean.abs().max()))
 

@@ -17,9 +17,8 @@ ROWS = {"some": [1, 2, 5, 8], "all": list(range(9)), "none": [], "the first": [0
 def tensors(dtype: torch.dtype) -> dict[str, Tensor]:
     g = torch.Generator().manual_seed(0)
     shapes: dict[str, tuple[int, ...]] = {"means": (3,), "W1": (2, 3), "b2": (1,), "scalar": (), "nothing": (0, 3)}
-    return {
-        n: torch.randn(9, *s, generator=g, dtype=torch.float64).to(dtype).requires_grad_() for n, s in shapes.items()
-    }
+    wide = {n: torch.randn(9, *s, generator=g, dtype=torch.float64) for n, s in shapes.items()}
+    return {n: x.to(dtype).requires_grad_() for n, x in wide.items()}
 
 
 def pull(taken: dict[str, Tensor]) -> None:
@@ -56,11 +55,8 @@ def test_strides_do_not_matter_and_what_nothing_is_asked_of_has_no_gradient() ->
 @pytest.mark.parametrize("count", [3, 5000])
 def test_without_a_gradient_few_and_many_rows(count: int) -> None:
     g = torch.Generator().manual_seed(3)
-    mine = {
-        "means": torch.randn(6000, 3, generator=g),
-        "nothing": torch.zeros(6000, 0, 3),
-        "b2": torch.randn(6000, generator=g).requires_grad_(),
-    }
+    mine = {"means": torch.randn(6000, 3, generator=g), "nothing": torch.zeros(6000, 0, 3)}
+    mine["b2"] = torch.randn(6000, generator=g).requires_grad_()
     rows = torch.randperm(6000, generator=g)[:count].sort().values
     with torch.no_grad():
         taken = take_primitive_rows(mine, rows)
@@ -74,10 +70,7 @@ def formula(w2: Tensor, b2: Tensor, log_gain: Tensor) -> tuple[Tensor, Tensor]:
 
 def given(neurons: int, dtype: torch.dtype, flat: bool) -> list[Tensor]:
     g = torch.Generator().manual_seed(neurons)
-    w2, b2 = (
-        torch.randn(8, neurons, generator=g, dtype=torch.float64),
-        torch.randn(8, 1, generator=g, dtype=torch.float64),
-    )
+    w2, b2 = (torch.randn(8, n, generator=g, dtype=torch.float64) for n in (neurons, 1))
     log_gain = torch.tensor([0.0, 1.5, -3.0, GAIN_LIMIT, -GAIN_LIMIT, 25.0, -400.0, 1e-9], dtype=torch.float64)[:, None]
     b2[0] = 0.0
     tensors = [w2, b2.reshape(-1) if flat else b2, log_gain.reshape(-1) if flat else log_gain]
@@ -89,15 +82,11 @@ def given(neurons: int, dtype: torch.dtype, flat: bool) -> list[Tensor]:
 @pytest.mark.parametrize(("dtype", "tolerance"), [(torch.float32, 2e-6), (torch.float64, 1e-14)])
 def test_it_is_the_formula_forward_and_backward(dtype: torch.dtype, tolerance: float, neurons: int, flat: bool) -> None:
     """Beyond the limit a gain has no gradient, at it one."""
-    mine, exact = (
-        given(neurons, dtype, flat),
-        [x.detach().double().requires_grad_() for x in given(neurons, dtype, flat)],
-    )
+    mine = given(neurons, dtype, flat)
+    exact = [x.detach().double().requires_grad_() for x in mine]
     found, wanted = apply_density_gain(*mine), formula(*exact)
-    same = formula(*given(neurons, dtype, flat))
-    assert all(torch.equal(a, b) for a, b in zip(found, same, strict=True)), (
-        "drawn values do not depend on how gradients are found"
-    )
+    # drawn values do not depend on how gradients are found
+    assert all(torch.equal(a, b) for a, b in zip(found, formula(*mine), strict=True))
     pull = [torch.randn(x.shape, generator=torch.Generator().manual_seed(7), dtype=torch.float64) for x in wanted]
     torch.autograd.backward(list(found), [p.to(dtype) for p in pull])
     torch.autograd.backward(list(wanted), [p.to(dtype).double() for p in pull])

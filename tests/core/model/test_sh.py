@@ -40,9 +40,8 @@ def test_order_and_signs() -> None:
     """Those of 3D Gaussian splatting: y, z, x with signs -, +, - in band 1."""
     x, y, z = torch.eye(3, dtype=torch.float64)[:, None]
     c1 = math.sqrt(3 / (4 * math.pi))
-    assert sh.sh_basis(x, 1)[0].tolist() == pytest.approx([sh.C0, 0, 0, -c1])
-    assert sh.sh_basis(y, 1)[0].tolist() == pytest.approx([sh.C0, -c1, 0, 0])
-    assert sh.sh_basis(z, 1)[0].tolist() == pytest.approx([sh.C0, 0, c1, 0])
+    for axis, band in ((x, [0, 0, -c1]), (y, [-c1, 0, 0]), (z, [0, c1, 0])):
+        assert sh.sh_basis(axis, 1)[0].tolist() == pytest.approx([sh.C0, *band])
     assert sh.sh_basis(z, 2)[0, 6].item() == pytest.approx(0.6307831305050401)
     assert sh.sh_basis(x, 2)[0, 8].item() == pytest.approx(0.5462742152960396)
     assert sh.sh_basis(x, 3)[0, 15].item() == pytest.approx(-0.5900435899266435)

@@ -243,8 +243,8 @@ def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> 
         decoded = _DECODER.decode(message)
     except (msgspec.MsgspecError, ValueError, RecursionError) as error:
         return f"a message that this page does not send: {' '.join(str(error).split())[:200]}"
-    turned = isinstance(decoded, ViewerCameraMessage | TransformControlsUpdateMessage)
-    if turned and not 0.99 < math.hypot(*decoded.wxyz) < 1.01:
+    quaternion = getattr(decoded, "wxyz", (1.0,))
+    if not 0.99 < math.hypot(*quaternion) < 1.01:
         return "a message that this page does not send: expected a unit quaternion - at `$.wxyz`"
     if not isinstance(decoded, GuiUpdateMessage):
         return None

@@ -139,6 +139,20 @@ def test_split_wraps_phases_at_the_density_s_own_turn(omega0: float) -> None:
     assert (before - after).abs().max() <= 1e-5 * before.abs().max()
 
 
+@pytest.mark.parametrize("edge", [1, 2])
+def test_children_with_a_soft_edge_have_their_parents_mass(edge: int) -> None:
+    """Without neurons a density's integral over space is b2/m times the volume, times a constant of the edge."""
+    t = scenes.tensors(20, 0, seed=5, dtype=torch.float64)
+    old = geometry(t)
+    new = Geometry(old.means, old.log_scales + torch.tensor([0.5, 0.8, 0.9], dtype=torch.float64).log(), old.quats)
+    child = CosineDensity(0, edge=edge).on_split({k: t[k] for k in DENSITY}, old, new)
+
+    def mass(b2: Tensor, g: Geometry) -> Tensor:
+        return b2[:, 0] / g.length_scale * g.scales.prod(1)
+
+    assert torch.allclose(2 * mass(child["b2"], new), mass(t["b2"], old), rtol=1e-12, atol=0)
+
+
 @pytest.mark.parametrize("neurons", [0, 5])
 def test_two_half_clones_are_the_original(neurons: int) -> None:
     t = scenes.tensors(12, neurons, seed=3, dtype=torch.float64)

@@ -37,7 +37,7 @@ from shared.trials import Trial, begin
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.runs.fit import train_to_end
 
@@ -66,7 +66,7 @@ def median_ms(run: Callable[[], Any], repeats: int = 20, warm: int = 3) -> float
     return statistics.median(times)
 
 
-def scene_on_gpu(count: int, neurons: int, edge: int) -> tuple[Lowered, list[torch.Tensor]]:
+def scene_on_gpu(count: int, neurons: int, edge: int) -> tuple[LoweredPrimitives, list[torch.Tensor]]:
     """The random scene of the other benchmarks, its first neurons, and the tensors that it is made of."""
     low = lower(random_scene(count))
     g, d, c = low.geometry, low.density, low.colour
@@ -74,7 +74,9 @@ def scene_on_gpu(count: int, neurons: int, edge: int) -> tuple[Lowered, list[tor
     tensors = [g.means, g.log_scales, g.quats, d.W1[:, :neurons], d.b1[:, :neurons], d.w2[:, :neurons], d.b2, c.rgb]
     leaves = [tensor.detach().cuda().contiguous().requires_grad_() for tensor in tensors]
     means, log_scales, quats, W1, b1, w2, b2, rgb = leaves
-    return Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 1.0, edge), Constant(rgb)), leaves
+    return LoweredPrimitives(
+        Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 1.0, edge), Constant(rgb)
+    ), leaves
 
 
 def make_camera(width: int, height: int) -> Camera:
@@ -82,7 +84,9 @@ def make_camera(width: int, height: int) -> Camera:
     return Camera(square.viewmat, square.fx, square.fy, width / 2, height / 2, width, height)
 
 
-def make_passes(lowered: Lowered, leaves: list[torch.Tensor], camera: Camera) -> dict[str, Callable[[], None]]:
+def make_passes(
+    lowered: LoweredPrimitives, leaves: list[torch.Tensor], camera: Camera
+) -> dict[str, Callable[[], None]]:
     """A forward pass, a forward and backward pass, and a training step."""
     settings, background = RenderSettings(backend="cuda"), torch.zeros(3, device="cuda")
     target = torch.rand(camera.height, camera.width, 3, device="cuda")

@@ -72,7 +72,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         return
     if name == BESIDE:
         for title, made in (
-            ("harmonics", sh_warp._kernels(3)),
+            ("harmonics", sh_warp._harmonic_kernels(3)),
             ("Adam", kernels_warp.adam_kernels()),
             ("SSIM", kernels_warp.ssim_kernels()),
             ("grid", (density_grid_warp._add_kernel(),)),

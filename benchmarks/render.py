@@ -33,7 +33,7 @@ from shared.timing import fastest
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.model.fields import Constant, Cosine
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.render import RenderSettings, layout, render_lowered
 from neuprim.core.render.cpu.layout import gradient_width, row_width
@@ -65,7 +65,7 @@ def _count_hits(E0, EX, EY, XA, tc, anchor, boxes):  # type: ignore[no-untyped-d
     return hits
 
 
-def count_true_hits(lowered: Lowered, camera: Camera) -> int:
+def count_true_hits(lowered: LoweredPrimitives, camera: Camera) -> int:
     """Rays that really meet a primitive within its silhouette, of all (pixel, primitive) pairs; counted in the frame
     that a forward pass keeps."""
     node = render_lowered(lowered, camera, RenderSettings(backend="cpu"), torch.zeros(3)).rgb.grad_fn
@@ -78,7 +78,7 @@ def count_true_hits(lowered: Lowered, camera: Camera) -> int:
     return int(_count_hits(*parts, rows[:, layout.TC], rows[:, [layout.UX, layout.UY]], frame.projected.boxes))
 
 
-def make_passes(lowered: Lowered, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
+def make_passes(lowered: LoweredPrimitives, camera: Camera, threads: int) -> tuple[Passes, dict[str, int]]:
     """The forward pass, the backward pass and a whole step; lanes of the first two, and pairs."""
     settings, background = RenderSettings(backend="cpu", threads=threads), torch.zeros(3)
     g_rgb = torch.ones(camera.height, camera.width, 3)

@@ -26,7 +26,7 @@ from shared.tables import DOCS, PERFORMANCE, Run, Table, between_markers, make_t
 from shared.timing import fastest
 
 from neuprim.core.compute.threads import core_count, cpu_name
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.report.charts import LARGE, Chart, Points, write_png_charts
 
@@ -40,7 +40,7 @@ SERIES = {
 """Primitives, side of the image and overlap."""
 
 
-def render_frame(lowered: Lowered, size: int, threads: int, backward: bool) -> RenderOutput:
+def render_frame(lowered: LoweredPrimitives, size: int, threads: int, backward: bool) -> RenderOutput:
     with torch.set_grad_enabled(backward):
         out = render_lowered(lowered, view(size), RenderSettings(backend="cpu", threads=threads), torch.zeros(3))
     if backward:

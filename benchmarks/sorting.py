@@ -30,7 +30,7 @@ from shared.unsorted_volume import measure_sorting_errors
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.runs.open import load_dataset, load_run
 
@@ -40,7 +40,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "sort=center samples=2": {"samples": 2},
     "sort=entry samples=2": {"sort": "entry", "samples": 2},
 }
-Scene = tuple[Lowered, Camera, Tensor]
+Scene = tuple[LoweredPrimitives, Camera, Tensor]
 
 
 def open_scene(folder: Path, index: int) -> tuple[str, Scene]:

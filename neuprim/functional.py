@@ -14,8 +14,8 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonF
 from neuprim.core.model.densities.cosine import apply_density_gain
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
-from neuprim.core.model.tensors import Sizes, tensor_fault
+from neuprim.core.model.primitives import LoweredPrimitives
+from neuprim.core.model.tensors import Sizes, primitive_tensor_fault
 from neuprim.core.render import Contributions, RenderSettings, RenderStats, backends, render_lowered
 
 __all__ = ["Rasterized", "rasterize"]
@@ -114,7 +114,7 @@ def rasterize(
             f"pass {able} or Ks.detach()"
         )
     frames = [
-        render_lowered(Lowered(geometry, density, Constant(palette)), camera, render_settings, behind)
+        render_lowered(LoweredPrimitives(geometry, density, Constant(palette)), camera, render_settings, behind)
         for palette, camera, behind in zip(palettes, cameras, backdrop, strict=True)
     ]
     if not frames:
@@ -146,7 +146,7 @@ def _render_settings(settings: dict[str, Any]) -> RenderSettings:
 
 
 def _check_tensor(name: str, value: Any) -> None:
-    fault = tensor_fault(value)
+    fault = primitive_tensor_fault(value)
     if fault is not None:
         raise DataError(f"rasterize: {name} has {fault}")
 

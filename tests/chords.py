@@ -8,8 +8,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.model.geometry import Pairs
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.geometry import PrimitiveChords
+from neuprim.core.model.primitives import LoweredPrimitives
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Chords:
     middle: Tensor
 
 
-def chords(lowered: Lowered, camera: Camera, near: float = 0.01) -> Chords:
+def chords(lowered: LoweredPrimitives, camera: Camera, near: float = 0.01) -> Chords:
     """By the quadratic equation of each ray and ellipsoid."""
     geometry, view = lowered.geometry, camera.viewmat.double()
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
@@ -46,7 +46,7 @@ def chords(lowered: Lowered, camera: Camera, near: float = 0.01) -> Chords:
         t0, t1 = torch.maximum((-b - root) / a, near * length), (-b + root) / a
         hit = ((b * b - a * c > 0) & (t1 > t0)).nonzero()[:, 0]
         if len(hit):
-            pairs = Pairs.of(geometry, torch.full_like(hit, i), origin, directions[hit], t0[hit], t1[hit])
+            pairs = PrimitiveChords.of(geometry, torch.full_like(hit, i), origin, directions[hit], t0[hit], t1[hit])
             tau[i, hit] = lowered.optical_depth(pairs).detach().clamp_min(0)
             middle[i, hit] = ((t0 + t1) / 2 / length)[hit]
     order = (geometry.means.detach().double() @ view[2, :3] + view[2, 3]).argsort(stable=True)

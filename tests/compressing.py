@@ -10,7 +10,7 @@ from torch import Tensor
 from neuprim.core.compression import BitTable, Quantizers, canonical_model, fit_quantizers, storage_order
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.densities.gaussian import GaussianDensity
-from neuprim.core.model.fields import ColourField, DensityField, prunable_units_by_name
+from neuprim.core.model.fields import ColourField, DensityField, prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import PrunableUnit, zero_units
 from neuprim.core.model.schema import InitContext
@@ -78,7 +78,7 @@ def example(name: str, count: int = 40) -> tuple[TaskSpec, Primitives]:
 
 def goners(model: Primitives) -> dict[str, tuple[PrunableUnit, Tensor]]:
     """Of every piece of a model, every k-th primitive, with another k for each."""
-    pieces = prunable_units_by_name(model.density, model.colour)
+    pieces = prunable_units_of_model(model.density, model.colour)
     return {
         name: (piece, torch.arange(model.count) % (2 + i % 3) == 0) for i, (name, piece) in enumerate(pieces.items())
     }

@@ -14,7 +14,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.densities.cosine import apply_density_gain
 from neuprim.core.model.fields import Constant, Cosine, LoweredColour, RayNet
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 
 
 def camera(
@@ -90,8 +90,8 @@ def soft(edge: int) -> Iterator[None]:
         _EDGE.reset(token)
 
 
-def lowered(t: dict[str, Tensor]) -> Lowered:
+def lowered(t: dict[str, Tensor]) -> LoweredPrimitives:
     """The renderer's input from a dictionary of :func:`tensors`, which may hold a ``log_gain``."""
     w2, b2 = apply_density_gain(t["w2"], t["b2"], t.get("log_gain"))
     density = Cosine(t["W1"], t["b1"], w2, b2, edge=_EDGE.get())
-    return Lowered(Geometry(t["means"], t["log_scales"], t["quats"]), density, colour(t))
+    return LoweredPrimitives(Geometry(t["means"], t["log_scales"], t["quats"]), density, colour(t))

@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 
 KINDS = {"thin": (500, 1), "deep": (300, 2), "inside": (200, 3)}
@@ -50,7 +50,9 @@ def render_with_gradients(
     view.requires_grad_()
     background = torch.tensor([0.2, 0.5, 0.8], dtype=torch.float64, requires_grad=True)
     means, log_scales, quats, W1, b1, w2, b2, colours = leaves
-    lowered = Lowered(Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 30.0, edge), Constant(colours))
+    lowered = LoweredPrimitives(
+        Geometry(means, log_scales, quats), Cosine(W1, b1, w2, b2, 30.0, edge), Constant(colours)
+    )
     out = render_lowered(lowered, Camera(view, 70.0, 72.0, 31.0, 33.0, SIZE, SIZE), settings, background)
     depth = torch.zeros_like(out.alpha) if out.depth is None else out.depth
     image = torch.cat([out.rgb, out.alpha[..., None], depth[..., None]], -1)

@@ -9,7 +9,7 @@ import torch
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 
 
 def random_scene(count: int, seed: int = 0, overlap: float = 30.0, rate: float = 4.0) -> dict[str, torch.Tensor]:
@@ -31,12 +31,12 @@ def random_scene(count: int, seed: int = 0, overlap: float = 30.0, rate: float =
     return {"mean": means, "scale": scales, "quat": quats, "W1": W1, "b1": b1, "w2": w2, "b2": b2, "col": colours}
 
 
-def lower(p: dict[str, torch.Tensor]) -> Lowered:
+def lower(p: dict[str, torch.Tensor]) -> LoweredPrimitives:
     t = {k: v.float().requires_grad_() for k, v in p.items()}
     with torch.no_grad():
         log_scales = t["scale"].log()
     geometry = Geometry(t["mean"], log_scales.requires_grad_(), t["quat"])
-    return Lowered(geometry, Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0=1.0), Constant(t["col"]))
+    return LoweredPrimitives(geometry, Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0=1.0), Constant(t["col"]))
 
 
 def view(size: int, distance: float = 1.7, fov: float = 40.0) -> Camera:

@@ -18,8 +18,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.metrics import psnr
-from neuprim.core.model.geometry import Pairs, quaternion_to_matrix
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.geometry import PrimitiveChords, quaternion_to_matrix
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import render_lowered
 from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.reference.backend import pixel_directions, screen_boxes
@@ -40,7 +40,7 @@ class SortingError:
 
 @torch.no_grad()
 def measure_sorting_errors(
-    lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor, steps: int, keep: Keep
+    lowered: LoweredPrimitives, camera: Camera, settings: RenderSettings, background: Tensor, steps: int, keep: Keep
 ) -> dict[SortOrder, SortingError]:
     """Return the errors of both orders against :func:`render_unsorted_volume`, all drawn with ``settings``."""
     errors: dict[SortOrder, SortingError] = {}
@@ -53,7 +53,7 @@ def measure_sorting_errors(
 
 @torch.no_grad()
 def render_unsorted_volume(
-    lowered: Lowered, camera: Camera, settings: RenderSettings, background: Tensor, steps: int, keep: Keep
+    lowered: LoweredPrimitives, camera: Camera, settings: RenderSettings, background: Tensor, steps: int, keep: Keep
 ) -> Tensor:
     """Render the emission-absorption image of the summed densities, (H, W, C) float64.
 
@@ -68,7 +68,9 @@ def render_unsorted_volume(
 class _Volume:
     """One frame, drawn block by block."""
 
-    def __init__(self, lowered: Lowered, camera: Camera, settings: RenderSettings, steps: int, keep: Keep) -> None:
+    def __init__(
+        self, lowered: LoweredPrimitives, camera: Camera, settings: RenderSettings, steps: int, keep: Keep
+    ) -> None:
         self.lowered, self.camera, self.settings, self.steps, self.keep = lowered, camera, settings, steps, keep
         g = lowered.geometry
         self.channels = lowered.colour.channels
@@ -107,7 +109,7 @@ class _Volume:
         start, end = torch.maximum(tm - half, (settings.near_plane / d[:, 2])[:, None]), tm + half
         ray, row = ((half > 0) & (end > start)).nonzero(as_tuple=True)
         prim, t0, t1 = rows[row], start[ray, row], end[ray, row]
-        chords = Pairs.of(g, prim, origin, world[ray], t0, t1)
+        chords = PrimitiveChords.of(g, prim, origin, world[ray], t0, t1)
         alpha = -torch.expm1(-self.lowered.optical_depth(chords).clamp_min(0))
         alpha = torch.where(alpha >= settings.alpha_min, alpha.clamp_max(settings.alpha_max), torch.zeros_like(alpha))
         P = d.shape[0]
@@ -131,7 +133,9 @@ class _Volume:
         middle = (low + high) / 2
         inside = (middle[ray] > t0[:, None]) & (middle[ray] < t1[:, None]) & (high > low)[ray]
         chord, cell = inside.nonzero(as_tuple=True)
-        pieces = Pairs.of(g, prim[chord], origin, world[ray[chord]], low[ray[chord], cell], high[ray[chord], cell])
+        pieces = PrimitiveChords.of(
+            g, prim[chord], origin, world[ray[chord]], low[ray[chord], cell], high[ray[chord], cell]
+        )
         tau = self.lowered.optical_depth(pieces).clamp_min(0)
         if self.keep == "opacity":
             total = torch.zeros_like(alpha).index_add(0, chord, tau)

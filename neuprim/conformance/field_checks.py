@@ -13,8 +13,8 @@ from neuprim.conformance.task_under_test import EXACT, TaskUnderTest
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import View
 from neuprim.core.model.fields import ColourField, Conditions, Field, Shading
-from neuprim.core.model.geometry import Geometry, Pairs
-from neuprim.core.model.primitives import ActiveSet, Primitives
+from neuprim.core.model.geometry import Geometry, PrimitiveChords
+from neuprim.core.model.primitives import ActivePrimitives, Primitives
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
@@ -34,11 +34,11 @@ def _double_view(view: View) -> View:
 # ---------------------------------------------------------------- activity and integrals
 
 
-def _active_rows(active: ActiveSet) -> Tensor:
+def _active_rows(active: ActivePrimitives) -> Tensor:
     return torch.arange(active.geometry.count) if active.rows is None else active.rows
 
 
-def _integrate(active: ActiveSet, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+def _integrate(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """Integrate along chords by Gauss-Legendre quadrature on eight panels; also return the greatest |sigma|."""
     o, d, t0, t1 = ray
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
@@ -112,7 +112,7 @@ def check_integral(t: TaskUnderTest) -> None:
             o, d, t0, t1 = random_chords(geometry, prim, generator)
             middle = t0 + 0.4 * (t1 - t0)
             rays = [(o, d, t0, t1), (o, d, t0, middle), (o, d, middle, t1)]
-            whole, first, second = (form.optical_depth(Pairs.of(geometry, prim, *ray)) for ray in rays)
+            whole, first, second = (form.optical_depth(PrimitiveChords.of(geometry, prim, *ray)) for ray in rays)
             shape = tuple(whole.shape)
             t.require(shape == tuple(prim.shape), "density.lower: integral", f"shape {shape}", tuple(prim.shape))
             expected, peak = _integrate(active, prim, rays[0])

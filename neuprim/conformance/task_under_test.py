@@ -18,7 +18,7 @@ from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import ColourField, ConditionSpec, Constant, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.render.backends import REFERENCE
@@ -226,7 +226,7 @@ def _ring_camera(angle: float, height: float) -> Camera:
     return Camera(pose, focal, focal, _WIDTH / 2, _HEIGHT / 2, _WIDTH, _HEIGHT)
 
 
-def _ellipsoids(channels: int) -> Lowered:
+def _ellipsoids(channels: int) -> LoweredPrimitives:
     geometry = Geometry(
         torch.tensor([[-0.35, 0.0, 0.0], [0.4, 0.1, 0.05], [0.0, -0.2, 0.4]]),
         torch.tensor([[0.4, 0.25, 0.3], [0.3, 0.35, 0.25], [0.2, 0.3, 0.2]]).log(),
@@ -234,4 +234,4 @@ def _ellipsoids(channels: int) -> Lowered:
     )
     constant = Cosine(torch.zeros(3, 0, 3), torch.zeros(3, 0), torch.zeros(3, 0), torch.tensor([[2.5], [2.0], [1.5]]))
     colours = torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85], [0.2, 0.7, 0.3]])
-    return Lowered(geometry, constant, Constant(colours[:, torch.arange(channels) % 3]))
+    return LoweredPrimitives(geometry, constant, Constant(colours[:, torch.arange(channels) % 3]))

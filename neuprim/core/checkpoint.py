@@ -23,7 +23,7 @@ from neuprim.core.io.files import atomic_path
 from neuprim.core.io.plain import finite_number, load_json
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import dense_parameters, sparse_parameters
+from neuprim.core.model.prunable import dense_primitive_parameters, sparse_primitive_parameters
 from neuprim.core.task import TaskSpec
 
 FORMAT = 1
@@ -129,7 +129,7 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
         without_zeros: leave out zeros of the fields, as in pruned models (:mod:`neuprim.core.model.prunable`).
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
-    tensors, sparse = sparse_parameters(model.params, specs)
+    tensors, sparse = sparse_primitive_parameters(model.params, specs)
     write_tensors(
         path, "model", tensors, {**model_header(model, task, extra), **({"sparse": sparse} if sparse else {})}
     )
@@ -198,7 +198,7 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
         raise CheckpointError(f"{path}: density and colour fields are {found}; expected one of each")
     own = (*density.parameters(), *colour.parameters())
     if "sparse" in header:
-        tensors = dense_parameters(tensors, header.pop("sparse"), own, str(path))
+        tensors = dense_primitive_parameters(tensors, header.pop("sparse"), own, str(path))
     try:
         model = Primitives(density, colour, tensors)
     except (ValueError, KeyError, TypeError, IndexError) as error:

@@ -18,7 +18,7 @@ from neuprim.core.conditions import Warn, flag, read_conditions
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.model.fields import Conditions, ConditionSpec
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import ActiveSet, Primitives
+from neuprim.core.model.primitives import ActivePrimitives, Primitives
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.inspect.layers import Scale
 
@@ -119,7 +119,7 @@ class FieldFrame:
         return self.of_side("model").sigma - self.of_side("truth").sigma
 
     @cached_property
-    def active(self) -> ActiveSet:
+    def active(self) -> ActivePrimitives:
         """The primitives that are active in this frame, without gradients."""
         with torch.no_grad():
             return self.model.active(self.conditions)
@@ -185,7 +185,7 @@ class FieldFrame:
         return int(found[0])
 
 
-def measure_absorption(active: ActiveSet) -> np.ndarray:
+def measure_absorption(active: ActivePrimitives) -> np.ndarray:
     """Return (M,) float64 clamped extinction times volume of each primitive, from 33 points inside it."""
     i = torch.arange(33)
     radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963

@@ -16,7 +16,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
 from neuprim.core.io.plain import finite_number, load_json
-from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit
 from neuprim.core.render import RenderSettings
@@ -176,7 +176,7 @@ def kept_shares(model: Primitives) -> dict[str, float]:
     """Group of prunable units -> share of its numbers that pruning kept, 0 to 1, as ``density.neuron 0``."""
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
-    for name, unit in prunable_units_by_name(model.density, model.colour).items():
+    for name, unit in prunable_units_of_model(model.density, model.colour).items():
         group, size = f"{name.partition('.')[0]}.{unit.group or unit.name}", count_unit_numbers(unit, model.params)
         share = float(primitives_with_unit(unit, model.params).float().mean()) if model.count else 0.0
         kept[group], sizes[group] = kept.get(group, 0.0) + size * share, sizes.get(group, 0) + size

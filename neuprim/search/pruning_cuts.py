@@ -9,7 +9,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import PrunableUnit, count_unit_numbers, primitives_with_unit, zero_units
 from neuprim.core.model.reduction import reduce_model
@@ -25,7 +25,7 @@ _HALVINGS = 14
 
 
 def _units(model: Primitives) -> dict[str, PrunableUnit]:
-    return prunable_units_by_name(model.density, model.colour)
+    return prunable_units_of_model(model.density, model.colour)
 
 
 def count_stored_numbers(model: Primitives) -> int:

@@ -18,7 +18,7 @@ from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
 from neuprim.core.train.distributed.process_group import ProcessGroup
@@ -31,7 +31,7 @@ from neuprim.tasks.static import SphericalHarmonics
 SIZE = 24
 
 
-def truth() -> Lowered:
+def truth() -> LoweredPrimitives:
     """A red and a blue ellipsoid side by side."""
     geometry = Geometry(
         torch.tensor([[-0.35, 0.0, 0.0], [0.4, 0.1, 0.05]]),
@@ -39,7 +39,7 @@ def truth() -> Lowered:
         torch.tensor([[1.0, 0.1, 0.2, 0.0], [0.9, 0.0, -0.3, 0.2]]),
     )
     flat = Cosine(torch.zeros(2, 0, 3), torch.zeros(2, 0), torch.zeros(2, 0), torch.tensor([[2.5], [2.0]]))
-    return Lowered(geometry, flat, Constant(torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85]])))
+    return LoweredPrimitives(geometry, flat, Constant(torch.tensor([[0.9, 0.15, 0.1], [0.1, 0.3, 0.85]])))
 
 
 def camera(angle: float, height: float) -> Camera:

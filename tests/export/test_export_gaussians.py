@@ -231,6 +231,6 @@ def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> Non
     eye = torch.tensor([0.0, 0.0, 500.0])
     camera = Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), 50.0, 50.0, 8, 8, 16, 16)
     exact = model.lower(camera, light).colour
-    expected = exact.radiance(torch.arange(5), torch.zeros(5, 3).double())  # type: ignore[union-attr]
+    expected = exact.primitive_radiance(torch.arange(5), torch.zeros(5, 3).double())  # type: ignore[union-attr]
     seen = fitted.evaluate(torch.arange(5), torch.tensor([[0.0, 0.0, -1.0]]).expand(5, 3))
     assert torch.allclose(seen, expected, atol=0.05)

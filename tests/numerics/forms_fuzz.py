@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from tests import scenes
 from tests.backends import SLOW_HERE, by
@@ -31,7 +31,7 @@ SIZED_BY = {"W1": "b1", "Wx": "bias", "base": "Wout", "means": "log_scales"}
 """The first tensor of a form -> the one that is named where both do not fit, as the first says how large it must be."""
 
 
-def tensors_of(lowered: Lowered) -> dict[str, tuple[str, Tensor]]:
+def tensors_of(lowered: LoweredPrimitives) -> dict[str, tuple[str, Tensor]]:
     """Tensor name -> (part of the form that holds it, the tensor)."""
     found = {}
     for part in PARTS:
@@ -40,12 +40,12 @@ def tensors_of(lowered: Lowered) -> dict[str, tuple[str, Tensor]]:
     return found
 
 
-def with_tensor(lowered: Lowered, name: str, value: Any) -> Lowered:
+def with_tensor(lowered: LoweredPrimitives, name: str, value: Any) -> LoweredPrimitives:
     part = next(p for p in PARTS if hasattr(getattr(lowered, p), name))
     return replace(lowered, **{part: replace(getattr(lowered, part), **{name: value})})
 
 
-def random_form(r: random.Random) -> Lowered:
+def random_form(r: random.Random) -> LoweredPrimitives:
     hidden, sizes = r.choice([None, None, 0, 3, 4]), ([1, 2, 3, 7, 20], [0, 1, 4, 8], [1, 3, 3, 5])
     t = scenes.tensors(*map(r.choice, sizes), seed=r.randrange(1000), hidden=hidden)
     if r.random() < 0.3:
@@ -113,7 +113,7 @@ FAULTS: tuple[Callable[[random.Random, Tensor], Any], ...] = (
 )  # fmt: skip
 
 
-def legal(lowered: Lowered, name: str, value: Any) -> bool:
+def legal(lowered: LoweredPrimitives, name: str, value: Any) -> bool:
     """Whether the changed tensor is as good as the one it replaces."""
     old = tensors_of(lowered)[name][1]
     if not isinstance(value, Tensor) or value.dtype not in (torch.float32, torch.float64):
@@ -128,7 +128,7 @@ def legal(lowered: Lowered, name: str, value: Any) -> bool:
     )
 
 
-def draw(lowered: Lowered, backend: str) -> tuple[Tensor, dict[str, Tensor | None]]:
+def draw(lowered: LoweredPrimitives, backend: str) -> tuple[Tensor, dict[str, Tensor | None]]:
     """The image, and the gradients of all tensors."""
     leaves = {name: v.detach().requires_grad_() for name, (_, v) in tensors_of(lowered).items()}
     for name, value in leaves.items():
@@ -139,7 +139,7 @@ def draw(lowered: Lowered, backend: str) -> tuple[Tensor, dict[str, Tensor | Non
     return image.detach(), {name: v.grad for name, v in leaves.items()}
 
 
-def refuse(lowered: Lowered, backend: str, name: str, background: Any = None) -> None:
+def refuse(lowered: LoweredPrimitives, backend: str, name: str, background: Any = None) -> None:
     try:
         image = render_lowered(lowered, CAMERA, RenderSettings(**by(backend)), background).rgb
     except FormError as error:
@@ -164,7 +164,7 @@ def _strided(r: random.Random, v: Tensor) -> Tensor:
     return torch.complex(torch.zeros_like(v), -v).conj().imag  # a lazily negated view, which numpy does not take
 
 
-def same(r: random.Random, lowered: Lowered, backend: str) -> None:
+def same(r: random.Random, lowered: LoweredPrimitives, backend: str) -> None:
     """Odd strides, and some tensors in another dtype: the same picture and gradients."""
     odd = lowered
     for name, (_, value) in tensors_of(lowered).items():

@@ -207,7 +207,12 @@ def test_backgrounds_rows_and_cameras() -> None:
             r"background has shape \(1,\); expected \(3,\), as colour lowered to Constant has",
         ),
         (lowered, away, None, r"viewmat has shape \(2, 2\); expected \(4, 4\)"),
-        (replace(lowered, rows=torch.arange(19)), CAMERA, None, r"Lowered\.rows holds 19 rows for 20 primitives"),
+        (
+            replace(lowered, rows=torch.arange(19)),
+            CAMERA,
+            None,
+            r"LoweredPrimitives\.rows holds 19 rows for 20 primitives",
+        ),
         (without, CAMERA, None, "geometry has type NoneType; expected Geometry"),
     ):
         with pytest.raises(FormError, match=f"^{message}"):

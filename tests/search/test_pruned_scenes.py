@@ -14,7 +14,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.plugins.registry import load_task
 from neuprim.runs.fit import prepare_training, train_to_end
@@ -48,7 +48,7 @@ class Blobs(ViewSet):
         return self.images[index]
 
 
-def _truth() -> Lowered:
+def _truth() -> LoweredPrimitives:
     means = torch.tensor([[-0.4, 0.0, 0.0], [0.35, 0.2, 0.1], [0.1, -0.4, -0.2]])
     geometry = Geometry(
         means, torch.tensor([[0.5, 0.4, 0.45]]).log().repeat(3, 1), torch.tensor([[1.0, 0.1, 0.0, 0.2]]).repeat(3, 1)
@@ -56,7 +56,9 @@ def _truth() -> Lowered:
     flat = Cosine(
         torch.zeros(3, 0, 3), torch.zeros(3, 0), torch.zeros(3, 0), torch.tensor([[3.0], [2.0], [4.0]]), edge=2
     )
-    return Lowered(geometry, flat, Constant(torch.tensor([[0.9, 0.2, 0.1], [0.2, 0.7, 0.3], [0.1, 0.3, 0.9]])))
+    return LoweredPrimitives(
+        geometry, flat, Constant(torch.tensor([[0.9, 0.2, 0.1], [0.2, 0.7, 0.3], [0.1, 0.3, 0.9]]))
+    )
 
 
 def _camera(angle: float, height: float) -> Camera:

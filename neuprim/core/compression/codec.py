@@ -32,8 +32,8 @@ from neuprim.core.compression.sections import (
     pack_sparse,
 )
 from neuprim.core.errors import CheckpointError, FormError
-from neuprim.core.model.checks import method_label
-from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.checks import model_method_label
+from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import primitives_with_unit
 
@@ -69,7 +69,8 @@ def canonical_model(model: Primitives) -> Primitives:
         wanted = {name: tuple(value.shape) for name, value in own.items()}
         if {name: tuple(value.shape) for name, value in found.items()} != wanted:
             raise FormError(
-                f"{method_label(field, 'canonicalize')} returned tensors of other names or shapes; expected {wanted}"
+                f"{model_method_label(field, 'canonicalize')} returned tensors of other names or shapes; "
+                f"expected {wanted}"
             )
         params |= found
     for name, value in params.items():
@@ -154,7 +155,7 @@ def _even_positions(x: Tensor, steps: Tensor) -> ColumnQuantizer:
 
 def _sparse_parameters(model: Primitives) -> set[str]:
     """Return the parameters of pieces that some primitives lack; their zeros must stay zeros."""
-    pieces = prunable_units_by_name(model.density, model.colour).values()
+    pieces = prunable_units_of_model(model.density, model.colour).values()
     return {
         name for piece in pieces if not bool(primitives_with_unit(piece, model.params).all()) for name in piece.places
     }
@@ -211,7 +212,7 @@ def _prunable_masks(
     }
     masks: list[np.ndarray] = []
     mask_of: dict[str, Tensor] = {}
-    for piece in prunable_units_by_name(model.density, model.colour).values():
+    for piece in prunable_units_of_model(model.density, model.colour).values():
         if not model.count or not set(piece.places) <= zero.keys():
             continue
         parts = [

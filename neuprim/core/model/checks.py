@@ -28,18 +28,18 @@ from neuprim.core.model.fields import (
 )
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec
-from neuprim.core.model.tensors import ShapedTensors, Sizes, tensor_fault
+from neuprim.core.model.tensors import PrimitiveTensors, Sizes, primitive_tensor_fault
 
-_DENSITIES: tuple[type[ShapedTensors], ...] = (Cosine, CustomDensity)
-_COLOURS: tuple[type[ShapedTensors], ...] = (Constant, RayNet, CustomColour)
+_DENSITIES: tuple[type[PrimitiveTensors], ...] = (Cosine, CustomDensity)
+_COLOURS: tuple[type[PrimitiveTensors], ...] = (Constant, RayNet, CustomColour)
 
 
-def _is_dense_tensor(value: Any) -> bool:
+def _is_dense_primitive_tensor(value: Any) -> bool:
     kept = isinstance(value, Tensor) and (value.is_cpu or value.device.type in device.DEVICE_TYPES)
     return kept and value.layout is torch.strided
 
 
-def _describe_tensor(value: Any) -> str:
+def _describe_model_tensor(value: Any) -> str:
     """What a value is, for messages."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}"
@@ -50,14 +50,16 @@ def _describe_tensor(value: Any) -> str:
 # ---------------------------------------------------------------- entrances
 
 
-def field_label(kind: str, field: str | None) -> str:
+def model_field_label(kind: str, field: str | None) -> str:
     """``"density field Waves"``, or ``"density"`` where no field is known."""
     return kind if field is None else f"{kind} field {field}"
 
 
-def method_label(field: Field, name: str) -> str:
+def model_method_label(field: Field, name: str) -> str:
     """``"density field Waves: on_split"``: a method as its author writes it."""
-    return f"{field_label('density' if isinstance(field, DensityField) else 'colour', type(field).__name__)}: {name}"
+    return (
+        f"{model_field_label('density' if isinstance(field, DensityField) else 'colour', type(field).__name__)}: {name}"
+    )
 
 
 def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
@@ -71,17 +73,17 @@ def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
     return sizes
 
 
-def check_density(density: Any, sizes: Sizes, field: str | None) -> None:
+def check_lowered_density(density: Any, sizes: Sizes, field: str | None) -> None:
     """Raise :class:`FormError` unless a lowered density fits; ``sizes`` are those of :func:`check_geometry`."""
-    _check_form(field_label("density", field), density, _DENSITIES, sizes)
+    _check_lowered_form(model_field_label("density", field), density, _DENSITIES, sizes)
 
 
-def check_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
+def check_lowered_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
     """The same of a lowered colour."""
-    _check_form(field_label("colour", field), colour, _COLOURS, sizes)
+    _check_lowered_form(model_field_label("colour", field), colour, _COLOURS, sizes)
 
 
-def _check_form(who: str, form: Any, kinds: tuple[type[ShapedTensors], ...], sizes: Sizes) -> None:
+def _check_lowered_form(who: str, form: Any, kinds: tuple[type[PrimitiveTensors], ...], sizes: Sizes) -> None:
     if not isinstance(form, kinds):
         names = ", ".join(k.__name__ for k in kinds[:-1])
         raise FormError(f"{who} lowered to {type(form).__name__}; expected {names} or {kinds[-1].__name__}")
@@ -90,29 +92,29 @@ def _check_form(who: str, form: Any, kinds: tuple[type[ShapedTensors], ...], siz
         raise FormError(f"{who} lowered to {type(form).__name__}: {fault}")
 
 
-def check_channels(found: int, colour: ColourField) -> None:
+def check_lowered_channels(found: int, colour: ColourField) -> None:
     """Raise :class:`FormError` unless a lowered colour has as many channels as its field says."""
     if found != colour.channels:
         raise FormError(
-            f"{method_label(colour, 'lower')} returned a colour of C={found}; "
+            f"{model_method_label(colour, 'lower')} returned a colour of C={found}; "
             f"expected {colour.channels}, as its member channels says"
         )
 
 
-def check_tensor_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") -> None:
+def check_model_tensor_shape(name: str, value: Any, shape: tuple[int, ...], why: str = "") -> None:
     """Raise :class:`FormError` unless ``value`` is a tensor of this shape that a kernel can read."""
-    fault = tensor_fault(value)
+    fault = primitive_tensor_fault(value)
     if fault is None and value.shape != shape:
         fault = f"shape {tuple(value.shape)}; expected {shape}{why}"
     if fault is not None:
         raise FormError(f"{name} has {fault}")
 
 
-def check_active_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
+def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
     """Raise :class:`FormError` unless ``rows`` are ascending int64 (M,), ``length`` of them, below ``model``."""
     found = None
-    if not _is_dense_tensor(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
-        found = _describe_tensor(rows)
+    if not _is_dense_primitive_tensor(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
+        found = _describe_model_tensor(rows)
     elif length is not None and len(rows) != length:
         found = f"{len(rows)} rows for {length} primitives"
     elif len(rows):
@@ -127,12 +129,12 @@ def check_active_rows(rows: Any, model: int | None, who: str, length: int | None
         raise FormError(f"{who} {found}; expected ascending int64 rows (M,){limit}")
 
 
-def check_field_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
+def check_primitive_field_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
     """Return what a field's own code returned if it is a dense tensor of real numbers of this shape."""
-    if not _is_dense_tensor(value) or not value.is_floating_point():
+    if not _is_dense_primitive_tensor(value) or not value.is_floating_point():
         kinds = " or ".join(device.DEVICE_TYPES)
         raise FormError(
-            f"{who} returned {_describe_tensor(value)}; expected a dense tensor of real numbers on the {kinds}"
+            f"{who} returned {_describe_model_tensor(value)}; expected a dense tensor of real numbers on the {kinds}"
         )
     if value.shape != shape:
         each = f"a row for each of the {shape[0]} that it was given"
@@ -140,18 +142,18 @@ def check_field_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
     return value  # type: ignore[no-any-return]
 
 
-def check_shading(found: Any, count: int, who: str) -> Shading:
+def check_primitive_shading(found: Any, count: int, who: str) -> Shading:
     """Return what ``shade`` returned if it fits ``count`` primitives; None is no shading."""
     if found is None:
         return Shading()
     if not isinstance(found, Shading):
         raise FormError(f"{who} returned type {type(found).__name__}; expected Shading or None")
     if found.primitives is not None:
-        check_field_result(found.primitives, (count,), f"{who}: primitives")
+        check_primitive_field_result(found.primitives, (count,), f"{who}: primitives")
     return found
 
 
-def check_initial_tensor(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
+def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, who: str) -> Tensor:
     """Return the float32 start value (N, *shape) that a parameter's own initialiser draws."""
     value, shape = spec.init(context), (context.count, *spec.shape)
     if not isinstance(value, Tensor):
@@ -161,14 +163,14 @@ def check_initial_tensor(spec: ParameterSpec, context: InitContext, who: str) ->
     return value.float().contiguous()
 
 
-def check_field_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
+def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
     """Return a field's own parameters from one of its methods: names, shapes and dtypes of ``like``."""
     if not isinstance(found, Mapping):
         raise FormError(f"{who} returned type {type(found).__name__}; expected a dict of tensors by name")
     if set(found) != set(like):
         raise FormError(f"{who} returned tensors {sorted(map(str, found))}; expected {sorted(like)}")
     for name, wanted in like.items():
-        fault = tensor_fault(found[name])
+        fault = primitive_tensor_fault(found[name])
         if fault is None and found[name].shape != wanted.shape:
             fault = f"shape {tuple(found[name].shape)}; expected {tuple(wanted.shape)}"
         if fault is None and found[name].dtype != wanted.dtype:
@@ -178,7 +180,7 @@ def check_field_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dic
     return dict(found)
 
 
-def check_divided_primitives(
+def check_divided_primitive_rows(
     found: Any, like: Mapping[str, Tensor], place: Geometry, who: str
 ) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
     """Return what ``divide`` returned: a mask of P parents, and 2 P rows like ``like`` and ``place``."""
@@ -188,15 +190,15 @@ def check_divided_primitives(
     parents = place.count // 2
     fits = isinstance(mask, Tensor) and mask.device == place.means.device and mask.dtype == torch.bool
     if not fits or mask.shape != (parents,):
-        raise FormError(f"{who} returned a mask of {_describe_tensor(mask)}; expected torch.bool ({parents},)")
+        raise FormError(f"{who} returned a mask of {_describe_model_tensor(mask)}; expected torch.bool ({parents},)")
     if not isinstance(where, Geometry):
         raise FormError(f"{who} returned a geometry of type {type(where).__name__}; expected Geometry")
     names = ("means", "log_scales", "quats")
     rows, stored = ({name: getattr(g, name) for name in names} for g in (where, place))
-    return mask, check_field_tensors(halves, like, who), check_field_tensors(rows, stored, who)
+    return mask, check_primitive_tensors(halves, like, who), check_primitive_tensors(rows, stored, who)
 
 
-def non_finite_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
+def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
     """Return the error for primitive ``row``, which is not finite or leaves the range of float32."""
     for name, value in tensors.items():
         if not bool(torch.isfinite(value[row]).all()):
@@ -209,7 +211,7 @@ def non_finite_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
     )
 
 
-def refuse_non_finite_colours(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
+def check_primitive_colours_finite(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
     """Raise NonFiniteError for colours, which the per-primitive kernels do not read; waits for a GPU.
 
     ``named``: all tensors of the frame; the first of them that is not finite is the cause.
@@ -220,4 +222,4 @@ def refuse_non_finite_colours(tensors: Mapping[str, Tensor], named: Mapping[str,
     for value in tensors.values():
         bad = ~torch.isfinite(value).reshape(len(value), -1).all(dim=1)
         if bool(bad.any()):
-            raise non_finite_error(tensors if named is None else named, int(bad.nonzero()[0]))
+            raise non_finite_primitive_error(tensors if named is None else named, int(bad.nonzero()[0]))

@@ -61,12 +61,12 @@ def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float
     return {**params, strength: torch.where(fits, b.sign(), b), log_gain: torch.where(fits, joined.to(g), g)}
 
 
-def smaller_neuron_counts(neurons: int) -> tuple[int, ...]:
+def smaller_cosine_neuron_counts(neurons: int) -> tuple[int, ...]:
     """Return three quarters, a half and a quarter of a number of neurons, and 0."""
     return tuple(sorted({neurons * part // 4 for part in range(4)} - {neurons}, reverse=True))
 
 
-def prune_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
+def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
     """Keep the ``keep`` neurons of each primitive whose part of the density varies most."""
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
@@ -74,8 +74,8 @@ def prune_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) 
     rate = omega0 * ((W1 @ rotations) * semi_axes[:, None, :]).norm(dim=-1)
     advance = omega0 * params["W_t"].double() if "W_t" in params else torch.zeros_like(phase)
     phase = phase + advance / 2
-    mean = phase.cos() * ball_mean(rate) * sinc(advance / 2)
-    square = (1 + (2 * phase).cos() * ball_mean(2 * rate) * sinc(advance)) / 2
+    mean = phase.cos() * ellipsoid_cosine_mean(rate) * sinc(advance / 2)
+    square = (1 + (2 * phase).cos() * ellipsoid_cosine_mean(2 * rate) * sinc(advance)) / 2
     order = (w2.square() * (square - mean.square())).argsort(dim=1, descending=True, stable=True)
     kept, gone = order[:, :keep].sort(dim=1).values, order[:, keep:]
     fewer = {name: value.gather(1, kept).contiguous() for name, value in params.items() if name in ("b1", "w2", "W_t")}
@@ -84,7 +84,7 @@ def prune_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) 
     return {**params, **fewer}
 
 
-def ball_mean(r: Tensor) -> Tensor:
+def ellipsoid_cosine_mean(r: Tensor) -> Tensor:
     """Return the mean of cos(r.y) over y in the unit ball, for |r| >= 0."""
     small = r < 1e-2
     safe = torch.where(small, torch.ones_like(r), r)

@@ -75,7 +75,7 @@ def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]
     return [d0 + d2 / 3 + d4 / 5, d1 + 3 * d3 / 5, 2 * d2 / 3 + 4 * d4 / 7, 2 * d3 / 5, 8 * d4 / 35]
 
 
-def chord_integral(
+def soft_edge_chord_integral(
     quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
 ) -> Tensor:
     """(M,) 1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)).

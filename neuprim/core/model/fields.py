@@ -139,7 +139,7 @@ class Field(ABC):
         return None
 
 
-def prunable_units_by_name(density: DensityField, colour: ColourField) -> dict[str, PrunableUnit]:
+def prunable_units_of_model(density: DensityField, colour: ColourField) -> dict[str, PrunableUnit]:
     """Return the units of both fields by name, e.g. ``density.neuron 0`` or ``colour.coefficient 1 +0, channel 2``."""
     found = {}
     for kind, own in (("density", density), ("colour", colour)):

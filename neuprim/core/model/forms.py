@@ -1,6 +1,6 @@
 """The closed forms that fields lower to: what a renderer draws, with its task's conditions folded in.
 
-Each knows its tensors' shapes and its mathematics along chords (:class:`Pairs`); kernels know a few by name.
+Each knows its tensors' shapes and its mathematics along chords (:class:`PrimitiveChords`); kernels know a few by name.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.edge import EDGES, chord_integral, sinc
-from neuprim.core.model.geometry import Geometry, Pairs
+from neuprim.core.model.edge import EDGES, sinc, soft_edge_chord_integral
+from neuprim.core.model.geometry import Geometry, PrimitiveChords
 from neuprim.core.model.tensors import (
     MOST_UNITS,
-    ShapedTensors,
+    PrimitiveTensors,
     Shapes,
     Sizes,
     function_fault,
@@ -29,7 +29,7 @@ from neuprim.core.model.tensors import (
 
 
 @dataclass(frozen=True)
-class Cosine(ShapedTensors):
+class Cosine(PrimitiveTensors):
     """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
 
     p = 0 is the paper's; 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`). ``first + second`` is a sum of
@@ -88,7 +88,7 @@ class Cosine(ShapedTensors):
             W1, b1, torch.cat([self.w2, other.w2], 1), self.b2 + other.b2.reshape(self.b2.shape), omega0, self.edge
         )
 
-    def rows(self, index: Tensor | slice) -> Cosine:
+    def primitive_rows(self, index: Tensor | slice) -> Cosine:
         """Those of some primitives, (M,) int64 or first:end, without gradient."""
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
@@ -99,7 +99,7 @@ class Cosine(ShapedTensors):
         w2, b2 = self.w2 * factors[:, None], self.b2 * factors.reshape(self.b2.shape)
         return Cosine(self.W1, self.b1, w2, b2, self.omega0, self.edge)
 
-    def optical_depth(self, pairs: Pairs) -> Tensor:
+    def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
         """(M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, whatever their length."""
         prim = pairs.prim
         W1 = self.W1.double()[prim]
@@ -107,13 +107,13 @@ class Cosine(ShapedTensors):
         rate = self.omega0 * (W1 * pairs.direction[:, None, :]).sum(-1)
         w2, b2, z = self.w2.double()[prim], self.b2.double().reshape(-1)[prim], rate * pairs.half[:, None]
         if self.edge:
-            return 2 * pairs.half * chord_integral(pairs.support, self.edge, phase, z, w2, b2)
+            return 2 * pairs.half * soft_edge_chord_integral(pairs.support, self.edge, phase, z, w2, b2)
         waves = (w2 * phase.cos() * sinc(z)).sum(-1)
         return 2 * pairs.half * (b2 + waves)
 
 
 @dataclass(frozen=True)
-class CustomDensity(ShapedTensors):
+class CustomDensity(PrimitiveTensors):
     """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) rows, (M, 3) ray origins and unit directions and (M,)
@@ -126,7 +126,7 @@ class CustomDensity(ShapedTensors):
     def fault(self, sizes: Sizes) -> str | None:
         return labelled_fault("line_integral", function_fault(self.line_integral))
 
-    def rows(self, index: Tensor | slice) -> CustomDensity:
+    def primitive_rows(self, index: Tensor | slice) -> CustomDensity:
         """That of some primitives, (M,) int64 or first:end."""
         if isinstance(index, slice):
             return CustomDensity(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
@@ -141,7 +141,7 @@ class CustomDensity(ShapedTensors):
 
         return CustomDensity(line_integral)
 
-    def optical_depth(self, pairs: Pairs) -> Tensor:
+    def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
         """Integrals of sigma along chords as the code returns them, unchecked."""
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
@@ -153,7 +153,7 @@ LoweredDensity = Cosine | CustomDensity
 
 
 @dataclass(frozen=True)
-class Constant(ShapedTensors):
+class Constant(PrimitiveTensors):
     """One colour per primitive and view: rgb (N, C), any channel count."""
 
     per_primitive: ClassVar[bool] = True
@@ -172,11 +172,11 @@ class Constant(ShapedTensors):
         """The same times (N,) factors, at least 0."""
         return Constant(self.rgb * factors.to(self.rgb)[:, None])
 
-    def chord_colours(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
         """(M, C) float64 colours that are seen along chords."""
         return self.rgb.double()[pairs.prim]
 
-    def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
+    def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
         """(N, C) colours at the centres of the primitives, seen from ``position`` (3,)."""
         return self.rgb
 
@@ -187,7 +187,7 @@ class Constant(ShapedTensors):
 
 
 @dataclass(frozen=True)
-class CustomColour(ShapedTensors):
+class CustomColour(PrimitiveTensors):
     """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
 
     ``radiance(prim, x, d)`` takes (M,) rows, (M, 3) chord middles in scene units and unit directions, returns (M, C).
@@ -213,11 +213,11 @@ class CustomColour(ShapedTensors):
 
         return CustomColour(radiance, self.channels)
 
-    def chord_colours(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
         """Colours seen along chords as the code returns them, unchecked."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
-    def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
+    def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
         """Colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
         means = geometry.means
         directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
@@ -225,7 +225,7 @@ class CustomColour(ShapedTensors):
 
 
 @dataclass(frozen=True)
-class RayNet(ShapedTensors):
+class RayNet(PrimitiveTensors):
     """A colour network per primitive, evaluated where each pixel's ray passes through it.
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
@@ -266,20 +266,20 @@ class RayNet(ShapedTensors):
         factors = factors.to(self.base)
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 
-    def radiance(self, prim: Tensor, local: Tensor) -> Tensor:
+    def primitive_radiance(self, prim: Tensor, local: Tensor) -> Tensor:
         """(M, C) float64 colours of primitives ``prim`` (M,) at ``local`` = x~_m (M, 3) float64; differentiable."""
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
 
-    def chord_colours(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
         """(M, C) float64 colours that are seen along chords; differentiable."""
-        return self.radiance(pairs.prim, pairs.local)
+        return self.primitive_radiance(pairs.prim, pairs.local)
 
-    def at_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
+    def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
         """(N, C) float64 colours at the centres of the primitives; the same from everywhere."""
         middles = torch.zeros_like(geometry.means, dtype=torch.float64)
-        return self.radiance(torch.arange(geometry.count, device=middles.device), middles)
+        return self.primitive_radiance(torch.arange(geometry.count, device=middles.device), middles)
 
 
 LoweredColour = Constant | RayNet | CustomColour

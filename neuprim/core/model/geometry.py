@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.schema import InitContext, ParameterSpec
-from neuprim.core.model.tensors import ShapedTensors, Shapes
+from neuprim.core.model.tensors import PrimitiveTensors, Shapes
 
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
@@ -24,7 +24,7 @@ def quaternion_to_matrix(quats: Tensor) -> Tensor:
 
 
 @dataclass(frozen=True)
-class Geometry(ShapedTensors):
+class Geometry(PrimitiveTensors):
     """N ellipsoids of hard support (radius 1 in whitened space).
 
     Attributes:
@@ -89,7 +89,7 @@ GEOMETRY_SPECS: tuple[ParameterSpec, ...] = (
 
 
 @dataclass(frozen=True)
-class Pairs:
+class PrimitiveChords:
     """M chords, one for each ray and primitive that meet; float64, differentiable. Lengths are in m, the longest
     semi-axis.
 
@@ -117,7 +117,9 @@ class Pairs:
     pace: Tensor
 
     @classmethod
-    def of(cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor) -> Pairs:
+    def of(
+        cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor
+    ) -> PrimitiveChords:
         """Chords ``t0`` to ``t1`` (M,) of rays, or parts of them, in scene units."""
         m = geometry.length_scale.double()[prim]
         middle = (t0 + t1) / 2

@@ -12,28 +12,28 @@ from torch import Tensor
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.checks import (
-    check_active_rows,
-    check_channels,
-    check_colour,
-    check_density,
-    check_field_result,
+    check_active_primitive_rows,
     check_geometry,
-    check_initial_tensor,
-    check_shading,
-    check_tensor_shape,
-    field_label,
-    method_label,
-    non_finite_error,
+    check_initial_primitive_tensor,
+    check_lowered_channels,
+    check_lowered_colour,
+    check_lowered_density,
+    check_model_tensor_shape,
+    check_primitive_field_result,
+    check_primitive_shading,
+    model_field_label,
+    model_method_label,
+    non_finite_primitive_error,
 )
 from neuprim.core.model.fields import ColourField, Conditions, DensityField, LoweredColour, LoweredDensity, Shade
-from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, Pairs
+from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, PrimitiveChords
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Sizes, function_fault
 from neuprim.core.settings import RenderSettings
 
 
 @dataclass(frozen=True)
-class Lowered:
+class LoweredPrimitives:
     """The input of the renderer for one frame, whatever the task.
 
     ``rows`` (M,) int64: which primitives of the model these are; None for all. ``shade``: a factor on each pixel
@@ -51,10 +51,10 @@ class Lowered:
         """Raise :class:`FormError` unless everything that a renderer takes fits."""
         density, colour = self.fields or (None, None)
         sizes = check_geometry(self.geometry, "geometry")
-        check_density(self.density, sizes, density)
-        check_colour(self.colour, sizes, colour)
+        check_lowered_density(self.density, sizes, density)
+        check_lowered_colour(self.colour, sizes, colour)
         if self.rows is not None:
-            check_active_rows(self.rows, None, "Lowered.rows holds", sizes["N"][0])
+            check_active_primitive_rows(self.rows, None, "LoweredPrimitives.rows holds", sizes["N"][0])
         self.check_frame(viewmat, background)
 
     def check_finite(self) -> None:
@@ -76,7 +76,7 @@ class Lowered:
                 if value.numel():
                     bad |= ~torch.isfinite(value.reshape(g.count, -1)).all(dim=1)
             if bool(bad.any()):
-                raise non_finite_error(tensors, int(bad.nonzero()[0]))
+                raise non_finite_primitive_error(tensors, int(bad.nonzero()[0]))
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
         """Check what :meth:`Primitives.lower` has not checked; raises as :meth:`check`."""
@@ -84,9 +84,11 @@ class Lowered:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
             channels = self.colour.channels
-            check_tensor_shape("background", background, (channels,), f", as {self.source('colour')} has C={channels}")
+            check_model_tensor_shape(
+                "background", background, (channels,), f", as {self.source('colour')} has C={channels}"
+            )
         if viewmat is not None:
-            check_tensor_shape("viewmat", viewmat, (4, 4))
+            check_model_tensor_shape("viewmat", viewmat, (4, 4))
         self._check_devices(viewmat)
 
     def _check_devices(self, viewmat: Tensor | None) -> None:
@@ -109,13 +111,15 @@ class Lowered:
         """Whether all that it is made of are tensors: a model's own code stays where it is."""
         return self.density.movable and self.colour.movable
 
-    def to(self, device: torch.device) -> Lowered:
+    def to(self, device: torch.device) -> LoweredPrimitives:
         """The same on another device, without ``rows`` and ``shade``; differentiable. It must be :attr:`movable`."""
-        return Lowered(self.geometry.to(device), self.density.to(device), self.colour.to(device), fields=self.fields)
+        return LoweredPrimitives(
+            self.geometry.to(device), self.density.to(device), self.colour.to(device), fields=self.fields
+        )
 
     def owner(self, kind: Literal["density", "colour"]) -> str:
         """Whose form it is, for messages: ``"density field Waves"``."""
-        return field_label(kind, None if self.fields is None else self.fields[kind == "colour"])
+        return model_field_label(kind, None if self.fields is None else self.fields[kind == "colour"])
 
     def source(self, kind: Literal["density", "colour"]) -> str:
         """The same with the form: ``"density field Waves lowered to Cosine"``."""
@@ -123,26 +127,26 @@ class Lowered:
 
     def center_colors(self, position: Tensor) -> Tensor:
         """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
-        found = self.colour.at_centers(self.geometry, position)
-        return check_field_result(
+        found = self.colour.at_primitive_centers(self.geometry, position)
+        return check_primitive_field_result(
             found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance"
         )
 
-    def optical_depth(self, pairs: Pairs) -> Tensor:
+    def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
         """(M,) float64 integrals of sigma along chords, unclamped."""
         found = self.density.optical_depth(pairs)
-        return check_field_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
+        return check_primitive_field_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
 
-    def chord_colours(self, pairs: Pairs) -> Tensor:
+    def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
         """(M, C) float64 colours that are seen along chords."""
         found = self.colour.chord_colours(pairs)
-        return check_field_result(
+        return check_primitive_field_result(
             found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance"
         ).double()
 
 
 @dataclass(frozen=True)
-class ActiveSet:
+class ActivePrimitives:
     """The M active primitives, which can absorb anything under some conditions."""
 
     field: DensityField
@@ -156,7 +160,7 @@ class ActiveSet:
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
         """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
-        return check_field_result(found, (len(prim),), method_label(self.field, "density"))
+        return check_primitive_field_result(found, (len(prim),), model_method_label(self.field, "density"))
 
 
 class Primitives:
@@ -188,8 +192,14 @@ class Primitives:
     def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
         """Fresh primitives from the specs' own initialisers; raises FormError for other shapes."""
         own = [("starting points", spec) for spec in GEOMETRY_SPECS]
-        own += [(method_label(field, "parameters"), spec) for field in (density, colour) for spec in field.parameters()]
-        return cls(density, colour, {spec.name: check_initial_tensor(spec, context, who) for who, spec in own})
+        own += [
+            (model_method_label(field, "parameters"), spec)
+            for field in (density, colour)
+            for spec in field.parameters()
+        ]
+        return cls(
+            density, colour, {spec.name: check_initial_primitive_tensor(spec, context, who) for who, spec in own}
+        )
 
     @property
     def count(self) -> int:
@@ -218,7 +228,7 @@ class Primitives:
 
     def lower(
         self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None, shaded: bool = True
-    ) -> Lowered:
+    ) -> LoweredPrimitives:
         """Fold a frame's conditions into closed forms; differentiable. Inactive primitives are left out.
 
         Args:
@@ -236,27 +246,27 @@ class Primitives:
         own = self._of(self.colour, active.params)
         colour = self.colour.lower(own, geometry, camera, conditions)
         names = (type(self.density).__name__, type(self.colour).__name__)
-        check_colour(colour, sizes, names[1])
-        check_channels(sizes["C"][0], self.colour)
+        check_lowered_colour(colour, sizes, names[1])
+        check_lowered_channels(sizes["C"][0], self.colour)
         found = self.colour.shade(geometry, density, conditions, settings or RenderSettings()) if shaded else None
-        shading = check_shading(found, geometry.count, method_label(self.colour, "shade"))
+        shading = check_primitive_shading(found, geometry.count, model_method_label(self.colour, "shade"))
         if shading.primitives is not None:
             colour = colour.scaled(shading.primitives)
-        return Lowered(geometry, density, colour, active.rows, shading.pixels, names)
+        return LoweredPrimitives(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
         """Return geometry and density of the primitives active in a frame."""
         active = self.active(conditions)
         return active.geometry, self._lower_density(active)[0]
 
-    def _lower_density(self, active: ActiveSet) -> tuple[LoweredDensity, Sizes]:
+    def _lower_density(self, active: ActivePrimitives) -> tuple[LoweredDensity, Sizes]:
         """The density, checked, and the sizes that its tensors share with the geometry."""
         sizes = check_geometry(active.geometry, "geometry")
         try:
             density = self.density.lower(active.own, active.geometry, active.conditions)
         except FormError as error:  # of a sum of forms, which knows no field
-            raise FormError(f"{method_label(self.density, 'lower')}: {error}") from error
-        check_density(density, sizes, type(self.density).__name__)
+            raise FormError(f"{model_method_label(self.density, 'lower')}: {error}") from error
+        check_lowered_density(density, sizes, type(self.density).__name__)
         return density, sizes
 
     def component(self, name: str) -> Primitives:
@@ -277,14 +287,14 @@ class Primitives:
             if value is not own[name]:
                 own[name].copy_(value)
 
-    def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActiveSet:
+    def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActivePrimitives:
         """Return the primitives active in a frame; differentiable. With ``dtype``, detached and of that type."""
         rows = self.density.active_rows(self.of(self.density), conditions)
         params = self.params
         if rows is not None:
             from neuprim.core.model.rows import take_primitive_rows  # numba, loaded when first needed
 
-            check_active_rows(rows, self.count, f"{method_label(self.density, 'active_rows')} returned")
+            check_active_primitive_rows(rows, self.count, f"{model_method_label(self.density, 'active_rows')} returned")
             params = take_primitive_rows(params, rows)
         if dtype is not None:
             params = {name: value.detach().to(dtype) for name, value in params.items()}
@@ -293,8 +303,8 @@ class Primitives:
         stored = Geometry(params["means"], params["log_scales"], params["quats"])
         moved = self.density.move(own, stored, conditions)
         if moved is not stored:
-            check_geometry(moved, method_label(self.density, "move"), stored.count)
-        return ActiveSet(self.density, conditions, rows, params, own, stored, moved)
+            check_geometry(moved, model_method_label(self.density, "move"), stored.count)
+        return ActivePrimitives(self.density, conditions, rows, params, own, stored, moved)
 
     def to(self, device: torch.device) -> Primitives:
         """The same model on another device, without gradients; itself if it is there already."""

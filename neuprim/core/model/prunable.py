@@ -39,10 +39,10 @@ def count_unit_numbers(unit: PrunableUnit, params: Params) -> int:
     return sum(math.prod(value.shape[1:]) for value in unit.of(params).values())
 
 
-def removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
+def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
     """Return (N,) first-order changes, when the unit becomes zero, of the sum whose gradients are given."""
     slopes = unit.of(gradients)
-    parts = [_flat_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
+    parts = [_flat_primitive_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
     total = parts[0]
     for part in parts[1:]:
         total = total + part
@@ -62,10 +62,10 @@ def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params)
 
 def primitives_with_unit(unit: PrunableUnit, params: Params) -> Tensor:
     """Return (N,) bool of the primitives for which some number of the unit is not zero."""
-    return torch.stack([_flat_rows(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
+    return torch.stack([_flat_primitive_rows(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
 
 
-def _flat_rows(value: Tensor) -> Tensor:
+def _flat_primitive_rows(value: Tensor) -> Tensor:
     """(N, numbers of a primitive), also for N = 0."""
     return value.reshape(len(value), math.prod(value.shape[1:]))
 
@@ -73,7 +73,7 @@ def _flat_rows(value: Tensor) -> Tensor:
 _MASK, _NUMBERS = "|there", "|numbers"
 
 
-def sparse_parameters(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
+def sparse_primitive_parameters(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
     """Return the tensors of a file and the names of sparse parameters; ``specs`` are those of the fields."""
     stored, sparse = dict(params), []
     for name in (spec.name for spec in specs):
@@ -87,7 +87,9 @@ def sparse_parameters(params: Params, specs: Sequence[ParameterSpec]) -> tuple[d
     return stored, sparse
 
 
-def dense_parameters(stored: Params, names: object, specs: Sequence[ParameterSpec], where: str) -> dict[str, Tensor]:
+def dense_primitive_parameters(
+    stored: Params, names: object, specs: Sequence[ParameterSpec], where: str
+) -> dict[str, Tensor]:
     """Return the dense tensors of a model file with sparse parameters ``names``; ``where``: the file, for messages.
 
     Raises CheckpointError where the tensors do not fit the fields or each other.
@@ -104,11 +106,11 @@ def dense_parameters(stored: Params, names: object, specs: Sequence[ParameterSpe
     found = {name: value for name, value in stored.items() if not name.endswith((_MASK, _NUMBERS))}
     for name in names:
         size = len(means) * math.prod(shapes[name])
-        bits = _check_stored_tensor(
+        bits = _check_stored_primitive_tensor(
             stored.get(name + _MASK), ((size + 7) // 8,), torch.uint8, f"{where}: {name + _MASK}"
         )
         mask = torch.from_numpy(np.unpackbits(bits.numpy(), count=size, bitorder="little").astype(bool))
-        numbers = _check_stored_tensor(
+        numbers = _check_stored_primitive_tensor(
             stored.get(name + _NUMBERS), (int(mask.sum()),), torch.float32, f"{where}: {name + _NUMBERS}"
         )
         if name in found:
@@ -122,7 +124,9 @@ def dense_parameters(stored: Params, names: object, specs: Sequence[ParameterSpe
     return found
 
 
-def _check_stored_tensor(tensor: Tensor | None, shape: tuple[int, ...], dtype: torch.dtype, what: str) -> Tensor:
+def _check_stored_primitive_tensor(
+    tensor: Tensor | None, shape: tuple[int, ...], dtype: torch.dtype, what: str
+) -> Tensor:
     if tensor is None or tuple(tensor.shape) != shape or tensor.dtype != dtype:
         shown = "missing" if tensor is None else f"{tensor.dtype} {tuple(tensor.shape)}"
         raise CheckpointError(f"{what} is {shown}; expected {dtype} {shape}")

@@ -21,18 +21,18 @@ def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str
     """Rows (M,) int64, ascending, of ``tensors`` (N, ...), float32 or float64; differentiable, once. Not checked."""
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
-    return dict(zip(tensors, apply_autograd(_Rows, rows, *tensors.values()), strict=True))
+    return dict(zip(tensors, apply_autograd(_PrimitiveRows, rows, *tensors.values()), strict=True))
 
 
 @exact_kernel
-def _take_rows_kernel(rows, whole, taken):  # type: ignore[no-untyped-def]
+def _take_primitive_rows_kernel(rows, whole, taken):  # type: ignore[no-untyped-def]
     for n in range(rows.shape[0]):
         for j in range(whole.shape[1]):
             taken[n, j] = whole[rows[n], j]
 
 
 @exact_kernel
-def _put_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
+def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
     """Writes every row of ``whole``: zeros where there is none of ``taken``."""
     row = 0
     for n in range(rows.shape[0]):
@@ -46,7 +46,9 @@ def _put_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
     whole[row:] = 0.0
 
 
-def _each(kernel: Callable[..., None], rows: np.ndarray, pairs: list[tuple[np.ndarray, np.ndarray]]) -> None:
+def _each_primitive_table(
+    kernel: Callable[..., None], rows: np.ndarray, pairs: list[tuple[np.ndarray, np.ndarray]]
+) -> None:
     """The kernel on each of ``pairs`` as tables, which are shared out among the threads."""
     tables = [tuple(x.reshape(len(x), -1) for x in pair) for pair in pairs if pair[0].size and pair[1].size]
 
@@ -57,14 +59,14 @@ def _each(kernel: Callable[..., None], rows: np.ndarray, pairs: list[tuple[np.nd
     parallel_for(share, len(tables), 1, 0)
 
 
-class _Rows(torch.autograd.Function):
+class _PrimitiveRows(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rows: Tensor, *tensors: Tensor) -> tuple[Tensor, ...]:  # type: ignore[override]
         ctx.set_materialize_grads(False)
         ctx.rows, ctx.shapes = rows.numpy(), [x.shape for x in tensors]
         taken = [torch.empty((len(rows), *x.shape[1:]), dtype=x.dtype) for x in tensors]
-        _each(
-            _take_rows_kernel,
+        _each_primitive_table(
+            _take_primitive_rows_kernel,
             ctx.rows,
             [(x.detach().contiguous().numpy(), y.numpy()) for x, y in zip(tensors, taken, strict=True)],
         )
@@ -84,12 +86,12 @@ class _Rows(torch.autograd.Function):
         for g, whole in known:
             if not g.numel():
                 whole.zero_()  # nothing lives, or nothing is there
-        _each(_put_rows_kernel, ctx.rows, [(g.numpy(), whole.numpy()) for g, whole in known])
+        _each_primitive_table(_put_primitive_rows_kernel, ctx.rows, [(g.numpy(), whole.numpy()) for g, whole in known])
         return (None, *made)
 
 
 @strict
-def fill_rotation(q, out):  # type: ignore[no-untyped-def]
+def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
     w, x, y, z = (
         np.float64(q[0]),
         np.float64(q[1]),
@@ -111,7 +113,7 @@ def fill_rotation(q, out):  # type: ignore[no-untyped-def]
 
 
 @strict
-def rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
+def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
     """dL/dq from dL/dR; the normalisation projects out the radial part."""
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -126,7 +128,7 @@ def rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
 
 
 @exact_kernel
-def gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
+def cosine_gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
     """Gradients of (w2, b2), (N, K) and (N, 1), times ``factor`` (N, 1), and of the factor, ``pulled``."""
     for n in range(b2.shape[0]):
         total = np.float64(p_b2[n, 0]) * b2[n, 0]
@@ -137,7 +139,7 @@ def gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: igno
         pulled[n, 0] = total
 
 
-class _Gain(torch.autograd.Function):
+class _CosineGain(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         gain = log_gain.clamp(-limit, limit).exp()
@@ -150,14 +152,14 @@ class _Gain(torch.autograd.Function):
         w2, b2, log_gain, gain = ctx.saved_tensors
         g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, gain))
         given = (x.detach().contiguous().numpy() for x in (w2, b2, gain, p_w2, p_b2))
-        gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
+        cosine_gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
         return g_w2, g_b2, (pulled * gain).masked_fill_(log_gain.abs() > ctx.limit, 0.0), None
 
 
-def fused_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
+def fused_cosine_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
     """(w2, b2), (N, K) and (N, 1), times exp(log_gain), (N, 1), clamped to ``limit``; one dtype."""
     if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain
-    result: tuple[Tensor, Tensor] = apply_autograd(_Gain, w2, b2, log_gain, limit)
+    result: tuple[Tensor, Tensor] = apply_autograd(_CosineGain, w2, b2, log_gain, limit)
     return result

@@ -27,7 +27,7 @@ _RANGES = {"K": (0, MOST_UNITS), "H": (0, MOST_UNITS), "C": (1, sys.maxsize)}
 _DTYPES = (torch.float32, torch.float64)
 
 
-def tensor_fault(value: Any) -> str | None:
+def primitive_tensor_fault(value: Any) -> str | None:
     """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
@@ -54,16 +54,16 @@ def function_fault(value: Any) -> str | None:
     return None if callable(value) else f"type {type(value).__name__}; expected a function"
 
 
-def tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
+def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
     """The first of (name, tensor, shapes that it may have) that does not fit; ``sizes`` gets what the others add."""
     for name, value, shapes in tensors:
-        fault = tensor_fault(value)
+        fault = primitive_tensor_fault(value)
         if fault is None:
             for shape in shapes:
-                if _fits_shape(value.shape, shape, name, sizes):
+                if _fits_primitive_shape(value.shape, shape, name, sizes):
                     break
             else:
-                fault = f"shape {tuple(value.shape)}; expected {_expected_shapes(shapes, sizes)}"
+                fault = f"shape {tuple(value.shape)}; expected {_expected_primitive_shapes(shapes, sizes)}"
         if fault is not None:
             return f"{name} has {fault}"
     return None
@@ -74,7 +74,7 @@ def labelled_fault(name: str, fault: str | None) -> str | None:
     return None if fault is None else f"{name} has {fault}"
 
 
-def _fits_shape(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
+def _fits_primitive_shape(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> bool:
     if len(found) != len(shape):
         return False
     fresh: Sizes | None = None
@@ -96,7 +96,7 @@ def _fits_shape(found: torch.Size, shape: Shape, name: str, sizes: Sizes) -> boo
     return True
 
 
-def _expected_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
+def _expected_primitive_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
     """In numbers where all are known, else in letters with what is known of them."""
     letters = list(dict.fromkeys(d for d in shapes[0] if isinstance(d, str)))
     known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
@@ -119,7 +119,7 @@ Shapes = Mapping[str, tuple[Shape, ...]]
 """Name of a tensor -> the shapes it may have, in letters that the tensors of a frame share."""
 
 
-class ShapedTensors:
+class PrimitiveTensors:
     """A bundle of tensors with a row per primitive, which knows what shapes they must have."""
 
     shapes: ClassVar[Shapes] = {}
@@ -143,4 +143,6 @@ class ShapedTensors:
 
         ``sizes``: those known so far; gets the ones that this form adds.
         """
-        return tensors_fault([(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes)
+        return primitive_tensors_fault(
+            [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes
+        )

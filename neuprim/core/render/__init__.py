@@ -16,7 +16,7 @@ from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import ConfigError, NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
 from neuprim.core.render.draw import draw_on_device, draw_samples, draw_shaded
 from neuprim.core.render.near_plane import resolve_near
@@ -73,7 +73,7 @@ def render(
 
 
 def render_lowered(
-    lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
+    lowered: LoweredPrimitives, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
 ) -> RenderOutput:
     """Draw a model whose conditions are folded in already; the same errors as :func:`render`."""
     lowered.check(camera.viewmat, background)
@@ -81,7 +81,7 @@ def render_lowered(
 
 
 def _draw_checked(
-    lowered: Lowered, camera: AnyCamera, settings: RenderSettings, background: Tensor | None
+    lowered: LoweredPrimitives, camera: AnyCamera, settings: RenderSettings, background: Tensor | None
 ) -> RenderOutput:
     settings = resolve_near(settings, lowered.geometry.means, [camera])
     backend = choose_backend(lowered, settings, camera)
@@ -120,7 +120,7 @@ def probe_backend(name: str) -> str | None:
         camera = Camera(view, 16.0, 16.0, 8.0, 8.0, 16, 16)
         geometry = Geometry(torch.zeros(1, 3), torch.zeros(1, 3), torch.tensor([[1.0, 0, 0, 0]]))
         density = Cosine(torch.zeros(1, 1, 3), torch.zeros(1, 1), torch.zeros(1, 1), torch.ones(1))
-        lowered = Lowered(geometry, density, Constant(torch.ones(1, 3)))
+        lowered = LoweredPrimitives(geometry, density, Constant(torch.ones(1, 3)))
         middle = render_lowered(lowered, camera, RenderSettings(backend=name)).rgb[8, 8, 0].item()
     except Exception as error:  # a broken installation may fail in any way; the reason is what the user wants to read
         return f"{type(error).__name__}: {error}"
@@ -143,7 +143,7 @@ def render_slabs(
     """
     with torch.no_grad():
         black = Constant(torch.zeros(geometry.count, 1, device=geometry.means.device))
-        lowered = Lowered(geometry, density, black)
+        lowered = LoweredPrimitives(geometry, density, black)
         lowered.check(camera.viewmat, None)
         backend = choose_backend(lowered, settings, camera)
         plain = settings.sort == "center" and settings.samples == 1 and backend.drawing_device(settings) == lowered.kind
@@ -151,13 +151,13 @@ def render_slabs(
         if draw_together is not None:
             return draw_together(lowered, slabs, count, camera, settings)
         order = torch.argsort(slabs, stable=True)
-        geometry, density, images = geometry[order], density.rows(order), []
+        geometry, density, images = geometry[order], density.primitive_rows(order), []
         ends = torch.bincount(slabs, minlength=count).cumsum(0).tolist()
         for first, end in zip([0, *ends], ends, strict=False):
             if first == end:
                 continue
             slab = slice(first, end)
-            alone = Lowered(geometry[slab], density.rows(slab), Constant(black.rgb[slab]))
+            alone = LoweredPrimitives(geometry[slab], density.primitive_rows(slab), Constant(black.rgb[slab]))
             try:
                 output = render_lowered(alone, camera, settings)
             except NonFiniteError:

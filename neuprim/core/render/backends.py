@@ -18,7 +18,7 @@ from neuprim.core.compute import device as hardware
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.forms import Constant, Cosine, RayNet
-from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.notices import warn_once
 from neuprim.core.render.draw import Draw
 from neuprim.core.settings import RenderSettings
@@ -44,7 +44,7 @@ class Backend:
 
     name: str
     load: Callable[[], Draw]  # imports it and returns its :data:`~neuprim.core.render.draw.Draw`
-    unsupported: Callable[[Lowered, AnyCamera | None], str | None] = _no_backend_fault
+    unsupported: Callable[[LoweredPrimitives, AnyCamera | None], str | None] = _no_backend_fault
     """What it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
     "cannot draw"; None if it can."""
     device_name: Callable[[], str] = _cpu_backend_name
@@ -69,7 +69,9 @@ class Backend:
         device = device or self.devices[0]
         return (hardware.cuda_unavailable() if device == hardware.CUDA else None) or self.missing()
 
-    def cannot_draw(self, lowered: Lowered, camera: AnyCamera | None, device: str | None = None) -> str | None:
+    def cannot_draw(
+        self, lowered: LoweredPrimitives, camera: AnyCamera | None, device: str | None = None
+    ) -> str | None:
         """Return why it does not draw this on a kind of device, as the rest of a sentence; None if it does."""
         device = device or self.devices[0]
         if device not in self.devices:
@@ -83,7 +85,7 @@ class Backend:
         return None if unsupported is None else f"cannot draw {unsupported}"
 
 
-def unsupported_by_kernels(lowered: Lowered, camera: AnyCamera | None) -> str | None:
+def unsupported_by_kernels(lowered: LoweredPrimitives, camera: AnyCamera | None) -> str | None:
     """Return what kernels that are compiled ahead of a model cannot draw; None if they can."""
     if not (isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)):
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
@@ -242,7 +244,7 @@ def computing_device(settings: RenderSettings) -> torch.device:
     return hardware.current_device(hardware.CPU if missing else kind)
 
 
-def choose_backend(lowered: Lowered, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
+def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
     """Return the backend that draws this model through this camera (None: any pinhole).
 
     Raises BackendUnavailable if the named one cannot, and ConfigError if there is none of the name.

@@ -11,8 +11,8 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device
-from neuprim.core.model.checks import check_field_result
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.checks import check_primitive_field_result
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, mean_depth
 from neuprim.core.settings import RenderSettings
 
@@ -21,7 +21,7 @@ Draw = Callable[..., RenderOutput]
 
 
 def draw_samples(
-    draw: Draw, lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings
+    draw: Draw, lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
     """Draw ``settings.samples`` squared rays per pixel: means of rgb and alpha, and of depth weighted by alpha."""
     n = settings.samples
@@ -55,7 +55,7 @@ def draw_shaded(draw: Draw) -> Draw:
     """Return a draw function that multiplies the frame, not its background, by ``lowered.shade`` at the mean depth."""
 
     def shaded(
-        lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
+        lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
     ) -> RenderOutput:
         assert lowered.shade is not None
         output = draw(lowered, camera, background, replace(settings, depth=True))
@@ -64,7 +64,9 @@ def draw_shaded(draw: Draw) -> Draw:
         factor = torch.ones_like(output.alpha, requires_grad=False)
         points = unproject_depth(output.depth, camera)[hit]
         values = lowered.shade(points)
-        factor[hit] = check_field_result(values, (len(points),), f"{lowered.owner('colour')}: shade").to(factor)
+        factor[hit] = check_primitive_field_result(values, (len(points),), f"{lowered.owner('colour')}: shade").to(
+            factor
+        )
         rgb = output.rgb * factor[..., None]
         if background is not None:
             rgb = rgb + ((1 - factor) * (1 - output.alpha))[..., None] * background.to(rgb)
@@ -76,7 +78,9 @@ def draw_shaded(draw: Draw) -> Draw:
 def draw_on_device(draw: Draw, place: torch.device) -> Draw:
     """Return a draw function that draws on another device and moves the frame back; differentiable."""
 
-    def moved(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+    def moved(
+        lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
+    ) -> RenderOutput:
         own = lowered.geometry.means.device
         camera = replace(camera, viewmat=camera.viewmat.to(place))
         output = draw(lowered.to(place), camera, None if background is None else background.to(place), settings)

@@ -15,7 +15,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.errors import ConfigError, FormError
 from neuprim.core.model.fields import Conditions, Constant, LoweredColour
-from neuprim.core.model.primitives import Lowered, Primitives
+from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.draw import unproject_depth
 
@@ -35,7 +35,7 @@ class LayerFrame:
     color_space: str = "linear"
 
     @cached_property
-    def lowered(self) -> Lowered:
+    def lowered(self) -> LoweredPrimitives:
         """The frame's closed forms, as it is drawn."""
         with torch.no_grad():
             return self.model.lower(self.camera, self.conditions, self.settings)
@@ -126,7 +126,7 @@ class LayerFrame:
         with torch.no_grad():
             return render_lowered(thin, camera, settings, torch.ones(1, device=means.device)).rgb[..., 0]
 
-    def _render(self, lowered: Lowered, settings: RenderSettings) -> RenderOutput:
+    def _render(self, lowered: LoweredPrimitives, settings: RenderSettings) -> RenderOutput:
         with torch.no_grad():
             return render_lowered(lowered, self.camera, settings)
 

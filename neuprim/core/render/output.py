@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.checks import check_tensor_shape
+from neuprim.core.model.checks import check_model_tensor_shape
 
 
 @dataclass
@@ -109,7 +109,7 @@ class RenderOutput:
         Args:
             error: (H, W) any measure of what is wrong at each pixel; no gradient reaches it.
         """
-        check_tensor_shape("request_contributions: error", error, tuple(self.alpha.shape), ", that of the frame")
+        check_model_tensor_shape("request_contributions: error", error, tuple(self.alpha.shape), ", that of the frame")
         return self.stats.request_contributions(error)
 
 

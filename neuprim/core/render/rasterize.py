@@ -16,7 +16,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.operation import apply_autograd, needs_grad
 from neuprim.core.model.fields import Constant, Cosine, RayNet
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
@@ -39,14 +39,14 @@ class RasterRequest:
 
     @classmethod
     def of(
-        cls, lowered: Lowered, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: bool
+        cls, lowered: LoweredPrimitives, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: bool
     ) -> RasterRequest:
         density = lowered.density
         assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
         return cls(camera, density.omega0 / (2 * math.pi), density.edge, settings, stats, *rest)
 
 
-def primitive_tensors(lowered: Lowered) -> tuple[Tensor, ...]:
+def primitive_tensors(lowered: LoweredPrimitives) -> tuple[Tensor, ...]:
     """Return the tensors of :data:`PARAMETERS`."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
@@ -56,7 +56,7 @@ def primitive_tensors(lowered: Lowered) -> tuple[Tensor, ...]:
 def rasterize(
     operation: type[torch.autograd.Function],
     name: str,
-    lowered: Lowered,
+    lowered: LoweredPrimitives,
     camera: Camera,
     background: Tensor | None,
     settings: RenderSettings,

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.checks import check_divided_primitives, check_field_tensors, method_label
+from neuprim.core.model.checks import check_divided_primitive_rows, check_primitive_tensors, model_method_label
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
@@ -57,17 +57,19 @@ def split_primitives(
     shrink = torch.where(longest > 0, torch.full_like(longest, long_factor), torch.full_like(longest, other_factor))
     after = Geometry(before.means + sign * shift * reach * direction, before.log_scales + shrink.log(), before.quats)
     own, own_colour = ({k: old[k] for k in model.of(field)} for field in (model.density, model.colour))
-    density = check_field_tensors(
-        model.density.on_split(own, before, after), own, method_label(model.density, "on_split")
+    density = check_primitive_tensors(
+        model.density.on_split(own, before, after), own, model_method_label(model.density, "on_split")
     )
-    colour = check_field_tensors(
-        model.colour.on_split(own_colour, before, after), own_colour, method_label(model.colour, "on_split")
+    colour = check_primitive_tensors(
+        model.colour.on_split(own_colour, before, after), own_colour, model_method_label(model.colour, "on_split")
     )
     children = {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
     first = slice(len(parents))
     divided = model.density.divide({k: v[first] for k, v in own.items()}, before[first])
     if divided is not None:
-        chosen, halves, place = check_divided_primitives(divided, own, before, method_label(model.density, "divide"))
+        chosen, halves, place = check_divided_primitive_rows(
+            divided, own, before, model_method_label(model.density, "divide")
+        )
         chosen = torch.cat([chosen, chosen])
         for name, value in {**old, **place, **halves}.items():
             children[name][chosen] = value[chosen]
@@ -269,7 +271,7 @@ class GradientPopulation(Population):
         params = {n: v.detach()[kept].clone() for n, v in model.params.items()}
         own = {k: model.params[k].detach()[clones] for k in model.of(model.density)}
         halved = model.density.scale_density(own, torch.full((len(clones),), 0.5, device=model.device))
-        halved = check_field_tensors(halved, own, method_label(model.density, "scale_density"))
+        halved = check_primitive_tensors(halved, own, model_method_label(model.density, "scale_density"))
         copies = {**model.rows(clones), **halved}
         position = torch.full_like(prune, -1, dtype=torch.int64)
         position[kept] = torch.arange(len(kept), device=model.device)

@@ -16,9 +16,9 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.data import Dataset, PointSamples
-from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import removal_effect
+from neuprim.core.model.prunable import primitive_unit_removal_effect
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.volumes.points import volume_values_at
 
@@ -51,7 +51,7 @@ class _SensitivitySums:
     """Sums over backward passes of random signs."""
 
     def __init__(self, model: Primitives) -> None:
-        self._model, self._pieces = model, prunable_units_by_name(model.density, model.colour)
+        self._model, self._pieces = model, prunable_units_of_model(model.density, model.colour)
         self.pieces = {name: torch.zeros(model.count) for name in self._pieces}
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
@@ -61,7 +61,7 @@ class _SensitivitySums:
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
         for name, piece in self._pieces.items():
-            self.pieces[name] += removal_effect(piece, params, gradients).square().cpu()
+            self.pieces[name] += primitive_unit_removal_effect(piece, params, gradients).square().cpu()
         for name, own in self.columns.items():
             slopes = gradients[name].reshape(self._model.count, len(own))
             if name == "quats":  # a change of a quaternion counts as it turns, whatever its norm

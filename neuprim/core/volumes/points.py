@@ -19,7 +19,7 @@ from neuprim.core.model.colours.sh import C0
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Conditions, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import ActiveSet, Primitives
+from neuprim.core.model.primitives import ActivePrimitives, Primitives
 from neuprim.core.volumes.points_cpu import NOT_FINITE, CosinePointValues, PointCells, sort_points_into_cells
 
 
@@ -101,7 +101,7 @@ def volume_values_at(
 
 
 def _torch_values(
-    active: ActiveSet, form: LoweredDensity, cells: PointCells, weights: Tensor, shares: PointShares
+    active: ActivePrimitives, form: LoweredDensity, cells: PointCells, weights: Tensor, shares: PointShares
 ) -> Tensor:
     """As :class:`CosinePointValues`; sums run in a fixed order."""
     g = active.geometry

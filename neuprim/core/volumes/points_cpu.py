@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.rows import fill_rotation, rotation_backward
+from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 
 _PARTIAL_SUMS = 8  # groups of primitives with a sum of their own, so that results do not depend on the thread count
 _ROWS_PER_JOB, _PREPARED_ROWS_PER_JOB = 64, 1024
@@ -111,7 +111,7 @@ def _prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach): 
     around the ellipsoids, ``reach`` (N, 3). Returns whether all are finite."""
     R, s, total = np.empty((3, 3)), np.empty(3), 0.0
     for n in range(start, stop):
-        fill_rotation(quats[n], R)
+        fill_ellipsoid_rotation(quats[n], R)
         for a in range(3):
             s[a] = np.exp(np.float64(log_scales[n, a]))
         m[n] = max(s[0], s[1], s[2])
@@ -155,7 +155,7 @@ def _parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulle
     for n in range(start, stop):
         for j in range(4):
             q[j] = quats[n, j]
-        inverse = fill_rotation(q, R)
+        inverse = fill_ellipsoid_rotation(q, R)
         longest, first = p_offset[n] * offset[n], 0
         for k in range(phase.shape[1]):
             longest += p_amplitude[n, k] * amplitude[n, k]
@@ -173,7 +173,7 @@ def _parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulle
                 total += p_A[n, a, j] * A[n, a, j]
                 gR[j, a] = p_A[n, a, j] / s
             g_log_scales[n, a] = -total - (longest if a == first else 0.0)
-        rotation_backward(q, inverse, gR, gq)
+        ellipsoid_rotation_backward(q, inverse, gR, gq)
         for j in range(4):
             g_quats[n, j] = gq[j]
 

@@ -23,7 +23,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.model.cosine_sums import canonicalize_cosines, prune_neurons
+from neuprim.core.model.cosine_sums import canonicalize_cosines, prune_cosine_neurons
 from neuprim.core.model.densities.cosine import (
     OMEGA0,
     CosineDensity,
@@ -252,7 +252,7 @@ class TimeDensity(DensityField):
     ) -> tuple[TimeDensity, dict[str, Tensor]]:
         if name == "neurons":
             field = TimeDensity(**{**self.settings(), "neurons": value})
-            return field, prune_neurons(params, geometry, value, self.static.omega0)
+            return field, prune_cosine_neurons(params, geometry, value, self.static.omega0)
         remaining = drop_time_terms(params, geometry, name, self.static.omega0)
         left = "+".join(part for part in TIME_PARTS if part in self.parts and part != name) or "none"
         field = TimeDensity(**{**self.settings(), "time": left})

@@ -12,7 +12,7 @@ from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.operation import apply_autograd
 from neuprim.core.model.edge import edge_weight
-from neuprim.core.model.rows import gain_backward
+from neuprim.core.model.rows import cosine_gain_backward
 
 WINDOW_EDGE = 2  # exponent of the window in time
 
@@ -54,7 +54,7 @@ class _Window(torch.autograd.Function):
         w2, b2, tau, u, weight = ctx.saved_tensors
         g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, weight))
         given = (x.detach().contiguous().numpy() for x in (w2, b2, weight, p_w2, p_b2))
-        gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
+        cosine_gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
         g_u = pulled.mul_(edge_weight(u.square(), WINDOW_EDGE - 1)).mul_(u).mul_(-2.0 * WINDOW_EDGE)
         return g_w2, g_b2, -g_u / tau, -g_u * u, None
 

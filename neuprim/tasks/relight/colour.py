@@ -22,7 +22,7 @@ from torch import Tensor
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.compute import device
 from neuprim.core.model.colours.sh import prunable_sh_coefficients, truncate_sh_bands
-from neuprim.core.model.cosine_sums import ball_mean, canonicalize_cosines, smaller_neuron_counts
+from neuprim.core.model.cosine_sums import canonicalize_cosines, ellipsoid_cosine_mean, smaller_cosine_neuron_counts
 from neuprim.core.model.edge import sinc
 from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, RayNet, Shading, read_script
 from neuprim.core.model.geometry import Geometry
@@ -148,7 +148,7 @@ class LightNetwork(ColourField):
         }
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        return {"hidden": smaller_neuron_counts(self.hidden)} if self.hidden else {}
+        return {"hidden": smaller_cosine_neuron_counts(self.hidden)} if self.hidden else {}
 
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
@@ -190,7 +190,12 @@ def prune_hidden_units(
     rates = ((net_x @ rotations) * semi_axes[:, None, :]).norm(dim=-1), view.norm(dim=-1), light.norm(dim=-1)
 
     def mean_of(times: int) -> Tensor:
-        return (times * phase).cos() * ball_mean(times * rates[0]) * sinc(times * rates[1]) * sinc(times * rates[2])
+        return (
+            (times * phase).cos()
+            * ellipsoid_cosine_mean(times * rates[0])
+            * sinc(times * rates[1])
+            * sinc(times * rates[2])
+        )
 
     mean = mean_of(1)
     variance = (1 + mean_of(2)) / 2 - mean.square()

@@ -23,7 +23,7 @@ from neuprim.core.compression import (
 )
 from neuprim.core.compression.quantizers import ColumnQuantizer
 from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from tests import scenes
@@ -75,7 +75,7 @@ def test_a_bit_says_who_does_without_a_piece(tmp_path: Path, name: str) -> None:
         checkpoint.save_compressed(tmp_path / "2", pruned, task.name, {}, LEVELS[3])
     plain, _ = checkpoint.load_model(tmp_path / "2", task)
     assert all(torch.equal(value, plain.params[key]) for key, value in pruned.params.items())
-    if prunable_units_by_name(model.density, model.colour):
+    if prunable_units_of_model(model.density, model.colour):
         assert len(files[0]) < 0.95 * (tmp_path / "2").stat().st_size
 
 

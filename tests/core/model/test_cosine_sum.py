@@ -11,7 +11,7 @@ from neuprim.conformance.field_checks import points_inside, random_chords
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Cosine
-from neuprim.core.model.geometry import Geometry, Pairs
+from neuprim.core.model.geometry import Geometry, PrimitiveChords
 from neuprim.core.model.tensors import MOST_UNITS
 from tests import scenes
 
@@ -52,7 +52,7 @@ def test_densities_and_line_integrals_add_up(name: str) -> None:
     found, a, b = (cosine_density(f, geometry, prim, x) for f in (both, first, second))
     assert (found - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.1
     ray = random_chords(geometry, prim, generator)
-    whole, a, b = (f.optical_depth(Pairs.of(geometry, prim, *ray)) for f in (both, first, second))
+    whole, a, b = (f.optical_depth(PrimitiveChords.of(geometry, prim, *ray)) for f in (both, first, second))
     assert (whole - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.01
 
 

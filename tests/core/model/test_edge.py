@@ -10,9 +10,9 @@ from torch import Tensor
 
 from neuprim.config import compose
 from neuprim.core.model.densities.cosine import CosineDensity, cosine_density
-from neuprim.core.model.edge import EDGES, NORMS, chord_integral, edge_profile, spherical_bessel
+from neuprim.core.model.edge import EDGES, NORMS, edge_profile, soft_edge_chord_integral, spherical_bessel
 from neuprim.core.model.fields import Cosine
-from neuprim.core.model.geometry import Geometry, Pairs
+from neuprim.core.model.geometry import Geometry, PrimitiveChords
 from neuprim.core.model.schema import InitContext
 from tests import scenes
 
@@ -49,7 +49,7 @@ def test_any_part_of_a_chord(edge: int, reach: float) -> None:
     quadratic = (1 - middle**2, -2 * middle * half, -(half**2))
     phase, z, amplitude = (torch.randn(count, neurons, generator=g, dtype=F64) for _ in range(3))
     z, offset = z.clamp(-1, 1) * reach, torch.randn(count, generator=g, dtype=F64)
-    found = chord_integral(quadratic, edge, phase, z, amplitude, offset)
+    found = soft_edge_chord_integral(quadratic, edge, phase, z, amplitude, offset)
     u, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(1400))
     f = offset[:, None] + (amplitude[..., None] * (phase[..., None] + z[..., None] * u).cos()).sum(1)
     weight = (quadratic[0][:, None] + quadratic[1][:, None] * u + quadratic[2][:, None] * u**2) ** edge
@@ -69,7 +69,10 @@ def test_gradients_of_a_part_of_a_chord() -> None:
         rest = [leaf(5, 2), leaf(5, 2), leaf(5, 2), leaf(5)]
         rest[1].data[0, 0], rest[1].data[1, 0] = 0.0, 2.0  # where series and recursion meet
         assert torch.autograd.gradcheck(
-            lambda a, b, c, *more, p=edge: chord_integral((a, b, c), p, *more), (*parts, *rest), atol=1e-7, rtol=1e-5
+            lambda a, b, c, *more, p=edge: soft_edge_chord_integral((a, b, c), p, *more),
+            (*parts, *rest),
+            atol=1e-7,
+            rtol=1e-5,
         )
 
 
@@ -89,7 +92,7 @@ def test_a_chord_is_the_integral_of_the_density(edge: int) -> None:
     root = (b * b + a * (1 - y.square().sum(-1))).sqrt()
     t0, t1 = (-b - root) / a, (-b + root) / a
     t0[40:] = torch.lerp(t0[40:], t1[40:], torch.rand(40, generator=g, dtype=F64))  # as a near plane cuts
-    found = form.optical_depth(Pairs.of(geometry, prim, start, d, t0, t1))
+    found = form.optical_depth(PrimitiveChords.of(geometry, prim, start, d, t0, t1))
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(200))
     at = t0[:, None] + (t1 - t0)[:, None] * (x + 1) / 2
     points = (start[:, None] + at[..., None] * d[:, None]).reshape(-1, 3)

@@ -11,18 +11,18 @@ from torch import Tensor
 
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, RayNet
-from neuprim.core.model.geometry import Pairs
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.geometry import PrimitiveChords
+from neuprim.core.model.primitives import LoweredPrimitives
 from tests import scenes
 
 M = 40
 
 
-def model(hidden: int | None = None) -> Lowered:
+def model(hidden: int | None = None) -> LoweredPrimitives:
     return scenes.lowered(scenes.tensors(12, 5, seed=2, dtype=torch.float64, hidden=hidden))
 
 
-def chords(low: Lowered) -> tuple[Pairs, Tensor, Tensor, Tensor, Tensor]:
+def chords(low: LoweredPrimitives) -> tuple[PrimitiveChords, Tensor, Tensor, Tensor, Tensor]:
     """M pieces of rays inside primitives, and how they were made: origins, directions, t0, t1."""
     g = torch.Generator().manual_seed(3)
     prim = torch.randint(0, low.geometry.count, (M,), generator=g)
@@ -31,7 +31,7 @@ def chords(low: Lowered) -> tuple[Pairs, Tensor, Tensor, Tensor, Tensor]:
     a, b = torch.rand(2, M, generator=g, dtype=torch.float64) * reach * 0.9
     o = low.geometry.means[prim] - 2.0 * d
     t0, t1 = 2.0 - a, 2.0 + b
-    return Pairs.of(low.geometry, prim, o, d, t0, t1), o, d, t0, t1
+    return PrimitiveChords.of(low.geometry, prim, o, d, t0, t1), o, d, t0, t1
 
 
 def test_pairs_are_measured_in_the_primitive_and_given_back_in_the_scene() -> None:

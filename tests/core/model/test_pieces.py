@@ -12,14 +12,14 @@ from safetensors.torch import save_file
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import Field, prunable_units_by_name
+from neuprim.core.model.fields import Field, prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import (
     count_unit_numbers,
-    dense_parameters,
+    dense_primitive_parameters,
+    primitive_unit_removal_effect,
     primitives_with_unit,
-    removal_effect,
-    sparse_parameters,
+    sparse_primitive_parameters,
     zero_units,
 )
 from neuprim.core.task import TaskSpec
@@ -42,7 +42,7 @@ PAIRS = [
 def pruned(model: Primitives, seed: int = 5) -> Primitives:
     """The model, in which every piece is gone from half of the primitives."""
     generator = torch.Generator().manual_seed(seed)
-    pieces = prunable_units_by_name(model.density, model.colour)
+    pieces = prunable_units_of_model(model.density, model.colour)
     gone = {name: (piece, torch.rand(model.count, generator=generator) < 0.5) for name, piece in pieces.items()}
     return Primitives(model.density, model.colour, zero_units(gone, model.params))
 
@@ -50,7 +50,7 @@ def pruned(model: Primitives, seed: int = 5) -> Primitives:
 @pytest.mark.parametrize(("density", "colour"), PAIRS, ids=lambda field: type(field).__name__)
 def test_no_number_is_in_two_pieces_and_each_has_some(density: Field, colour: Field) -> None:
     model = made(density, colour)
-    pieces = prunable_units_by_name(model.density, model.colour)
+    pieces = prunable_units_of_model(model.density, model.colour)
     assert pieces
     times = {name: torch.zeros_like(value) for name, value in model.params.items()}
     for piece in pieces.values():
@@ -65,7 +65,7 @@ def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) 
     """A primitive whose piece is zero looks like one whose other numbers of the piece never were: moving zeros
     elsewhere changes nothing."""
     model = made(density, colour)
-    for name, piece in prunable_units_by_name(model.density, model.colour).items():
+    for name, piece in prunable_units_of_model(model.density, model.colour).items():
         everywhere = torch.ones(COUNT, dtype=torch.bool)
         empty = Primitives(model.density, model.colour, zero_units({name: (piece, everywhere)}, model.params))
         assert not bool(primitives_with_unit(piece, empty.params).any())
@@ -77,7 +77,7 @@ def test_of_a_piece_that_is_gone_nothing_is_left(density: Field, colour: Field) 
 
 def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
     model = made(*PAIRS[0])
-    piece = prunable_units_by_name(model.density, model.colour)["density.neuron 1"]
+    piece = prunable_units_of_model(model.density, model.colour)["density.neuron 1"]
     empty = zero_units({"": (piece, torch.ones(COUNT, dtype=torch.bool))}, model.params)
     own = model.of(model.density)
     fewer = {name: value[:, [0, 2]] if name in ("W1", "b1", "w2") else value for name, value in own.items()}
@@ -89,14 +89,14 @@ def test_a_neuron_that_is_gone_is_a_field_without_it() -> None:
 
 def test_worth_is_the_first_order_of_doing_without() -> None:
     model = made(*PAIRS[0])
-    piece = prunable_units_by_name(model.density, model.colour)["colour.coefficient 2 +0, channel 1"]
+    piece = prunable_units_of_model(model.density, model.colour)["colour.coefficient 2 +0, channel 1"]
     params = {name: value.clone().requires_grad_() for name, value in model.params.items()}
     weights = torch.randn(COUNT, 3, generator=torch.Generator().manual_seed(1))
     colours = 5.0 + sum((params["sh_rest"][:, i] for i in range(15)), torch.zeros(COUNT, 3))  # linear, as harmonics are
     (colours * weights).sum().backward()
     gradients = {name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()}
     expected = model.params["sh_rest"][:, 5, 1] * weights[:, 1]
-    assert torch.allclose(removal_effect(piece, params, gradients), expected, atol=1e-5)
+    assert torch.allclose(primitive_unit_removal_effect(piece, params, gradients), expected, atol=1e-5)
 
 
 # ---------------------------------------------------------------- files
@@ -108,8 +108,8 @@ BITS = (45 * COUNT + 7) // 8  # bytes of the bits of COUNT primitives' coefficie
 def test_files_leave_zeros_out_and_give_them_back(density: Field, colour: Field) -> None:
     model = pruned(made(density, colour))
     own = (*model.density.parameters(), *model.colour.parameters())
-    stored, sparse = sparse_parameters(model.params, own)
-    again = dense_parameters(stored, sparse, own, "file")
+    stored, sparse = sparse_primitive_parameters(model.params, own)
+    again = dense_primitive_parameters(stored, sparse, own, "file")
     assert sparse and again.keys() == model.params.keys()
     for name, value in model.params.items():
         assert torch.equal(again[name].view(torch.int32), value.view(torch.int32)), name

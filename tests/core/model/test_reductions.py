@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.colours import sh
-from neuprim.core.model.cosine_sums import prune_neurons
+from neuprim.core.model.cosine_sums import prune_cosine_neurons
 from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density
 from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Field
@@ -106,7 +106,7 @@ def test_dropped_neurons_leave_their_mean_and_those_that_stay_matter_most() -> N
     x = inside(model.geometry, 4000, torch.Generator().manual_seed(2))
     whole = sigma(model, x)
     for keep in (6, 4, 2, 0):
-        params = prune_neurons(model.of(model.density), model.geometry, keep, OMEGA0)
+        params = prune_cosine_neurons(model.of(model.density), model.geometry, keep, OMEGA0)
         smaller = Primitives(CosineDensity(keep), model.colour, {**model.params, **params})
         left = sigma(smaller, x)
         scale = whole.std(1)
@@ -120,7 +120,7 @@ def test_means_of_phases_that_advance_are_those_over_the_sequence() -> None:
     model = made(TimeDensity(3, "phase"), SphericalHarmonics(0), noise=0.02)
     model.params["W_t"] *= 3
     x = inside(model.geometry, 1500, torch.Generator().manual_seed(2))
-    params = prune_neurons(model.of(model.density), model.geometry, 0, OMEGA0)
+    params = prune_cosine_neurons(model.of(model.density), model.geometry, 0, OMEGA0)
     means = torch.stack([sigma(model, x, {"time": t}).mean(1) for t in torch.linspace(0, 1, 41)])
     mean = torch.trapezoid(means, dx=1 / 40, dim=0)
     amplitude = model.params["w2"].abs().sum(1) / model.geometry.length_scale

@@ -113,9 +113,9 @@ def on_blocks(
 ) -> torch.Tensor:
     """The card's kernels, on Warp's CPU blocks."""
     pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
-    from neuprim.core.model.colours.sh_warp import fused_colors
+    from neuprim.core.model.colours.sh_warp import fused_harmonic_colors
 
-    return fused_colors(means, dc, rest, origin, degree)
+    return fused_harmonic_colors(means, dc, rest, origin, degree)
 
 
 @pytest.mark.parametrize("kernels", [sh.sh_colors, on_blocks])

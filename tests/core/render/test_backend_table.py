@@ -18,7 +18,7 @@ from neuprim.config import RunConfig, compose
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError, NonFiniteError
 from neuprim.core.model.fields import Constant, CustomDensity
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderOutput, RenderSettings, backends, render_lowered
 from neuprim.core.render.backends import Backend, choose_backend
 from neuprim.core.render.draw import Draw
@@ -37,7 +37,7 @@ class Fake:
     dim: float = 1.0
 
     def load(self) -> Draw:
-        def render(lowered: Lowered, *rest: Any) -> RenderOutput:
+        def render(lowered: LoweredPrimitives, *rest: Any) -> RenderOutput:
             assert isinstance(lowered.colour, Constant)
             self.frames += 1
             output = reference(lowered, *rest)
@@ -46,7 +46,7 @@ class Fake:
 
         return render
 
-    def unsupported(self, lowered: Lowered, camera: AnyCamera | None) -> str | None:
+    def unsupported(self, lowered: LoweredPrimitives, camera: AnyCamera | None) -> str | None:
         return None if isinstance(lowered.colour, Constant) else f"{type(lowered.colour).__name__} colour"
 
 

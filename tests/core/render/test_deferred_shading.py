@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras.projections import RayCamera
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.draw import unproject_depth
 from tests import scenes
@@ -17,7 +17,7 @@ from tests.backends import BACKENDS, by
 BACKGROUND = torch.tensor([0.3, 0.6, 0.9])
 
 
-def lowered() -> Lowered:
+def lowered() -> LoweredPrimitives:
     return scenes.lowered(scenes.tensors(12, seed=4))
 
 

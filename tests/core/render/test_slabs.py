@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Constant
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered, render_slabs
 from tests import scenes
 from tests.backends import BACKENDS
@@ -18,7 +18,7 @@ from tests.backends import BACKENDS
 COUNT = 4
 
 
-def scene(distance: float, fov: float) -> tuple[Lowered, Tensor, Any]:
+def scene(distance: float, fov: float) -> tuple[LoweredPrimitives, Tensor, Any]:
     """Before the camera, or around it, where many are drawn in float64; slab 2 has no primitives."""
     low = scenes.lowered(scenes.tensors(80, seed=5))
     slabs = torch.randint(0, COUNT, (80,), generator=torch.Generator().manual_seed(1))
@@ -37,7 +37,9 @@ def test_each_is_what_it_is_alone(
     wanted = []
     for slab in (0, 1, 3):
         rows = (slabs == slab).nonzero()[:, 0]
-        alone = Lowered(low.geometry[rows], low.density.rows(rows), Constant(torch.zeros(len(rows), 1)))
+        alone = LoweredPrimitives(
+            low.geometry[rows], low.density.primitive_rows(rows), Constant(torch.zeros(len(rows), 1))
+        )
         wanted.append(render_lowered(alone, camera, settings))
     frames = []
     genuine = render_lowered

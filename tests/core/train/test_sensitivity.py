@@ -8,7 +8,7 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.fields import prunable_units_by_name
+from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import zero_units
 from neuprim.core.render import RenderSettings, render
@@ -40,7 +40,7 @@ def test_signs_find_the_mean_squared_change_of_every_piece() -> None:
     views = list(range(len(dataset.train)))[:4]
     whole = images(one, dataset, views)
     trials = [sensitivity(one, dataset, views, SETTINGS, seed) for seed in range(60)]
-    pieces = prunable_units_by_name(one.density, one.colour)
+    pieces = prunable_units_of_model(one.density, one.colour)
     for name in ("colour.coefficient 1 -1, channel 0", "colour.coefficient 1 +0, channel 2"):
         found = torch.stack([t.pieces[name] for t in trials]).mean(0)
         for row in range(one.count):

@@ -12,7 +12,7 @@ from neuprim.core.errors import FormError
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import Params
-from neuprim.core.model.tensors import Shape, Sizes, tensors_fault
+from neuprim.core.model.tensors import Shape, Sizes, primitive_tensors_fault
 
 
 def sh_coefficient_count(degree: int) -> int:
@@ -61,13 +61,13 @@ def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, de
         return (dc * C0 + 0.5).clamp_min(0.0)
     assert rest is not None  # checked above
     if device.on_numba(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
-        from neuprim.core.model.colours.sh_cpu import fused_colors  # numba, loaded when first needed
+        from neuprim.core.model.colours.sh_cpu import fused_harmonic_colors  # numba, loaded when first needed
 
-        return fused_colors(means, dc, rest, origin, degree)
+        return fused_harmonic_colors(means, dc, rest, origin, degree)
     if device.on_warp(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
         from neuprim.core.model.colours import sh_warp
 
-        return sh_warp.fused_colors(means, dc, rest, origin, degree)
+        return sh_warp.fused_harmonic_colors(means, dc, rest, origin, degree)
     offset = means - device.to_device_like(origin, means)
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     bands = sh_basis(direction, degree)[:, 1:]
@@ -84,7 +84,7 @@ def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Ten
     if needed:
         tensors += [("rest", rest, (("N", "bands", "C"),)), ("origin", origin, ((3,),))]
     sizes: Sizes = {}
-    fault = tensors_fault(tensors, sizes)
+    fault = primitive_tensors_fault(tensors, sizes)
     if fault is None and needed and sizes["bands"][0] < needed:
         fault = f"rest has {sizes['bands'][0]} bands; expected at least {needed} for degree {degree}"
     if fault is not None:

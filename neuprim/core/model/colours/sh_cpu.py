@@ -75,7 +75,7 @@ def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
 
 
 @exact_kernel
-def _colors(start, stop, means, dc, rest, origin, degree, color):  # type: ignore[no-untyped-def]
+def _harmonic_colors(start, stop, means, dc, rest, origin, degree, color):  # type: ignore[no-untyped-def]
     bands = (degree + 1) * (degree + 1) - 1
     C = dc.shape[1]
     Y = np.empty(15)
@@ -91,7 +91,7 @@ def _colors(start, stop, means, dc, rest, origin, degree, color):  # type: ignor
 
 
 @exact_kernel
-def _colors_backward(start, stop, means, rest, origin, degree, color, grad, g_means, g_dc, g_rest):  # type: ignore[no-untyped-def]
+def _harmonic_colors_backward(start, stop, means, rest, origin, degree, color, grad, g_means, g_dc, g_rest):  # type: ignore[no-untyped-def]
     bands = (degree + 1) * (degree + 1) - 1
     C = color.shape[1]
     Y, gY, gd = np.empty(15), np.empty(15), np.empty(3)
@@ -116,14 +116,14 @@ def _colors_backward(start, stop, means, rest, origin, degree, color, grad, g_me
         )
 
 
-class _Colors(torch.autograd.Function):
+class _HarmonicColors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:  # type: ignore[override]
         ctx.arrays = [x.detach().contiguous().numpy() for x in (means, rest)]
         ctx.origin, ctx.degree = origin.detach().double().numpy(), degree
         color = np.empty(dc.shape, np.float32)
         parallel_for(
-            _colors,
+            _harmonic_colors,
             len(color),
             _CHUNK,
             0,
@@ -142,12 +142,12 @@ class _Colors(torch.autograd.Function):
         means, rest = ctx.arrays
         g_means, g_dc, g_rest = np.empty_like(means), np.empty_like(ctx.color), np.zeros_like(rest)
         args = (means, rest, ctx.origin, ctx.degree, ctx.color, grad.contiguous().numpy(), g_means, g_dc, g_rest)
-        parallel_for(_colors_backward, len(means), _CHUNK, 0, *args)
+        parallel_for(_harmonic_colors_backward, len(means), _CHUNK, 0, *args)
         view = torch.from_numpy(-g_means.sum(0, dtype=np.float64)) if ctx.needs_input_grad[3] else None
         return torch.from_numpy(g_means), torch.from_numpy(g_dc), torch.from_numpy(g_rest), view, None
 
 
-def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
+def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
     """:func:`~neuprim.core.model.colours.sh.sh_colors` of float32 CPU tensors, degree 1..3; differentiable."""
-    result: Tensor = apply_autograd(_Colors, means, dc, rest, origin, degree)
+    result: Tensor = apply_autograd(_HarmonicColors, means, dc, rest, origin, degree)
     return result

@@ -17,7 +17,7 @@ _vec15 = wp.types.vector(length=15, dtype=wp.float64)
 
 
 @functools.cache
-def _functions(degree: int) -> tuple[Any, Any]:
+def _harmonic_functions(degree: int) -> tuple[Any, Any]:
     a0, a1, a2, a3, a4 = (d(c) for c in C2)
     b0, b1, b2, b3, b4, b5, b6 = (d(c) for c in C3)
     two, three, four, six, eight = d(2.0), d(3.0), d(4.0), d(6.0), d(8.0)
@@ -79,8 +79,8 @@ def _functions(degree: int) -> tuple[Any, Any]:
 
 
 @functools.cache
-def _kernels(degree: int) -> tuple[Any, Any]:
-    basis, basis_gradient = _functions(degree)
+def _harmonic_kernels(degree: int) -> tuple[Any, Any]:
+    basis, basis_gradient = _harmonic_functions(degree)
     bands = (degree + 1) * (degree + 1) - 1
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
@@ -127,7 +127,7 @@ def _kernels(degree: int) -> tuple[Any, Any]:
     return forward, backward
 
 
-class _Colors(torch.autograd.Function):
+class _HarmonicColors(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
         means, dc, rest = (x.detach().contiguous() for x in (means, dc, rest))
@@ -140,7 +140,7 @@ class _Colors(torch.autograd.Function):
             array(centre, wp.float64),
             array(color, wp.float32),
         )
-        launch_kernel(_kernels(degree)[0], len(means), arrays, means.device)
+        launch_kernel(_harmonic_kernels(degree)[0], len(means), arrays, means.device)
         ctx.tensors, ctx.degree, ctx.origin = (means, rest, centre, color), degree, (origin.dtype, origin.device)
         return color
 
@@ -149,7 +149,7 @@ class _Colors(torch.autograd.Function):
         means, rest, centre, color = ctx.tensors
         g_means, g_dc, g_rest = torch.empty_like(means), torch.empty_like(color), torch.empty_like(rest)
         launch_kernel(
-            _kernels(ctx.degree)[1], len(means),
+            _harmonic_kernels(ctx.degree)[1], len(means),
             (
                 array(means, wp.vec3), array(rest, wp.float32), array(centre, wp.float64), array(color, wp.float32),
                 array(grad.contiguous(), wp.float32), array(g_means, wp.vec3), array(g_dc, wp.float32),
@@ -161,7 +161,7 @@ class _Colors(torch.autograd.Function):
         return g_means, g_dc, g_rest, view, None
 
 
-def fused_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
+def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
     """:func:`~neuprim.core.model.colours.sh.sh_colors` of float32 GPU tensors, degree 1..3; differentiable."""
-    result: Tensor = _Colors.apply(means, dc, rest, origin, degree)
+    result: Tensor = _HarmonicColors.apply(means, dc, rest, origin, degree)
     return result

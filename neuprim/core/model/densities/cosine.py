@@ -16,7 +16,12 @@ from typing import Annotated, Any
 import torch
 from torch import Tensor
 
-from neuprim.core.model.cosine_sums import canonicalize_cosines, canonicalize_gain, prune_neurons, smaller_neuron_counts
+from neuprim.core.model.cosine_sums import (
+    canonicalize_cosines,
+    canonicalize_gain,
+    prune_cosine_neurons,
+    smaller_cosine_neuron_counts,
+)
 from neuprim.core.model.edge import EDGES, NORMS, edge_weight
 from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.geometry import Geometry
@@ -111,12 +116,12 @@ class CosineDensity(DensityField):
         return support.to(alphas), -torch.expm1(-depth).to(alphas)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        return {"neurons": smaller_neuron_counts(self.neurons)} if self.neurons else {}
+        return {"neurons": smaller_cosine_neuron_counts(self.neurons)} if self.neurons else {}
 
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[CosineDensity, dict[str, Tensor]]:
-        return CosineDensity(value, self.omega0, self.edge, self.gain), prune_neurons(
+        return CosineDensity(value, self.omega0, self.edge, self.gain), prune_cosine_neurons(
             params, geometry, value, self.omega0
         )
 
@@ -139,9 +144,9 @@ def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple
     """Return (w2, b2), (N, K) and (N, 1), times the gain exp(log_gain), (N, 1) or (N,)."""
     if log_gain is None:
         return w2, b2
-    from neuprim.core.model.rows import fused_gain  # numba, loaded when first needed
+    from neuprim.core.model.rows import fused_cosine_gain  # numba, loaded when first needed
 
-    return fused_gain(w2, b2.reshape(-1, 1), log_gain.reshape(-1, 1), GAIN_LIMIT)
+    return fused_cosine_gain(w2, b2.reshape(-1, 1), log_gain.reshape(-1, 1), GAIN_LIMIT)
 
 
 _FAINT, _SOLID = 0.02, 0.98

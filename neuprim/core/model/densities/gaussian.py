@@ -137,10 +137,10 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
     tail = torch.erfc(side - w) - torch.erfc(side + w)
     whole = math.sqrt(math.pi) / 2 * torch.where(side <= w, both, tail)
     short = w * (1 + side) < _SHORT
-    return whole.masked_scatter(short, _series(u[short], w[short]))
+    return whole.masked_scatter(short, _gaussian_series(u[short], w[short]))
 
 
-def _series(u: Tensor, w: Tensor) -> Tensor:
+def _gaussian_series(u: Tensor, w: Tensor) -> Tensor:
     """The Taylor series of :func:`bell_integral`; scaled polynomials P_n = w^n H_n(u)/n! keep every term small."""
     low, high = torch.ones_like(u), 2 * u * w  # P_0, P_1;  P_(n+1) = 2 (u w P_n - w^2 P_(n-1)) / (n + 1)
     total = low

@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.threads import parallel_for, resolve_threads
-from neuprim.core.model.checks import non_finite_error, refuse_non_finite_colours
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.checks import check_primitive_colours_finite, non_finite_primitive_error
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.backward import ImageGradient, backward_tiles, sum_gradient_rows
@@ -114,7 +114,7 @@ def _prepare_frame(
     )
     bad = np.flatnonzero(projected.status == P.NON_FINITE)
     if bad.size:
-        raise non_finite_error({name: torch.from_numpy(array) for name, array in arrays.items()}, int(bad[0]))
+        raise non_finite_primitive_error({name: torch.from_numpy(array) for name, array in arrays.items()}, int(bad[0]))
     in_float64, net_rows = projected.in_float64, None
     if "Wx" in arrays:
         net_rows, fast = prepare_colour_net(np.arange(count), arrays, False, threads)
@@ -162,7 +162,7 @@ class _Rasterize(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor]:
         weights = dict(zip(NET, tensors[len(PARAMETERS) :], strict=False))
         colours = weights | {"base" if weights else "colors": palette}
-        refuse_non_finite_colours(colours, dict(zip(PARAMETERS, tensors, strict=False)) | colours)
+        check_primitive_colours_finite(colours, dict(zip(PARAMETERS, tensors, strict=False)) | colours)
         frame = _prepare_frame(request, viewmat, tensors)
         settings, camera = request.settings, request.camera
         h, w = camera.height, camera.width
@@ -254,13 +254,15 @@ def _float32_image(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.resolve_neg().numpy(), np.float32)
 
 
-def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+def render(
+    lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
+) -> RenderOutput:
     """Draw a frame; see :data:`neuprim.core.render.draw.Draw`."""
     return rasterize(_Rasterize, "cpu", lowered, camera, background, settings)
 
 
 def render_slabs(
-    lowered: Lowered, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
+    lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
     """Return opacity and depth of each slab, prepared as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means = lowered.geometry.means

@@ -13,7 +13,7 @@ import numpy as np
 
 from neuprim.core.compute.kernels import exact_kernel, inline
 from neuprim.core.compute.threads import parallel_for
-from neuprim.core.model.rows import fill_rotation, rotation_backward
+from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.float64 import phase_float64
@@ -49,7 +49,7 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
         row = out[n]
         row[:] = 0.0
         fast[n] = False
-        fill_rotation(quats[i], local)
+        fill_ellipsoid_rotation(quats[i], local)
         top = max(np.float64(log_scales[i, 0]), np.float64(log_scales[i, 1]), np.float64(log_scales[i, 2]))
         for a in range(3):
             axes[a] = np.exp(np.float64(log_scales[i, a]) - top)
@@ -94,7 +94,7 @@ def colour_net_backward(  # type: ignore[no-untyped-def]
         if not touched[i]:
             continue
         g = grads[i]
-        inverse = fill_rotation(quats[i], local)
+        inverse = fill_ellipsoid_rotation(quats[i], local)
         longest = 0
         for a in range(1, 3):
             if log_scales[i, a] > log_scales[i, longest]:
@@ -124,7 +124,7 @@ def colour_net_backward(  # type: ignore[no-untyped-def]
                 g_Wout[i, c, j] = g[og + P.NET_OUT + c]
         for a in range(4):
             q[a] = quats[i, a]
-        rotation_backward(q, inverse, gL, gq)
+        ellipsoid_rotation_backward(q, inverse, gL, gq)
         for a in range(3):
             g_log_scales[i, a] += gl[a]
         for a in range(4):

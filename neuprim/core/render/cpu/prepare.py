@@ -12,7 +12,7 @@ import numpy as np
 
 from neuprim.core.compute.kernels import borrow_arrays, exact_kernel, release_array, strict
 from neuprim.core.model.edge import NORMS
-from neuprim.core.model.rows import fill_rotation, rotation_backward
+from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 
@@ -127,7 +127,7 @@ def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # typ
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
     """
     R, t = view.R, view.t
-    n = fill_rotation(quat, local)
+    n = fill_ellipsoid_rotation(quat, local)
     top = max(np.float64(log_scale[0]), np.float64(log_scale[1]), np.float64(log_scale[2]))
     m = np.exp(top)
     for i in range(3):
@@ -444,7 +444,7 @@ def prepare_backward(start, stop, parameters, view, projected, grads, touched, o
                 gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
         for j in range(4):
             q[j] = quats[i, j]
-        rotation_backward(q, inverse, gL, gq)
+        ellipsoid_rotation_backward(q, inverse, gL, gq)
         for j in range(4):
             g_quats[i, j] = gq[j]
         if g_view.shape[0] > 0:

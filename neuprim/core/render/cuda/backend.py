@@ -11,8 +11,8 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.warp import array, launch_kernel, wp
 from neuprim.core.errors import BackendUnavailable
-from neuprim.core.model.checks import non_finite_error, refuse_non_finite_colours
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.checks import check_primitive_colours_finite, non_finite_primitive_error
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.backward import pairs_kernel, pixels_kernel, sum_pairs
 from neuprim.core.render.cuda.binning import row_spans
@@ -55,14 +55,14 @@ class _Rasterize(torch.autograd.Function):
         form = KernelForm(W1.shape[1], request.edge, palette.shape[1], weights[0].shape[1] if weights else -1)
         net: ColourNet | None = None
         if weights:
-            refuse_non_finite_colours(dict(zip(NET, weights, strict=True)))
+            check_primitive_colours_finite(dict(zip(NET, weights, strict=True)))
             net = prepare_colour_net(log_scales, quats, *weights)
         forced = net.fast if net is not None and net.hidden else None
         try:
             frame = prepare_frame(request, viewmat, palette, parameters, forced)
         except NotFinitePrimitive as error:
             named = dict(zip(PARAMETERS, parameters, strict=True)) | {"base" if weights else "colors": palette}
-            raise non_finite_error(named, error.row) from None
+            raise non_finite_primitive_error(named, error.row) from None
         if net is not None and net.hidden and len(frame.which):
             fill_wide_net(net, frame.which, frame.parameters[1], frame.parameters[2])
         settings, stats, camera = request.settings, request.stats, request.camera
@@ -117,13 +117,15 @@ class _Rasterize(torch.autograd.Function):
         return input_gradients(ctx, view, (background, colours.clone(), *own, *g_net))
 
 
-def render(lowered: Lowered, camera: Camera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+def render(
+    lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
+) -> RenderOutput:
     """Draw a frame; see :data:`neuprim.core.render.draw.Draw`."""
     return rasterize(_Rasterize, "cuda", lowered, camera, background, settings)
 
 
 def render_slabs(
-    lowered: Lowered, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
+    lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
     """Return opacity and depth of each slab, in one frame; see :func:`neuprim.core.render.render_slabs`."""
     means, settings = lowered.geometry.means, replace(settings, depth=True)
@@ -134,7 +136,7 @@ def render_slabs(
         images = (slabs.int().contiguous(), count)
         frame = prepare_frame(request, camera.viewmat, blank, tensors, images=images)
     except NotFinitePrimitive as error:
-        raise non_finite_error(dict(zip(PARAMETERS, tensors, strict=True)), error.row) from None
+        raise non_finite_primitive_error(dict(zip(PARAMETERS, tensors, strict=True)), error.row) from None
     drawn = composite_frame(
         frame, KernelForm(frame.neurons, request.edge, 1), None, blank.new_zeros(1), settings, False, count
     )

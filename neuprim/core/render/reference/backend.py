@@ -13,8 +13,8 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
-from neuprim.core.model.geometry import Geometry, Pairs, quaternion_to_matrix
-from neuprim.core.model.primitives import Lowered
+from neuprim.core.model.geometry import Geometry, PrimitiveChords, quaternion_to_matrix
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
@@ -58,7 +58,7 @@ class _Contributions(torch.autograd.Function):
 class _PreparedPrimitives:
     """Per-primitive quantities of one view, in float64, in camera axes."""
 
-    def __init__(self, lowered: Lowered, camera: AnyCamera) -> None:
+    def __init__(self, lowered: LoweredPrimitives, camera: AnyCamera) -> None:
         g = lowered.geometry
         view = camera.viewmat.double()
         self.rotation = view[:3, :3]
@@ -76,7 +76,9 @@ class _PreparedPrimitives:
         self.start = -(self.whiten @ (self.center / self.m[:, None])[:, :, None])[..., 0]  # camera centre, whitened
 
 
-def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, settings: RenderSettings) -> RenderOutput:
+def render(
+    lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
+) -> RenderOutput:
     """Draw a frame in float64 and return it in the model's dtype; see :data:`neuprim.core.render.draw.Draw`."""
     frame = _PreparedPrimitives(lowered, camera)
     count = lowered.geometry.count
@@ -109,7 +111,7 @@ def render(lowered: Lowered, camera: AnyCamera, background: Tensor | None, setti
 
 
 def _trace_block(
-    lowered: Lowered,
+    lowered: LoweredPrimitives,
     frame: _PreparedPrimitives,
     rays: ReferenceRays,
     rows: Tensor,
@@ -154,7 +156,7 @@ def _trace_block(
     world_d = dj @ frame.rotation
     # (x - mu)/m of the chord middle, scene axes
     local = (frame.local[prim] @ (frame.axes[prim] * xm)[:, :, None])[..., 0]
-    pairs = Pairs(prim, world_d, local, half, frame.origin, t0, t1, mid, m, xm, v)
+    pairs = PrimitiveChords(prim, world_d, local, half, frame.origin, t0, t1, mid, m, xm, v)
     optical_depth = lowered.optical_depth(pairs)
 
     alpha = -torch.expm1(-optical_depth.clamp_min(0))

@@ -156,10 +156,15 @@ def save_compressed(
         made = bits
     sections = compression.encode_sections(model, made)
     if config is not None:
-        sections.insert(0, compression.Section(compression.CONFIG, compression.TEXT, (), planes=(config.encode(),)))
+        sections.insert(
+            0, compression.CompressedSection(compression.CONFIG, compression.TEXT, (), planes=(config.encode(),))
+        )
     header = {"format": FORMAT, "kind": "model", **model_header(model, task, extra)}
     sizes = compression.write_compressed(path, header, model.count, sections)
-    return {name: compression.StoredSize(compression.format_bits(scheme), sizes[name]) for name, scheme in made.items()}
+    return {
+        name: compression.StoredSize(compression.format_quantizer_bits(scheme), sizes[name])
+        for name, scheme in made.items()
+    }
 
 
 def stored_config(path: Path) -> str | None:

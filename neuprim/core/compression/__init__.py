@@ -10,11 +10,11 @@ from neuprim.core.compression.codec import (
     fake_quantize,
     fit_quantizers,
     fit_quantizers_to_error,
-    format_bits,
+    format_quantizer_bits,
     storage_order,
 )
 from neuprim.core.compression.file import CONFIG, is_compressed, read_compressed, read_model_header, write_compressed
-from neuprim.core.compression.sections import TEXT, Section
+from neuprim.core.compression.sections import TEXT, CompressedSection
 
 __all__ = [
     "CONFIG",
@@ -23,7 +23,7 @@ __all__ = [
     "TEXT",
     "BitTable",
     "Quantizers",
-    "Section",
+    "CompressedSection",
     "StoredSize",
     "bit_table",
     "canonical_model",
@@ -31,7 +31,7 @@ __all__ = [
     "fake_quantize",
     "fit_quantizers",
     "fit_quantizers_to_error",
-    "format_bits",
+    "format_quantizer_bits",
     "is_compressed",
     "read_compressed",
     "read_model_header",

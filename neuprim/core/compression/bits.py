@@ -65,7 +65,7 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
             raise ConfigError(f"--bits {word}: the model has no parameter {name!r}{nearest(name, [*names, OTHERS])}")
         if name in table.exact:
             raise ConfigError(f"--bits {word}: {name} is given twice")
-        bits = _parse_bits(word, text, name)
+        bits = _parse_quantizer_bits(word, text, name)
         if name == OTHERS:
             table = replace(
                 table, others=bits[0], exact=table.exact | {n for n in (*names, OTHERS) if n not in table.named}
@@ -75,7 +75,7 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
     return table
 
 
-def _parse_bits(word: str, text: str, name: str) -> tuple[int, ...]:
+def _parse_quantizer_bits(word: str, text: str, name: str) -> tuple[int, ...]:
     low, high = (MIN_BITS, 16) if name == "quats" else (1, MAX_BITS if name == "means" else 16)
     several = name not in ("means", "quats", OTHERS)
     parts = text.split(",")

@@ -18,18 +18,18 @@ from neuprim.core.compression.quantizers import (
     RotationQuantizer,
     columns_of_step,
     fit_columns,
-    relative_error,
+    relative_quantizer_error,
     snap_to_zero,
 )
 from neuprim.core.compression.sections import (
     COLUMNS,
     POSITIONS,
     ROTATIONS,
-    Section,
+    CompressedSection,
     morton_encode,
-    pack_masks,
+    pack_codec_masks,
     pack_section,
-    pack_sparse,
+    pack_sparse_columns,
 )
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.model.checks import model_method_label
@@ -89,7 +89,7 @@ def canonical_model(model: Primitives) -> Primitives:
 def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
     """Return quantizers of a canonical model: ranges from its numbers, bits from the table."""
     found: Quantizers = {}
-    sparse = _sparse_parameters(model)
+    sparse = _sparse_quantized_parameters(model)
     for spec in model.specs:
         x, bits = model.params[spec.name].reshape(model.count, spec.size), table.of(spec.name, spec.shape)
         if spec.name == "quats":
@@ -97,11 +97,11 @@ def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
         elif spec.fixed:
             found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
         elif spec.name == "means":
-            found[spec.name] = _fit_positions(model, x, bits[0], spec.name in table.exact)
+            found[spec.name] = _fit_position_quantizer(model, x, bits[0], spec.name in table.exact)
         else:
             columns = fit_columns(x, bits)
             if spec.name not in table.exact and model.count:
-                spiky = relative_error(x, columns) > _SPIKY
+                spiky = relative_quantizer_error(x, columns) > _SPIKY
                 if bool(spiky.any()):
                     columns = fit_columns(
                         x, [min(2 * b, 16) if more else b for b, more in zip(bits, spiky.tolist(), strict=True)]
@@ -122,7 +122,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
         error: mean squared change that one column may add.
     """
     found: Quantizers = {}
-    sparse = _sparse_parameters(model)
+    sparse = _sparse_quantized_parameters(model)
     for spec in model.specs:
         x = model.params[spec.name].reshape(model.count, spec.size)
         # An unknown effect counts as infinite: the column is stored as finely as possible.
@@ -136,7 +136,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
         elif spec.fixed:
             found[spec.name] = fit_columns(x, [_LABEL] * spec.size, clips=(0.0,))
         elif spec.name == "means":
-            found[spec.name] = _even_positions(x, steps)
+            found[spec.name] = _even_position_quantizer(x, steps)
         else:
             zero = spec.name in sparse
             columns = columns_of_step(x, steps, 0.0 if zero else x.double().mean(0))
@@ -144,7 +144,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
     return found
 
 
-def _even_positions(x: Tensor, steps: Tensor) -> ColumnQuantizer:
+def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
     """Return :func:`columns_of_step` with equal bits for all axes."""
     own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
@@ -153,7 +153,7 @@ def _even_positions(x: Tensor, steps: Tensor) -> ColumnQuantizer:
     return ColumnQuantizer(torch.full_like(own.bits, bits), own.low, (low + ((1 << bits) - 1) * step).float())
 
 
-def _sparse_parameters(model: Primitives) -> set[str]:
+def _sparse_quantized_parameters(model: Primitives) -> set[str]:
     """Return the parameters of pieces that some primitives lack; their zeros must stay zeros."""
     pieces = prunable_units_of_model(model.density, model.colour).values()
     return {
@@ -161,7 +161,7 @@ def _sparse_parameters(model: Primitives) -> set[str]:
     }
 
 
-def _fit_positions(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
+def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
     """Return columns of positions, without clipping; distant primitives raise the bits of all."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
@@ -180,27 +180,27 @@ def storage_order(model: Primitives, made: Quantizers) -> Tensor:
     )
 
 
-def encode_sections(model: Primitives, made: Quantizers) -> list[Section]:
+def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSection]:
     """Return the sections of a canonical model, in file order."""
     order = storage_order(model, made)
     codes = {
         spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order])
         for spec in model.specs
     }
-    masks, mask_of = _prunable_masks(model, made, codes)
-    sections = [pack_masks(masks)] if masks else []
+    masks, mask_of = _sparse_column_masks(model, made, codes)
+    sections = [pack_codec_masks(masks)] if masks else []
     for spec in model.specs:
         scheme, own = made[spec.name], codes[spec.name].numpy()
         if spec.name in mask_of:
             assert isinstance(scheme, ColumnQuantizer)
-            sections.append(pack_sparse(spec.name, spec.shape, scheme, own, mask_of[spec.name], masks))
+            sections.append(pack_sparse_columns(spec.name, spec.shape, scheme, own, mask_of[spec.name], masks))
             continue
         coding = ROTATIONS if isinstance(scheme, RotationQuantizer) else POSITIONS if spec.name == "means" else COLUMNS
         sections.append(pack_section(spec.name, spec.shape, scheme, own, coding))
     return sections
 
 
-def _prunable_masks(
+def _sparse_column_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
     """Return bit masks of pieces that some primitives lack, and parameter -> each column's mask number (0: none)."""
@@ -235,7 +235,7 @@ def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, T
     }
 
 
-def format_bits(scheme: ColumnQuantizer | RotationQuantizer) -> str:
+def format_quantizer_bits(scheme: ColumnQuantizer | RotationQuantizer) -> str:
     """Return ``"7"``, or ``"6 to 8"`` where columns differ."""
     bits = sorted({scheme.bits} if isinstance(scheme, RotationQuantizer) else set(scheme.bits.tolist()))
     return " to ".join(map(str, bits if len(bits) < 2 else (bits[0], bits[-1])))

@@ -27,11 +27,11 @@ from neuprim.core.compression.sections import (
     POSITIONS,
     ROTATIONS,
     TEXT,
+    CompressedSection,
     CorruptSection,
-    Section,
-    compress_planes,
+    compress_code_planes,
     section_content_size,
-    unpack_masks,
+    unpack_codec_masks,
     unpack_section,
 )
 from neuprim.core.errors import CheckpointError
@@ -57,7 +57,7 @@ _MAX_SECTIONS, _MAX_DIMENSIONS, _MAX_COLUMNS, _MAX_PRIMITIVES = 4096, 4, 2**20, 
 class _TableEntry:
     """A row of the table: a section without content, bytes of its planes, packing, stored bytes, their checksum."""
 
-    section: Section
+    section: CompressedSection
     content: int
     packing: int
     stored: int
@@ -74,7 +74,9 @@ class _FileHead:
 # ---------------------------------------------------------------- writing
 
 
-def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections: Sequence[Section]) -> dict[str, int]:
+def write_compressed(
+    path: Path, header: Mapping[str, Any], count: int, sections: Sequence[CompressedSection]
+) -> dict[str, int]:
     """Write a file atomically; returns the bytes of each section, whose names must be unique.
 
     Raises CheckpointError where the file could not be written.
@@ -91,10 +93,10 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
                 f"{path}: parameter {s.name!r} of shape {s.shape} cannot be stored; at most {limits} can be"
             )
     plain = [b"".join(s.planes) for s in sections]
-    packed = [compress_planes(s.planes) for s in sections]
+    packed = [compress_code_planes(s.planes) for s in sections]
     numbers = count * sum(s.columns for s in sections if s.coding != TEXT)
     for i in sorted(range(len(sections)), key=lambda i: len(plain[i]) - len(packed[i])):
-        if _expansion_allowed(numbers, sum(map(len, packed))):
+        if _decompression_allowed(numbers, sum(map(len, packed))):
             break
         packed[i] = plain[i]  # a model of zeros would exceed the limit of expansion
     packings = [_PLAIN if len(a) == len(b) else _ZSTD for a, b in zip(packed, plain, strict=True)]
@@ -113,13 +115,13 @@ def write_compressed(path: Path, header: Mapping[str, Any], count: int, sections
     return {s.name: len(data) for s, data in zip(sections, stored, strict=True)}
 
 
-def _pack_entry(section: Section, packing: int, content: int, data: bytes) -> bytes:
+def _pack_entry(section: CompressedSection, packing: int, content: int, data: bytes) -> bytes:
     name = section.name.encode()
     dimensions = struct.pack(f"<BBB{len(section.shape)}I", section.coding, packing, len(section.shape), *section.shape)
     return bytes([len(name)]) + name + dimensions + _SIZES.pack(content, len(data), zlib.crc32(data))
 
 
-def _expansion_allowed(numbers: int, size: int) -> bool:
+def _decompression_allowed(numbers: int, size: int) -> bool:
     return 4 * numbers <= 2**20 + MAX_EXPANSION * size
 
 
@@ -138,13 +140,13 @@ def is_compressed(path: Path) -> bool:
 def read_model_header(path: Path) -> dict[str, Any]:
     """Return the header without reading a section, or raise CheckpointError."""
     with _open_model_file(path) as file:
-        return _read_file_head(path, file).header
+        return _read_compressed_head(path, file).header
 
 
 def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str | None]:
     """Return header, float32 tensors by name and the run's configuration (or None), or raise CheckpointError."""
     with _open_model_file(path) as file:
-        head = _read_file_head(path, file)
+        head = _read_compressed_head(path, file)
         tensors: dict[str, Tensor] = {}
         masks: list[np.ndarray] = []
         config: str | None = None
@@ -163,7 +165,7 @@ def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str 
                 if section.coding == TEXT:
                     config = content.decode("utf-8")
                 elif section.coding == MASKS:
-                    masks = unpack_masks(section, content, head.count)
+                    masks = unpack_codec_masks(section, content, head.count)
                 else:
                     tensors[section.name] = unpack_section(section, content, head.count, masks)
             except (CorruptSection, UnicodeDecodeError) as error:
@@ -195,7 +197,7 @@ def _unpack_content(data: bytes, entry: _TableEntry) -> bytes:
     return made
 
 
-def _read_file_head(path: Path, file: BinaryIO) -> _FileHead:
+def _read_compressed_head(path: Path, file: BinaryIO) -> _FileHead:
     size = file.seek(0, io.SEEK_END)
     file.seek(0)
     if (found := file.read(len(MAGIC))) != MAGIC:
@@ -226,7 +228,7 @@ def _read_file_head(path: Path, file: BinaryIO) -> _FileHead:
     if not isinstance(header, dict):
         raise CheckpointError(f"{path}: the header is a {type(header).__name__}; expected an object")
     try:
-        entries = _parse_table(table, sections, count)
+        entries = _parse_compressed_table(table, sections, count)
         _check_total_size(entries, count, size, size - file.tell())
     except CorruptSection as error:
         raise CheckpointError(f"{path}: {error}") from error
@@ -235,7 +237,7 @@ def _read_file_head(path: Path, file: BinaryIO) -> _FileHead:
     return _FileHead(header, count, entries)
 
 
-def _parse_table(table: bytes, sections: int, count: int) -> list[_TableEntry]:
+def _parse_compressed_table(table: bytes, sections: int, count: int) -> list[_TableEntry]:
     file = io.BytesIO(table)
     made: list[_TableEntry] = []
     names: set[str] = set()
@@ -256,19 +258,22 @@ def _parse_table(table: bytes, sections: int, count: int) -> list[_TableEntry]:
         if name in names:
             raise CorruptSection(f"section {name!r} is there twice")
         names.add(name)
-        made.append(_TableEntry(_checked_section(name, coding, shape), content, packing, stored, checksum))
+        made.append(_TableEntry(_checked_codec_section(name, coding, shape), content, packing, stored, checksum))
         _check_entry_sizes(made[-1], count)
     if file.read(1):
         raise CorruptSection(f"the table goes on after {sections} sections; expected its end")
     return made
 
 
-def _checked_section(name: str, coding: int, shape: tuple[int, ...]) -> Section:
+def _checked_codec_section(name: str, coding: int, shape: tuple[int, ...]) -> CompressedSection:
     if coding not in CODINGS:
         raise CorruptSection(
             f"section {name!r} has coding {coding}; expected {', '.join(f'{k} ({v})' for k, v in CODINGS.items())}"
         )
-    section, wanted = Section(name, coding, shape), {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape)
+    section, wanted = (
+        CompressedSection(name, coding, shape),
+        {TEXT: (), POSITIONS: (3,), ROTATIONS: (4,)}.get(coding, shape),
+    )
     if shape != wanted:
         raise CorruptSection(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
     if (coding == TEXT) != (name == CONFIG):
@@ -311,7 +316,7 @@ def _check_total_size(entries: Sequence[_TableEntry], count: int, size: int, lef
     if stored != left:
         raise CorruptSection(f"the sections take {stored} bytes by the table; {left} follow it")
     numbers = count * sum(entry.section.columns for entry in entries if entry.section.coding != TEXT)
-    if not _expansion_allowed(numbers, size):
+    if not _decompression_allowed(numbers, size):
         raise CorruptSection(
             f"stands for {count} primitives of {numbers // max(count, 1)} numbers; "
             f"expected at most {MAX_EXPANSION} times its size"

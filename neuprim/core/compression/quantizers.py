@@ -126,7 +126,7 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
     return np.asarray(ordered[below] * (1 - share) + ordered[above] * share)
 
 
-def relative_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
+def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
     """Return the (C,) root mean squared errors over those of steps between -1 and 1 standard deviations."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()

@@ -39,7 +39,7 @@ class CorruptSection(Exception):
 
 
 @dataclass(frozen=True)
-class Section:
+class CompressedSection:
     """A parameter, or the one text, of a file."""
 
     name: str
@@ -62,41 +62,41 @@ class Section:
 
 def pack_section(
     name: str, shape: tuple[int, ...], scheme: ColumnQuantizer | RotationQuantizer, codes: np.ndarray, coding: int
-) -> Section:
+) -> CompressedSection:
     """Return the section of codes (N, C). Positions must be in file order."""
     if isinstance(scheme, RotationQuantizer):
         planes = [
             *_byte_planes(codes[:, 0], 2),
             *(plane for i in (1, 2, 3) for plane in _byte_planes(codes[:, i], scheme.bits)),
         ]
-        return Section(name, coding, shape, bytes([scheme.bits]), tuple(planes))
+        return CompressedSection(name, coding, shape, bytes([scheme.bits]), tuple(planes))
     bits, head = scheme.bits.tolist(), _quantizer_head(scheme)
     if coding == POSITIONS:
         planes = _byte_planes(np.diff(morton_encode(codes, bits[0]), prepend=np.uint64(0)), 3 * bits[0])
     else:
         planes = [plane for i, b in enumerate(bits) for plane in _byte_planes(codes[:, i], b)]
-    return Section(name, coding, shape, head, tuple(planes))
+    return CompressedSection(name, coding, shape, head, tuple(planes))
 
 
-def pack_masks(masks: Sequence[np.ndarray]) -> Section:
+def pack_codec_masks(masks: Sequence[np.ndarray]) -> CompressedSection:
     """Return the section of (N,) bool masks, a bit per primitive, the lowest first."""
-    return Section(
+    return CompressedSection(
         MASKS_NAME, MASKS, (len(masks),), planes=tuple(np.packbits(mask, bitorder="little").tobytes() for mask in masks)
     )
 
 
-def pack_sparse(
+def pack_sparse_columns(
     name: str,
     shape: tuple[int, ...],
     scheme: ColumnQuantizer,
     codes: np.ndarray,
     mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
-) -> Section:
+) -> CompressedSection:
     """Return the section of codes (N, C); column i has the rows of mask ``mask_of[i] - 1``, or all rows for 0."""
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
-    return Section(
+    return CompressedSection(
         name, SPARSE, shape, _quantizer_head(scheme) + b"".join(map(_MASK_NUMBER.pack, mask_of)), tuple(planes)
     )
 
@@ -111,29 +111,29 @@ def _byte_planes(codes: np.ndarray, bits: int) -> list[bytes]:
     """Return the byte planes of codes, low bytes first."""
     return [
         ((codes >> codes.dtype.type(8 * i)) & codes.dtype.type(255)).astype(np.uint8).tobytes()
-        for i in range(_byte_count(bits))
+        for i in range(_code_byte_count(bits))
     ]
 
 
-def _byte_count(bits: int) -> int:
+def _code_byte_count(bits: int) -> int:
     return (bits + 7) // 8
 
 
-def section_content_size(section: Section, count: int, masks: Sequence[np.ndarray] = ()) -> int:
+def section_content_size(section: CompressedSection, count: int, masks: Sequence[np.ndarray] = ()) -> int:
     """Return the bytes of a section's planes, from its head, or raise CorruptSection."""
     if section.coding == MASKS:
         return section.columns * ((count + 7) // 8)
     if section.coding == ROTATIONS:
-        return count * (1 + 3 * _byte_count(_rotations(section).bits))
+        return count * (1 + 3 * _code_byte_count(_rotations(section).bits))
     bits = _column_records(section).bits.tolist()
     if section.coding == POSITIONS:
         if len(set(bits)) != 1 or len(bits) != 3:
             raise CorruptSection(f"{bits} bits; expected three columns of as many bits each")
-        return count * _byte_count(3 * bits[0])
-    return sum(_byte_count(b) * n for b, n in zip(bits, _column_counts(section, count, masks), strict=True))
+        return count * _code_byte_count(3 * bits[0])
+    return sum(_code_byte_count(b) * n for b, n in zip(bits, _column_counts(section, count, masks), strict=True))
 
 
-def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarray]:
+def unpack_codec_masks(section: CompressedSection, content: bytes, count: int) -> list[np.ndarray]:
     """Return the (count,) bool masks of a section, or raise CorruptSection."""
     bits = np.unpackbits(
         np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little"
@@ -143,7 +143,7 @@ def unpack_masks(section: Section, content: bytes, count: int) -> list[np.ndarra
     return list(bits[:, :count].astype(bool))
 
 
-def unpack_section(section: Section, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
+def unpack_section(section: CompressedSection, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
     """Decode (count, *shape) float32 of ``content``, :func:`section_content_size` bytes, or raise CorruptSection."""
     planes = _PlaneReader(content)
     if section.coding == ROTATIONS:
@@ -154,7 +154,9 @@ def unpack_section(section: Section, content: bytes, count: int, masks: Sequence
     if section.coding == POSITIONS:
         return columns.values(torch.from_numpy(_position_cells(planes, count, int(columns.bits[0]))))
     values = torch.zeros(count, section.columns)
-    for i, (of, own) in enumerate(zip(_mask_numbers(section), _column_counts(section, count, masks), strict=True)):
+    for i, (of, own) in enumerate(
+        zip(_column_mask_numbers(section), _column_counts(section, count, masks), strict=True)
+    ):
         one = ColumnQuantizer(columns.bits[i : i + 1], columns.low[i : i + 1], columns.high[i : i + 1])
         found = one.values(torch.from_numpy(planes.codes(own, int(one.bits), int(one.last))[:, None]))[:, 0]
         if of:
@@ -164,30 +166,30 @@ def unpack_section(section: Section, content: bytes, count: int, masks: Sequence
     return values.reshape(count, *section.shape)
 
 
-def _mask_numbers(section: Section) -> list[int]:
+def _column_mask_numbers(section: CompressedSection) -> list[int]:
     """Return the mask number of each column, 0 for all primitives."""
     if section.coding != SPARSE:
         return [0] * section.columns
     return [of for (of,) in _MASK_NUMBER.iter_unpack(section.head[_RECORD.size * section.columns :])]
 
 
-def _column_counts(section: Section, count: int, masks: Sequence[np.ndarray]) -> list[int]:
+def _column_counts(section: CompressedSection, count: int, masks: Sequence[np.ndarray]) -> list[int]:
     """Return how many primitives each column has numbers of."""
-    mask_of = _mask_numbers(section)
+    mask_of = _column_mask_numbers(section)
     if max(mask_of, default=0) > len(masks):
         raise CorruptSection(f"a column refers to mask {max(mask_of)}; expected at most {len(masks)}")
     sizes = {of: int(masks[of - 1].sum()) if of else count for of in set(mask_of)}
     return [sizes[of] for of in mask_of]
 
 
-def _rotations(section: Section) -> RotationQuantizer:
+def _rotations(section: CompressedSection) -> RotationQuantizer:
     bits = section.head[0]
     if not MIN_BITS <= bits <= 16:
         raise CorruptSection(f"{bits} bits for rotations; expected {MIN_BITS} to 16")
     return RotationQuantizer(bits)
 
 
-def _column_records(section: Section) -> ColumnQuantizer:
+def _column_records(section: CompressedSection) -> ColumnQuantizer:
     found = list(_RECORD.iter_unpack(section.head[: _RECORD.size * section.columns]))
     for i, (bits, low, high) in enumerate(found):
         if not 1 <= bits <= MAX_BITS:
@@ -219,7 +221,7 @@ class _PlaneReader:
         """Return the next (count,) int64 codes, each at most ``last``."""
         found = np.zeros(count, np.int64)
         if count:
-            for i in range(_byte_count(bits)):
+            for i in range(_code_byte_count(bits)):
                 found |= self._bytes[self._at : self._at + count].astype(np.int64) << (8 * i)
                 self._at += count
             if found.min() < 0 or found.max() > last:
@@ -246,7 +248,7 @@ def morton_decode(keys: np.ndarray, bits: int) -> np.ndarray:
     return cells.astype(np.int64)
 
 
-def compress_planes(planes: Sequence[bytes]) -> bytes:
+def compress_code_planes(planes: Sequence[bytes]) -> bytes:
     """Return the smallest of several zstd frames, or the plain planes where no frame is smaller.
 
     A block of a frame has one entropy table. Similar columns best share a block; others have their own.

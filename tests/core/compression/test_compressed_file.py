@@ -21,7 +21,7 @@ import pytest
 import zstandard
 
 from neuprim.core import checkpoint
-from neuprim.core.compression import CONFIG, LEVELS, Section, is_compressed, write_compressed
+from neuprim.core.compression import CONFIG, LEVELS, CompressedSection, is_compressed, write_compressed
 from neuprim.core.errors import CheckpointError
 from neuprim.tasks.static import TASK
 from tests.compressing import FIELDS, example, without_pieces
@@ -391,7 +391,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, whole: bytes, monkeypat
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1, 1), (2**20 + 1,), (2**10, 2**11)])
 def test_parameters_that_no_reader_would_take(tmp_path: Path, shape: tuple[int, ...]) -> None:
     with pytest.raises(CheckpointError, match=r"parameter 'p' of shape .* cannot be stored; at most"):
-        write_compressed(tmp_path / "m", {}, 0, [Section("p", 1, shape)])
+        write_compressed(tmp_path / "m", {}, 0, [CompressedSection("p", 1, shape)])
     with pytest.raises(CheckpointError, match="cannot be stored; at most a name of 255 bytes"):
-        write_compressed(tmp_path / "m", {}, 0, [Section("ü" * 128, 1, (1,))])
+        write_compressed(tmp_path / "m", {}, 0, [CompressedSection("ü" * 128, 1, (1,))])
     assert list(tmp_path.iterdir()) == []

@@ -30,7 +30,7 @@ from neuprim.config import compose
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.train.distributed.process_group import ProcessGroup, read_torchrun_rank
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import compile_kernels, fit, prepare_training, use_one_torch_thread
+from neuprim.runs.fit import compile_run_kernels, fit, prepare_training, use_one_torch_thread_for_run
 
 RECORD = RESULTS / "ranks.json"
 SCENES = {
@@ -54,7 +54,7 @@ def make_trainers(scene: str, group: ProcessGroup) -> dict[str, Trainer]:
         own = replace(own, renderer=replace(config.renderer, device="cpu", threads=threads))
         fitted = prepare_training(own, dataset=dataset, group=group if way == "together" else None)
         dataset = fitted.dataset
-        compile_kernels(fitted.trainer)
+        compile_run_kernels(fitted.trainer)
         fitted.trainer.step = (fitted.trainer.settings.iterations or 0) // 2
         made[way] = fitted.trainer
     return made
@@ -72,7 +72,7 @@ def measure(scene: str, args: argparse.Namespace, group: ProcessGroup) -> Record
             trainers[way].train_step()
         return (time.perf_counter() - begun) / steps, (time.process_time() - used) / steps
 
-    with use_one_torch_thread():
+    with use_one_torch_thread_for_run():
         for way in trainers:
             run_steps(way, 10)
         steps = group.gather(max(round(args.seconds / run_steps("together", 10)[0]), 4))[0]

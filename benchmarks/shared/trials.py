@@ -14,9 +14,9 @@ from neuprim.config import compose
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs.fit import Events, Fitted, compile_kernels, prepare_training, train_to_end
+from neuprim.runs.fit import Events, Fitted, compile_run_kernels, prepare_training, train_to_end
 from neuprim.runs.launch.jobs import JobResult, LaunchJob
-from neuprim.runs.launch.launcher import launch
+from neuprim.runs.launch.launcher import launch_jobs
 from shared.records import read_trials, update_record
 
 _TURN, _DRAWS = 16, 500
@@ -65,7 +65,7 @@ def train(trial: Trial, wanted: Sequence[str] | Measure) -> dict[str, Any]:
     """One run and its numbers; ``cpu_seconds`` are those that this thread computed while the model learned."""
     torch.set_num_threads(1)
     fitted = begin(trial)
-    compile_kernels(fitted.trainer)
+    compile_run_kernels(fitted.trainer)
     start = time.thread_time()
     train_to_end(fitted)
     numbers = {"trial": trial.name, "seed": trial.seed, "iterations": trial.iterations}
@@ -102,7 +102,7 @@ def run_all(
 
     work = [LaunchJob(trial.name, f"{__name__}:train_job", (trial, wanted)) for trial in waiting]
     settings = LauncherSettings("processes", workers=jobs, threads=1)
-    results = launch(work, settings, path.parent / f".{path.stem}-launch", on_result=keep)
+    results = launch_jobs(work, settings, path.parent / f".{path.stem}-launch", on_result=keep)
     failed = [
         f"{trial.name}: {result.trace or result.line}"
         for trial, result in zip(waiting, results, strict=True)
@@ -137,7 +137,7 @@ def time_steps(trainers: Mapping[str, Trainer], steps: int) -> dict[str, float]:
     others on the machine do meanwhile.
     """
     for trainer in trainers.values():
-        compile_kernels(trainer)
+        compile_run_kernels(trainer)
         if trainer.dataset.points is not None:  # files are read once in a run, which is next to nothing in a long one
             generator = torch.Generator().manual_seed(0)
             for _ in range(_DRAWS):

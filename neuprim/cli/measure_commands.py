@@ -108,10 +108,10 @@ def _bench(args: argparse.Namespace) -> int:
     from neuprim.cli.run_commands import run_one
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.open import read_metrics
-    from neuprim.runs.paper import load_paper_tables, plan_paper_runs
+    from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
 
     wanted = parse_table_numbers(args.tables)
-    chosen = [table for table in load_paper_tables() if wanted & set(table.numbers)]
+    chosen = [table for table in load_paper_run_tables() if wanted & set(table.numbers)]
     if args.data is None:
         print(*_list_paper_tables(chosen), sep="\n")
         return 0
@@ -182,7 +182,7 @@ def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
 
 
 def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Iterator[str]:
-    from neuprim.runs.paper import compare_with_paper
+    from neuprim.runs.paper import compare_run_with_paper
 
     steps, seconds = metrics["iterations"], _format_seconds(metrics["train_seconds"])
     yield (
@@ -193,7 +193,7 @@ def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
     own = " ".join(text for text in one.config.overrides if not text.startswith(protocol))
     width, height = metrics["image_size"]
     yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{f', {own}' if own else ''}"
-    for kind, ours, theirs, other in compare_with_paper(one, metrics):
+    for kind, ours, theirs, other in compare_run_with_paper(one, metrics):
         beside = (
             f"   {one.row.beside[0]} {_format_measure(other, kind)}"
             if one.row.beside[0] and kind in _PAPER_MEASURES
@@ -204,7 +204,7 @@ def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
 
 def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, Any]]]) -> Iterator[str]:
     """Per row, over scenes and seeds that have both numbers."""
-    from neuprim.runs.paper import compare_with_paper
+    from neuprim.runs.paper import compare_run_with_paper
 
     rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
     for one, metrics in results:
@@ -213,7 +213,7 @@ def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, An
         scenes, seeds = len({one.scene for one, _ in own}), len({one.config.seed for one, _ in own})
         count = f"{scenes} scenes, {seeds} seed{'s' * (seeds > 1)}"
         yield f"{title}, {name}: means over {count}; ours of the last checkpoint, the paper's of the best"
-        pairs = [pair for one, metrics in own for pair in compare_with_paper(one, metrics)]
+        pairs = [pair for one, metrics in own for pair in compare_run_with_paper(one, metrics)]
         for kind in _PAPER_MEASURES:
             both = [(a, b) for what, a, b, _ in pairs if what == kind and a is not None and b is not None]
             if both:

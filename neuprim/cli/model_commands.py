@@ -149,9 +149,9 @@ def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _import_model(arguments: argparse.Namespace) -> int:
-    from neuprim.runs.export import import_run
+    from neuprim.runs.export import import_run_directory
 
-    print(import_run(arguments.file, arguments.out))
+    print(import_run_directory(arguments.file, arguments.out))
     return 0
 
 
@@ -263,7 +263,7 @@ _PRUNING_ROWS = (
 
 
 def _print_pruning(made: Pruning, tolerance: float) -> None:
-    from neuprim.runs.open import describe_kept_shares
+    from neuprim.runs.open import describe_run_kept_shares
 
     before = made.judged_psnr[0]
     for number, stage in enumerate(made.stages, 1):
@@ -279,7 +279,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
     print_columns([("", "before", "after"), *rows])
     for word in made.reduced:
         print(f"all primitives: {word}")
-    for line in describe_kept_shares(made.kept):
+    for line in describe_run_kept_shares(made.kept):
         print(line)
     print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")
 

@@ -204,7 +204,7 @@ def launch_runs(
     """
     from neuprim.cli.progress import RunLaunchProgress
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
-    from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
+    from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
     from neuprim.runs.launch_record import make_run_job
     from neuprim.runs.sweep import run_sweep
 
@@ -213,7 +213,7 @@ def launch_runs(
             _, results = run_sweep(configs, overrides, settings, progress)
         else:
             render_ground_truth_of_runs(configs, settings, progress)
-            results = launch([make_run_job(configs[0])], settings, configs[0].output_dir / LAUNCH_FOLDER, progress)
+            results = launch_jobs([make_run_job(configs[0])], settings, configs[0].output_dir / LAUNCH_FOLDER, progress)
     status = _report_launched_runs(configs, results, progress.live, typed)
     if len(configs) > 1:
         print(configs[0].output_dir.parent / "sweep.html")
@@ -270,13 +270,13 @@ def _truth(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
     from neuprim.config.command_settings import take_launcher
-    from neuprim.runs.ground_truth import render_ground_truth
+    from neuprim.runs.ground_truth import launch_ground_truth_jobs
 
     launcher, rest = take_launcher(args.overrides)
     try:
         for config in compose_all(rest) if args.multirun else [compose(rest)]:
             with RunProgress(f"{config.task}/{config.scene_name}") as events:
-                made = render_ground_truth(config, launcher, events)
+                made = launch_ground_truth_jobs(config, launcher, events)
             if made is None:
                 raise ConfigError(
                     f"scene={config.scene_name}: its images are not rendered frame by frame; expected "
@@ -395,7 +395,7 @@ def _fit_as_rank(config: RunConfig, overrides: Sequence[str], group: ProcessGrou
     """Train, and show it on rank 0."""
     from neuprim.cli.progress import RunProgress
     from neuprim.config.overrides import CommandLine
-    from neuprim.runs.fit import ignore_event
+    from neuprim.runs.fit import ignore_run_event
     from neuprim.runs.run import run
 
     ranks = f"--nproc-per-node {group.place.local_size}" if group.size == group.place.local_size else "…"
@@ -404,7 +404,7 @@ def _fit_as_rank(config: RunConfig, overrides: Sequence[str], group: ProcessGrou
         if not group.is_first:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # rank 0 warns
-                run(config, ignore_event, group=group)
+                run(config, ignore_run_event, group=group)
             return
         with RunProgress(f"{config.task}/{config.scene_name}, {group.size} ranks") as events:
             print(run(config, events, group=group))

@@ -74,11 +74,11 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     orbit = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [display(render_image(model, view, settings, dataset.background)) for view in orbit]
     write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory, task.conditions, _make_viewer_page(fitted, directory))
+    write_report(directory, task.conditions, _make_run_viewer_page(fitted, directory))
     return metrics
 
 
-def _make_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
+def _make_run_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
     """Return the viewer page of the model; None of a model that a page cannot show."""
     task, dataset, channels, model = fitted.task, fitted.dataset, fitted.channels, fitted.model
     settings = fitted.config.renderer

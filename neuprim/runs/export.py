@@ -63,23 +63,23 @@ def export_run(
         load_run(run)  # that the run's own package is gone says more
         raise
     source = find_plugin_source(EXPORTERS, name)
-    final = _export_destination(run_dir, exporter, out)
+    final = _run_export_destination(run_dir, exporter, out)
     refuse_existing(final, overwrite)
     model = open_run(run, progress)
-    options, conditions = _parse_options(words, exporter, model.task.conditions)
+    options, conditions = _parse_run_export_options(words, exporter, model.task.conditions)
     notes: list[str] = []
     read_conditions(model.task.conditions, conditions, notes.append)
     with staged_output(final, overwrite) as output:
         job = ExportJob(model, output.out, options, conditions, progress)
         with attribute_errors(source):
             report = exporter.write(job)
-        files = _check_exported_files(report, output, source.label)
+        files = _check_run_export_files(report, output, source.label)
         output.publish()
     report = replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
-    return _record_export(name, job, report)
+    return _record_run_export(name, job, report)
 
 
-def _export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
+def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
     """What the user named, or the exporter's own name for it in the run."""
     if out is None:
         return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
@@ -89,7 +89,7 @@ def _export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> 
     return out
 
 
-def _check_exported_files(report: Any, output: StagedOutput, exporter: str) -> tuple[Path, ...]:
+def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) -> tuple[Path, ...]:
     """Where the files of a report will be. Raises PluginError for a wrong report."""
     if not isinstance(report, ExportReport):
         raise PluginError(f"{exporter}: write returned {type(report).__name__}; expected an ExportReport")
@@ -107,7 +107,7 @@ def _check_exported_files(report: Any, output: StagedOutput, exporter: str) -> t
     return tuple(files)
 
 
-def _parse_options(
+def _parse_run_export_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
     """Options of the exporter and texts of conditions; where both have one name, ``NAME=`` means the option."""
@@ -127,7 +127,7 @@ def _parse_options(
             conditions[condition] = text
         elif key in exporter.options:
             given.add(key)
-            options[key] = _parse_scalar(text)
+            options[key] = _parse_run_export_option(text)
         else:
             known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
             hint = nearest(key, known) or "; it has none"
@@ -135,7 +135,7 @@ def _parse_options(
     return options, conditions
 
 
-def _parse_scalar(text: str) -> Any:
+def _parse_run_export_option(text: str) -> Any:
     """A number, true, false, null, or the text; unlike YAML's, 1e-3 is a number and 1:40 is text."""
     words = {"true": True, "false": False, "null": None, "": None}
     if text in words:
@@ -149,14 +149,14 @@ def _parse_scalar(text: str) -> Any:
 # ---------------------------------------------------------------- record
 
 
-def _record_export(word: str, job: ExportJob, report: ExportReport) -> ExportReport:
+def _record_run_export(word: str, job: ExportJob, report: ExportReport) -> ExportReport:
     """Add an export to its run's list; returns its report, with a note if the list could not be written.
 
     Args:
         word: what chose the exporter, ``NAME`` or ``PACKAGE:NAME``.
     """
     path, info = job.run.directory / EXPORTS_FILE, EXPORTERS.find(word)
-    files = [_name_exported_file(Path(file), job.run.directory) for file in report.files]
+    files = [_name_run_export_file(Path(file), job.run.directory) for file in report.files]
     entry = {
         "files": files[:_MAX_FILES],
         **({"more_files": len(files) - _MAX_FILES} if len(files) > _MAX_FILES else {}),
@@ -165,11 +165,11 @@ def _record_export(word: str, job: ExportJob, report: ExportReport) -> ExportRep
         "version": info.version,
         "neuprim": __version__,
         "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "options": _json_options({**job.options, **job.conditions}),
+        "options": _plain_run_export_options({**job.options, **job.conditions}),
         "lossless": bool(report.lossless),
     }
     try:
-        write_json(path, [*_read_exports(path), entry][-_MAX_ENTRIES:])
+        write_json(path, [*_read_run_exports(path), entry][-_MAX_ENTRIES:])
     except OSError as error:
         note = f"{path}: not written ({error.strerror or error}); this export is not recorded"
     except ValueError as error:
@@ -179,13 +179,13 @@ def _record_export(word: str, job: ExportJob, report: ExportReport) -> ExportRep
     return replace(report, notes=(*report.notes, note))
 
 
-def _name_exported_file(file: Path, directory: Path) -> str:
+def _name_run_export_file(file: Path, directory: Path) -> str:
     """Relative to the run directory if it lies in there, so that a run that was moved still finds it; else absolute."""
     whole, inside = file.absolute(), directory.absolute()
     return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)[:_MAX_CHARACTERS]
 
 
-def _json_options(options: Mapping[str, Any]) -> dict[str, Any]:
+def _plain_run_export_options(options: Mapping[str, Any]) -> dict[str, Any]:
     """Options as strict JSON holds them."""
     plain: dict[str, Any] = {}
     for key, value in options.items():
@@ -194,7 +194,7 @@ def _json_options(options: Mapping[str, Any]) -> dict[str, Any]:
     return plain
 
 
-def _read_exports(path: Path) -> list[Any]:
+def _read_run_exports(path: Path) -> list[Any]:
     """Earlier entries. Raises ValueError for a file that is not a list of exports."""
     try:
         if path.stat().st_size > _MAX_BYTES:
@@ -214,7 +214,7 @@ def _read_exports(path: Path) -> list[Any]:
 # ---------------------------------------------------------------- import
 
 
-def import_run(path: Path, out: Path, name: str | None = None) -> Path:
+def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path:
     """Make a run directory of a file that a lossless exporter or ``neuprim compress`` wrote; returns ``out``.
 
     It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``, so that it renders,
@@ -244,10 +244,10 @@ def import_run(path: Path, out: Path, name: str | None = None) -> Path:
         raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
     with attribute_errors(find_plugin_source(EXPORTERS, name)):
         stored = reader.read(path)
-    return import_model(stored, path, out)
+    return import_model_as_run(stored, path, out)
 
 
-def import_model(stored: StoredModel, path: Path, out: Path) -> Path:
+def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
     """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}

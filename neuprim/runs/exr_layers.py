@@ -26,14 +26,14 @@ from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import draw_task_layer
-from neuprim.runs.render_config import RenderConfig
+from neuprim.runs.render_config import RunRendering
 from neuprim.version import __version__
 
 _MOST_LIGHTS = 128
 _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # those of sRGB: x and y of red, green, blue, white
 
 
-def _linear_light(image: Tensor, color_space: str, alpha: Tensor | None = None) -> Tensor:
+def _linear_light_of_run_layer(image: Tensor, color_space: str, alpha: Tensor | None = None) -> Tensor:
     """(H, W, C) linear light of an image in a data set's colour space; sRGB values lose what is below 0.
 
     Args:
@@ -48,7 +48,7 @@ def _linear_light(image: Tensor, color_space: str, alpha: Tensor | None = None) 
 
 
 @dataclass(frozen=True)
-class ExrLayers:
+class RunExrLayers:
     """Which layers of a run's views are written, and how.
 
     Attributes:
@@ -65,7 +65,7 @@ class ExrLayers:
     run_dir: Path
     task: TaskSpec
     channels: Channels
-    point: RenderConfig
+    point: RunRendering
     background: Tensor
     names: str | None = None
     half: bool = False
@@ -144,10 +144,10 @@ class ExrLayers:
             else:
                 image = self.point.upsample(image, view.camera)
             if name == "beauty" and "alpha" in found:
-                image = _linear_light(image, self.channels.color_space, large_alpha[..., 0])
+                image = _linear_light_of_run_layer(image, self.channels.color_space, large_alpha[..., 0])
             elif name == "beauty":
                 image = image + (1.0 - large_alpha) * self.background.to(image)
-                image = _linear_light(image, self.channels.color_space)
+                image = _linear_light_of_run_layer(image, self.channels.color_space)
             half = self.half and (spec is None or spec.light or name == "alpha")
             names = self.channels.names if spec is None or not spec.channels else spec.channels
             prefix = "" if name in ("beauty", "alpha") else f"{name}."
@@ -171,7 +171,7 @@ class ExrLayers:
             "neuprim:task": self.task.name,
             "neuprim:view": view.name,
             "neuprim:colorSpace": f"linear light{origin}",
-            "neuprim:background": _linear_light(self.background[None, None], space)[0, 0].tolist(),
+            "neuprim:background": _linear_light_of_run_layer(self.background[None, None], space)[0, 0].tolist(),
         }
         if self.channels.is_rgb:
             found["chromaticities"] = _REC709

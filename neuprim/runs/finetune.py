@@ -11,7 +11,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.trainer_state import select_state_tensors
-from neuprim.runs.fit import keep_model_settings, make_loss
+from neuprim.runs.fit import drop_unused_run_rates, make_run_loss
 
 BEGIN = 0.8
 """Progress of the run that the first step stands for."""
@@ -33,7 +33,7 @@ _PACE_WARMUP, _PACE_STEPS = 5, 20
 """Steps before the pace is measured, and those that it is measured over."""
 
 
-def make_finetune_trainer(
+def make_run_finetune_trainer(
     job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
     """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
@@ -45,7 +45,7 @@ def make_finetune_trainer(
     config, params = job.config, {name: value.detach().clone() for name, value in model.params.items()}
     copy = Primitives(model.density, model.colour, params)
     total = round(steps / (1 - begin))
-    usual = keep_model_settings(config.train, job.task, copy)
+    usual = drop_unused_run_rates(config.train, job.task, copy)
     final = COOL ** (1 / (1 - begin))  # a rate's factor is final ** progress
     scale = max(START * min(steps / LONG, 1.0), LEAST_START) * usual.final_rate / final**begin
     settings = replace(
@@ -60,7 +60,7 @@ def make_finetune_trainer(
         voxels_every=min(usual.voxels_every, voxels_every),
         population=replace(config.train.population, strategy="fixed", grow_from=1.0),
     )
-    trainer = Trainer(copy, dataset, make_loss(job), settings, config.renderer, config.seed)
+    trainer = Trainer(copy, dataset, make_run_loss(job), settings, config.renderer, config.seed)
     trainer.step = total - steps
     saved = config.output_dir / "checkpoint.safetensors"
     if trainer.exposures is not None and saved.exists():
@@ -68,11 +68,11 @@ def make_finetune_trainer(
     return trainer
 
 
-def count_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
+def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
     """How many steps of fine-tuning fit into some seconds, at the measured pace; none in 0 seconds."""
     if seconds <= 0:
         return 0
-    trainer = make_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)
+    trainer = make_run_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)
     for _ in range(_PACE_WARMUP):
         trainer.train_step()
     before = trainer.elapsed

@@ -87,7 +87,7 @@ Event = Preparing | Step | Evaluated | Finishing | Note
 Events = Callable[[Event], None]
 
 
-def ignore_event(event: Event) -> None:
+def ignore_run_event(event: Event) -> None:
     """Do nothing."""
 
 
@@ -135,7 +135,7 @@ class Fitted(Job):
         return summarize_metrics(self, self.dataset, self.model, views, size, self.training, self.lpips, self.split)
 
 
-def fit(config: RunConfig, events: Events = ignore_event, dataset: Dataset | None = None) -> Fitted:
+def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset | None = None) -> Fitted:
     """Train a configuration to the end of its budget, in memory.
 
     Args:
@@ -148,11 +148,11 @@ def fit(config: RunConfig, events: Events = ignore_event, dataset: Dataset | Non
         return train_to_end(prepare_training(config, events, dataset), events)
 
 
-def train_to_end(fitted: Fitted, events: Events = ignore_event) -> Fitted:
+def train_to_end(fitted: Fitted, events: Events = ignore_run_event) -> Fitted:
     """Train to the end of the budget; returns what was passed."""
-    compile_kernels(fitted.trainer, events)
-    with use_one_torch_thread():
-        for _ in train_steps(fitted.trainer, events):
+    compile_run_kernels(fitted.trainer, events)
+    with use_one_torch_thread_for_run():
+        for _ in train_run_steps(fitted.trainer, events):
             pass
     fitted.unlock_bands()
     return fitted
@@ -160,7 +160,7 @@ def train_to_end(fitted: Fitted, events: Events = ignore_event) -> Fitted:
 
 def prepare_training(
     config: RunConfig,
-    events: Events = ignore_event,
+    events: Events = ignore_run_event,
     dataset: Dataset | None = None,
     hold_out: int = 0,
     make: TrainerFactory | None = None,
@@ -170,7 +170,7 @@ def prepare_training(
 
     Args:
         hold_out: n > 1: every n-th training view replaces the test views; 0: the data are taken as they are.
-        make: makes the trainer; None: :func:`make_trainer`, of a fresh model.
+        make: makes the trainer; None: :func:`make_run_trainer`, of a fresh model.
         group: the ranks that train the model together; None for one process.
     """
     if make is None:
@@ -180,7 +180,7 @@ def prepare_training(
     config = replace(config, made_by=current_provenance(config, task))
     job = Job(config, task)
     # what the loss or the task refuses must not cost the loading of the data or a training
-    loss = make_loss(job)
+    loss = make_run_loss(job)
     lpips = None if config.metrics.lpips is None else Lpips.load(config.metrics.lpips)
     if dataset is None:
         dataset = load_dataset(job, lambda text, fraction: events(Preparing(text, fraction)))
@@ -196,9 +196,9 @@ def prepare_training(
         trainer = make(job, dataset, loss)
     else:
         events(Preparing("starting points"))
-        trainer = make_trainer(job, dataset, loss, group)
+        trainer = make_run_trainer(job, dataset, loss, group)
         wanted, found = config.model.primitives, trainer.model.count
-        if found < _starting_count(config):
+        if found < _starting_count_of_run(config):
             grows = config.train.population.strategy == "relocate"
             rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
             events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={wanted:,}: {rest}"))
@@ -208,20 +208,20 @@ def prepare_training(
     return Fitted(config, task, dataset, channels, trainer, lpips, split)
 
 
-def train_steps(trainer: Trainer, events: Events = ignore_event) -> Iterator[tuple[StepReport, float | None]]:
+def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iterator[tuple[StepReport, float | None]]:
     """Step until the budget is used; yields each step's report, and the held-out PSNR where the curve gets a point.
 
     Between two steps the state may be saved or the loop left.
     """
-    next_point = _next_curve_progress(trainer)
+    next_point = _next_run_curve_progress(trainer)
     for report in trainer.run():
         events(Step(report, trainer.progress))
         held_out = None
         if trainer.progress >= next_point:
             if trainer.rank == 0:
-                held_out = measure_curve_point(trainer)
+                held_out = measure_run_curve_point(trainer)
                 events(Evaluated(held_out))
-            next_point = _next_curve_progress(trainer)
+            next_point = _next_run_curve_progress(trainer)
         yield report, held_out
     wanted = trainer.settings.population.grow_to or 0
     if trainer.settings.population.strategy == "relocate" and trainer.model.count < wanted:
@@ -233,13 +233,13 @@ def train_steps(trainer: Trainer, events: Events = ignore_event) -> Iterator[tup
         )
 
 
-def _next_curve_progress(trainer: Trainer) -> float:
+def _next_run_curve_progress(trainer: Trainer) -> float:
     """The progress at which the curve gets its next point."""
     every = trainer.settings.eval_every
     return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
 
 
-def measure_curve_point(trainer: Trainer) -> float:
+def measure_run_curve_point(trainer: Trainer) -> float:
     """Mean PSNR of a few held-out views, at most 200 dB; does not touch the training state."""
     views, background = trainer.dataset.test, trainer.dataset.background
     chosen = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
@@ -254,7 +254,7 @@ def measure_curve_point(trainer: Trainer) -> float:
 # ---------------------------------------------------------------- parts of a training
 
 
-def make_loss(job: Job) -> Loss:
+def make_run_loss(job: Job) -> Loss:
     """Make the loss of a job: its task's own, or the one that ``train.loss`` names.
 
     Raises:
@@ -269,7 +269,7 @@ def make_loss(job: Job) -> Loss:
     return guard_loss(made, job.plugins.loss)
 
 
-def make_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup | None = None) -> Trainer:
+def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup | None = None) -> Trainer:
     """Make a fresh model of a job and its trainer.
 
     Args:
@@ -289,18 +289,18 @@ def make_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup | N
     density, colour = reduce_fields(density, colour, config.model.reduced)
     with attribute_errors(source):
         check_fields(density, colour, dataset)
-    settings = replace(config.model, primitives=_starting_count(config))
+    settings = replace(config.model, primitives=_starting_count_of_run(config))
     model = initial_model(density, colour, dataset, settings, config.seed)
     population = config.train.population
     if population.grow_to is None:
         population = replace(population, grow_to=config.model.primitives)
-    train = keep_model_settings(replace(config.train, population=population), task, model)
+    train = drop_unused_run_rates(replace(config.train, population=population), task, model)
     if group is None:
         return Trainer(model, dataset, loss, train, config.renderer, config.seed)
     return DistributedTrainer(model, dataset, loss, train, config.renderer, config.seed, group)
 
 
-def keep_model_settings(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
+def drop_unused_run_rates(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
     """Drop the rates of parameters that the model does not have: a preset has rates for every density and colour of its
     task, and the trainer refuses other names."""
     others = task.parameter_names() - model.params.keys()
@@ -309,12 +309,12 @@ def keep_model_settings(train: TrainSettings, task: TaskSpec, model: Primitives)
     return replace(train, rates=rates, rate_units=units)
 
 
-def _starting_count(config: RunConfig) -> int:
+def _starting_count_of_run(config: RunConfig) -> int:
     """Primitives at the start of a training."""
     return max(round(config.train.population.grow_from * config.model.primitives), 1)
 
 
-def compile_kernels(trainer: Trainer, events: Events = ignore_event) -> None:
+def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> None:
     """Compile the kernels outside the training clock: one throw-away step on a copy of a few primitives."""
     events(Preparing("loading kernels; once per installation they are compiled, which takes about a minute"))
     model = trainer.model
@@ -327,7 +327,7 @@ def compile_kernels(trainer: Trainer, events: Events = ignore_event) -> None:
 
 
 @contextmanager
-def use_one_torch_thread() -> Iterator[None]:
+def use_one_torch_thread_for_run() -> Iterator[None]:
     """Between kernels torch has only small tensors; its own thread pool would spin on the cores the kernels need."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

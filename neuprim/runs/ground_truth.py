@@ -14,11 +14,11 @@ from neuprim.core.data.dataset import GroundTruth
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.store import WAIT_MESSAGE
 from neuprim.plugins.attribution import attribute_errors
-from neuprim.runs.fit import Event, Events, Note, Preparing, ignore_event
+from neuprim.runs.fit import Event, Events, Note, Preparing, ignore_run_event
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
-from neuprim.runs.launch.launcher import OnStatus, launch
-from neuprim.runs.open import Progress, ignore_progress, make_scene_context
+from neuprim.runs.launch.launcher import OnStatus, launch_jobs
+from neuprim.runs.open import Progress, ignore_progress, make_run_scene_context
 
 _MOST_FRAMES = 16
 """Frames that a worker takes at a time."""
@@ -27,7 +27,7 @@ _loaded: dict[str, GroundTruth] = {}
 """Of this process's last job: all jobs of a launch have one scene."""
 
 
-def load_ground_truth(
+def load_run_ground_truth(
     config: RunConfig, progress: Progress = ignore_progress, known: Mapping[str, Any] | None = None
 ) -> GroundTruth | None:
     """The ground truth of a configuration's scene; None of a scene whose images are not rendered frame by frame.
@@ -40,11 +40,11 @@ def load_ground_truth(
     if make is None:
         return None
     with attribute_errors(job.plugins.scene, "truth"):
-        return make(config.scene, make_scene_context(config, progress), known)
+        return make(config.scene, make_run_scene_context(config, progress), known)
 
 
-def render_ground_truth(
-    config: RunConfig, settings: LauncherSettings, events: Events = ignore_event
+def launch_ground_truth_jobs(
+    config: RunConfig, settings: LauncherSettings, events: Events = ignore_run_event
 ) -> GroundTruth | None:
     """Have what is missing of the ground truth made where the launcher says; None of a scene that renders none.
 
@@ -56,13 +56,13 @@ def render_ground_truth(
         NeuprimError: what the launcher or the scene refuses, or a frame that cannot be made.
         RuntimeError: a bug in a worker, with its traceback.
     """
-    truth = load_ground_truth(config, lambda text, fraction: events(Preparing(text, fraction)))
+    truth = load_run_ground_truth(config, lambda text, fraction: events(Preparing(text, fraction)))
     if truth is None:
         return None
     missing = truth.missing()
     if missing:
         truth.begin()
-        _launch_frames(config, truth, missing, settings, events)
+        _launch_ground_truth_frames(config, truth, missing, settings, events)
     truth.complete()
     return truth
 
@@ -80,7 +80,7 @@ def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: Launcher
         return
     scenes: dict[str, list[int]] = {}
     for number, config in enumerate(configs):
-        scenes.setdefault(_scene_key(config), []).append(number)
+        scenes.setdefault(_run_scene_key(config), []).append(number)
     for numbers in scenes.values():
 
         def tell(event: Event, numbers: Sequence[int] = numbers) -> None:
@@ -91,22 +91,22 @@ def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: Launcher
                     on_status(number, JobStatus("waiting", text, progress=done))
 
         with suppress(NeuprimError):
-            render_ground_truth(configs[numbers[0]], settings, tell)
+            launch_ground_truth_jobs(configs[numbers[0]], settings, tell)
 
 
-def render_ground_truth_for_training(config: RunConfig, settings: LauncherSettings, progress: Progress) -> None:
+def render_ground_truth_before_run(config: RunConfig, settings: LauncherSettings, progress: Progress) -> None:
     """The ground truth of trainings in this process, as :func:`render_ground_truth_of_runs`; raises as
-    :func:`render_ground_truth`."""
+    :func:`launch_ground_truth_jobs`."""
 
     def tell(event: Event) -> None:
         if isinstance(event, Preparing):
             progress(event.text, event.fraction)
 
     if settings.name != "inline":
-        render_ground_truth(config, settings, tell)
+        launch_ground_truth_jobs(config, settings, tell)
 
 
-def split_frames(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
+def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
     """Frames for one job after the other: several at first, and one by one in the end, so that nobody waits long for a
     slow worker (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
     left = list(missing)
@@ -119,9 +119,9 @@ def split_frames(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
 def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> int:
     """The function of a job; returns how many of its frames are there then."""
     config = RunConfig.from_dict(data["config"])
-    key = _scene_key(config)
+    key = _run_scene_key(config)
     if key not in _loaded:
-        loaded = load_ground_truth(config, known=data["known"])
+        loaded = load_run_ground_truth(config, known=data["known"])
         assert loaded is not None, "only scenes with a ground truth are launched"
         _loaded.clear()
         _loaded[key] = loaded
@@ -137,10 +137,10 @@ def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> 
     return len(data["frames"])
 
 
-def _launch_frames(
+def _launch_ground_truth_frames(
     config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events
 ) -> None:
-    parts = list(split_frames(missing, count_parallel_jobs(settings, len(missing))[0]))
+    parts = list(split_frames_into_jobs(missing, count_parallel_jobs(settings, len(missing))[0]))
     outputs = config.output_dir.parent.absolute()  # which every machine sees
     new, folder = not outputs.exists(), outputs / f"truth-{uuid.uuid4().hex[:8]}"
     common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key}
@@ -168,9 +168,9 @@ def _launch_frames(
 
     events(Preparing(text, done / total))
     _loaded.clear()
-    _loaded[_scene_key(config)] = truth
+    _loaded[_run_scene_key(config)] = truth
     try:
-        results = launch(jobs, settings, folder, on_status, on_result, stop_at_failure=True)
+        results = launch_jobs(jobs, settings, folder, on_status, on_result, stop_at_failure=True)
     finally:
         _loaded.clear()
         with suppress(OSError):
@@ -186,5 +186,5 @@ def _launch_frames(
         raise KeyboardInterrupt
 
 
-def _scene_key(config: RunConfig) -> str:
+def _run_scene_key(config: RunConfig) -> str:
     return json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True, default=str)

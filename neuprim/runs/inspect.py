@@ -28,8 +28,8 @@ from neuprim.inspect.truth_volumes import open_ground_truth, pair_frames, write_
 from neuprim.inspect.window import Window, has_display, list_panels, prepare_headless, require_pyvista
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import INSPECTORS, PluginError
-from neuprim.runs.fit import Events, Note, ignore_event
-from neuprim.runs.open import PRUNED, StoredRun, describe_kept_shares, kept_shares, open_run
+from neuprim.runs.fit import Events, Note, ignore_run_event
+from neuprim.runs.open import PRUNED, StoredRun, describe_run_kept_shares, kept_shares, open_run
 
 FILMS = (".webp", ".gif", ".mp4")
 OUTPUTS = (".png", *FILMS, ".html", ".vdb")
@@ -66,7 +66,7 @@ class InspectRequest:
     overwrite: bool = False
 
 
-def inspect_run(request: InspectRequest, events: Events = ignore_event) -> list[Path]:
+def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> list[Path]:
     """Show a run's density in a window, or write files and return them.
 
     Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a
@@ -83,7 +83,7 @@ def inspect_run(request: InspectRequest, events: Events = ignore_event) -> list[
     kind = "" if request.out is None else request.out.suffix.lower()
     if request.out is not None and kind not in OUTPUTS:
         raise ConfigError(f"--out {request.out}: expected a name that ends in {', '.join(OUTPUTS)}")
-    inspectors = [_load_inspector(name) for name in dict.fromkeys(request.show)]
+    inspectors = [_load_run_inspector(name) for name in dict.fromkeys(request.show)]
     if request.out is None and not has_display():
         raise BackendUnavailable("there is no display to open a window on; give --out FILE.png, .webp, .html or .vdb")
     if kind not in (".html", ".vdb"):
@@ -92,25 +92,25 @@ def inspect_run(request: InspectRequest, events: Events = ignore_event) -> list[
             prepare_headless()
     if request.against is None and any(i.shows == "both" for i in inspectors):
         raise ConfigError("--show difference: there is no ground truth; give --against FILE.vdb, DIR or scene")
-    film = _InspectedFrames(request, events)
+    film = _RunFrames(request, events)
     if film.channels.hides_channels and any(i.shows == "model" for i in inspectors):
         events(Note(f"shown: {film.channels.display_text}"))
     if request.out is not None and kind == ".html":
         write_page(request.out, film, inspectors)
         return [request.out]
     if request.out is not None and kind == ".vdb":
-        return _write_frames(request.out, film, lambda path, frame: write_density_vdb(path, frame, film.world))
+        return _write_run_frames(request.out, film, lambda path, frame: write_density_vdb(path, frame, film.world))
     window = Window(list_panels(inspectors, request.against is not None), film.up, bool(kind), request.size)
     try:
         if request.out is not None:
-            return _write_pictures(request.out, film, window)
+            return _write_run_pictures(request.out, film, window)
         window.interact(len(film), film.frame)
         return []
     finally:
         window.close()
 
 
-def _load_inspector(name: str) -> Inspector:
+def _load_run_inspector(name: str) -> Inspector:
     """Load an inspector under the name that the user gave it, with errors attributed and layers checked."""
     inspector, source = INSPECTORS.load(name), find_plugin_source(INSPECTORS, name)
     if source.built_in:
@@ -135,19 +135,19 @@ def _output_paths(out: Path, count: int) -> list[Path]:
     return [out.with_name(f"{out.stem}_{i:04d}{suffix}") for i in range(count)]
 
 
-def _write_pictures(out: Path, film: _InspectedFrames, window: Window) -> list[Path]:
+def _write_run_pictures(out: Path, film: _RunFrames, window: Window) -> list[Path]:
     def draw(frame: FieldFrame) -> Tensor:
         window.draw(frame)
         return torch.from_numpy(window.picture().copy()).float() / 255.0
 
     if out.suffix.lower() == ".png":
-        return _write_frames(out, film, lambda path, frame: images.write_png(path, draw(frame)))
+        return _write_run_frames(out, film, lambda path, frame: images.write_png(path, draw(frame)))
     out.parent.mkdir(parents=True, exist_ok=True)
     write_animation(out, [draw(film.frame(i)) for i in range(len(film))], min(24.0, max(len(film) / 4.0, 4.0)))
     return [out]
 
 
-def _write_frames(out: Path, film: _InspectedFrames, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+def _write_run_frames(out: Path, film: _RunFrames, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
     paths = _output_paths(out, len(film))
     for i, path in enumerate(paths):
@@ -155,7 +155,7 @@ def _write_frames(out: Path, film: _InspectedFrames, write: Callable[[Path, Fiel
     return paths
 
 
-class _InspectedFrames:
+class _RunFrames:
     """The requested frames, made one at a time, with one box and scale for all."""
 
     def __init__(self, request: InspectRequest, events: Events) -> None:
@@ -187,7 +187,7 @@ class _InspectedFrames:
         clamp = "in 1/scene unit, each primitive clamped at 0 from below"
         events(Note(f"extinction of {self.model.count} primitives on {on}, {clamp}"))
         if (run.directory / PRUNED).exists():
-            for line in describe_kept_shares(kept_shares(self.model)):
+            for line in describe_run_kept_shares(kept_shares(self.model)):
                 events(Note(line))
 
     def __len__(self) -> int:
@@ -226,7 +226,7 @@ class _InspectedFrames:
             float(np.average(np.arange(n), weights=weights.sum(tuple({0, 1, 2} - {a})))) for a, n in enumerate(shape)
         ]
         focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
-        return _round_scale_end(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
+        return _round_scale_of_run_frames(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> FieldFrame:
         """Make a frame; its grids are computed once per frame object."""
@@ -251,7 +251,7 @@ class _InspectedFrames:
         )
 
 
-def _round_scale_end(value: float) -> float:
+def _round_scale_of_run_frames(value: float) -> float:
     """Return the next number of two digits, for the end of a scale; 1 for 0."""
     if not value > 0:
         return 1.0

@@ -15,7 +15,7 @@ from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.validation import coerce, validate
 from neuprim.runs.ground_truth import render_ground_truth_of_runs
 from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
-from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher, launch
+from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher, launch_jobs
 from neuprim.runs.open import model_file
 
 _FORMAT = 1
@@ -183,6 +183,6 @@ def launch_missing_runs(
 
     chosen = [configs[number] for number in todo]
     render_ground_truth_of_runs(chosen, settings, hear)
-    launch([make_run_job(config) for config in chosen], settings, record.file.parent / LAUNCH_FOLDER, hear, end)
+    launch_jobs([make_run_job(config) for config in chosen], settings, record.file.parent / LAUNCH_FOLDER, hear, end)
     record.write()
     return record, results

@@ -37,7 +37,7 @@ from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_mask, call_task_metrics
 from neuprim.runs.open import StoredRun, load_dataset, load_run, model_file, move_to_render_device
-from neuprim.runs.render_config import estimate_file_bytes, parse_render_config
+from neuprim.runs.render_config import estimate_run_file_bytes, parse_run_rendering
 from neuprim.version import __version__
 
 _VISIBLE_PSNR = 20 * math.log10(255)
@@ -130,7 +130,7 @@ def measure_views(
         if pixels.mask is not None:
             rendered = torch.where(pixels.mask[..., None], rendered, truth)
         mask = call_task_mask(task, dataset, i)
-        more = _display_metrics(rendered, truth, dataset, channels, pixels.mask)
+        more = _run_display_metrics(rendered, truth, dataset, channels, pixels.mask)
         more |= _mask_metrics(rendered, truth, dataset, mask) | _table_metrics(rendered, truth, channels, lpips)
         if pixels.alpha is None:
             more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
@@ -156,7 +156,7 @@ def measure_quality(
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
 
-def _display_metrics(
+def _run_display_metrics(
     rendered: Tensor, truth: Tensor, dataset: Dataset, channels: Channels, valid: Tensor | None
 ) -> dict[str, float]:
     if channels.own is not None:
@@ -200,7 +200,7 @@ def evaluate_run(
             run's file with these changes.
     """
     run = load_run(run)
-    config = parse_render_config(overrides, run.config.renderer, run.model)
+    config = parse_run_rendering(overrides, run.config.renderer, run.model)
     run = replace(run, config=replace(run.config, renderer=config.settings))
     weights = lpips or run.config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
@@ -209,7 +209,7 @@ def evaluate_run(
         check_dataset(dataset, run.task.conditions)
         training = {name: run.header.get(name) for name in ("iterations", "train_seconds")}
         model = config.prepare_model(run.model)
-        size = estimate_file_bytes(model_file(run.directory), run.model, model, config.storage)
+        size = estimate_run_file_bytes(model_file(run.directory), run.model, model, config.storage)
         model = move_to_render_device(model, config.settings, dataset.test.view(0))
         views = measure_views(model, run.task, dataset, config.settings, distance, render_view=config.render_view)
         return summarize_metrics(run, dataset, model, views, size, training, distance)
@@ -244,13 +244,13 @@ def summarize_metrics(
         **metric_to_json("psnr", float(np.mean([v.psnr for v in views]))),
         "ssim": float(np.mean([v.ssim for v in views])),
         **mean_metrics([v.more for v in views]),
-        **_lpips_entries(views, lpips),
+        **_run_lpips_entries(views, lpips),
         **metric_to_json("psnr_worst", worst.psnr),
         "view_worst": worst.name,
         "worse_than_black_image": [v.name for v in views if v.psnr < min(v.black, _VISIBLE_PSNR)],
-        "per_view": [_view_entry(v) for v in views],
+        "per_view": [_run_view_metrics_entry(v) for v in views],
         **({"views_empty": sum(v.empty for v in views)} if any(v.empty for v in views) else {}),
-        **_frame_means(call_task_clips(task, dataset) if split == "test" else (), views),
+        **_run_frame_means(call_task_clips(task, dataset) if split == "test" else (), views),
         "primitives": model.count,
         "parameters": model.count * model.parameters_per_primitive,
         "parameters_per_primitive": model.parameters_per_primitive,
@@ -281,14 +281,14 @@ def summarize_metrics(
     }
 
 
-def _view_entry(view: ViewMetrics) -> dict[str, Any]:
+def _run_view_metrics_entry(view: ViewMetrics) -> dict[str, Any]:
     entry = {"name": view.name, **metric_to_json("psnr", view.psnr), "ssim": view.ssim, "seconds": view.seconds}
     for name, value in view.more.items():
         entry |= metric_to_json(name, value)
     return entry
 
 
-def _lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
+def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
     """Which network measured LPIPS, or why none did: a missing number is not a zero."""
     if lpips is None:
         why = "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"
@@ -299,7 +299,7 @@ def _lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[st
     return {"lpips_network": lpips.network}
 
 
-def _frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
+def _run_frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
     """Means over the clips of the test views of each of their frames, if all clips have one length."""
     own = [[views[i] for i in clip.views] for clip in clips if clip.source is None]
     if not own or len({len(clip) for clip in own}) != 1:

@@ -93,7 +93,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     return replace(stored, task=task)
 
 
-def make_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
+def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
     """What a run's scene is loaded with.
 
     Raises:
@@ -110,7 +110,7 @@ def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
     Raises:
         NeuprimError: the loader refuses its files or settings, or it crashed.
     """
-    context = make_scene_context(job.config, progress)
+    context = make_run_scene_context(job.config, progress)
     if isinstance(job, StoredRun):
         context = replace(context, world=job.world)
     scene, source = job.scene, job.plugins.scene
@@ -135,7 +135,7 @@ def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> Tra
         if load is None:
             return None
         with attribute_errors(stored.plugins.scene, "volume"):
-            return load(config.scene, make_scene_context(config, progress))
+            return load(config.scene, make_run_scene_context(config, progress))
 
     return TrainedModel(
         stored.directory,
@@ -183,6 +183,6 @@ def kept_shares(model: Primitives) -> dict[str, float]:
     return {group: value / sizes[group] for group, value in kept.items()}
 
 
-def describe_kept_shares(kept: dict[str, float]) -> list[str]:
+def describe_run_kept_shares(kept: dict[str, float]) -> list[str]:
     """A line for every group of prunable units that is not whole."""
     return [f"{name}: {share:.0%} of its numbers are kept" for name, share in kept.items() if share < 1]

@@ -19,7 +19,7 @@ import yaml
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.metrics import metric_from_json
-from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
+from neuprim.runs.fit import compile_run_kernels, prepare_training, use_one_torch_thread_for_run
 
 _OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 _UNITS = {"s": 1, "m": 60, "h": 3600}
@@ -81,13 +81,13 @@ class PlannedRun:
     config: RunConfig
 
 
-def load_paper_tables() -> list[PaperTable]:
+def load_paper_run_tables() -> list[PaperTable]:
     """All of the paper's tables, as shipped."""
     text = (resources.files(__package__) / "paper_tables.yaml").read_text(encoding="utf-8")
-    return [_parse_table(entry) for entry in yaml.safe_load(text)]
+    return [_parse_paper_run_table(entry) for entry in yaml.safe_load(text)]
 
 
-def _parse_table(entry: Mapping[str, Any]) -> PaperTable:
+def _parse_paper_run_table(entry: Mapping[str, Any]) -> PaperTable:
     scenes = tuple(entry["scenes"])
 
     def figures(found: Mapping[str, Any]) -> dict[str, PaperFigures]:
@@ -103,7 +103,7 @@ def _parse_table(entry: Mapping[str, Any]) -> PaperTable:
     return PaperTable(entry["title"], tuple(entry["tables"]), entry["loader"], scenes, images, tuple(rows))
 
 
-def budget_overrides(budget: str) -> list[str]:
+def paper_run_budget_overrides(budget: str) -> list[str]:
     """Overrides of a budget: "full", the preset's own steps, or a run's seconds of training as 90s, 10m or 2h.
 
     Raises:
@@ -149,7 +149,7 @@ def plan_paper_runs(
     if not data.is_dir():
         raise ConfigError(f"--data {data}: no such folder")
     folders = {entry.name.casefold(): entry for entry in sorted(data.iterdir()) if entry.is_dir()}
-    common = [*budget_overrides(budget), *words]
+    common = [*paper_run_budget_overrides(budget), *words]
     planned = []
     for table in tables:
         for scene in (s for s in table.scenes if not scenes or s in scenes):
@@ -175,8 +175,8 @@ def measure_starting_pace(planned: PlannedRun, steps: int = 8) -> float:
     """Seconds that a step takes at the start of a run, on this machine; a population that grows makes later ones
     slower."""
     trainer = prepare_training(planned.config).trainer
-    compile_kernels(trainer)
-    with use_one_torch_thread():
+    compile_run_kernels(trainer)
+    with use_one_torch_thread_for_run():
         trainer.train_step()
         begin = time.perf_counter()
         for _ in range(steps):
@@ -184,7 +184,7 @@ def measure_starting_pace(planned: PlannedRun, steps: int = 8) -> float:
         return (time.perf_counter() - begin) / steps
 
 
-def compare_with_paper(
+def compare_run_with_paper(
     planned: PlannedRun, metrics: Mapping[str, Any]
 ) -> Iterator[tuple[str, float | None, float | None, float | None]]:
     """(what, ours, the paper's, that of what the paper puts beside it) of a finished run; None for what is not there.

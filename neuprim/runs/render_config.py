@@ -53,7 +53,7 @@ GROUPS = ("means", "shape", "density", "colour")
 ALL_GROUPS = "all"
 
 
-def _round_trip(value: Tensor, format: str) -> Tensor:
+def _round_trip_run_storage(value: Tensor, format: str) -> Tensor:
     """(N, ...) float32 after storing and reading."""
     if format == "float16":
         return value.half().float()
@@ -64,13 +64,13 @@ def _round_trip(value: Tensor, format: str) -> Tensor:
     return columns.values(columns.codes(flat)).reshape(value.shape).to(value)
 
 
-def _stored_bytes(value: Tensor, format: str) -> int:
+def _run_tensor_storage_bytes(value: Tensor, format: str) -> int:
     if format == "uint8":
         return value.numel() + 8 * math.prod(value.shape[1:])  # every column has two float32 ends
     return (2 if format == "float16" else 4) * value.numel()
 
 
-def _group_parameters(model: Primitives, group: str) -> tuple[str, ...]:
+def _run_storage_parameters(model: Primitives, group: str) -> tuple[str, ...]:
     if group == "means":
         return ("means",)
     if group == "shape":
@@ -78,7 +78,7 @@ def _group_parameters(model: Primitives, group: str) -> tuple[str, ...]:
     return tuple(spec.name for spec in (model.density if group == "density" else model.colour).parameters())
 
 
-def emulate_storage(model: Primitives, storage: Mapping[str, str]) -> Primitives:
+def emulate_run_storage(model: Primitives, storage: Mapping[str, str]) -> Primitives:
     """Return the model after storing groups of parameters in formats; itself if all are float32.
 
     Raises:
@@ -88,38 +88,38 @@ def emulate_storage(model: Primitives, storage: Mapping[str, str]) -> Primitives
         return model
     params = dict(model.params)
     for group, name in storage.items():
-        for parameter in _group_parameters(model, group):
-            params[parameter] = _round_trip(params[parameter].detach(), name)
+        for parameter in _run_storage_parameters(model, group):
+            params[parameter] = _round_trip_run_storage(params[parameter].detach(), name)
             if not bool(torch.isfinite(params[parameter]).all()):
                 raise ConfigError(f"store.{group}={name}: {parameter} has values outside the range of {name}")
     return Primitives(model.density, model.colour, params)
 
 
-def storage_bytes(model: Primitives, storage: Mapping[str, str]) -> int:
+def run_storage_bytes(model: Primitives, storage: Mapping[str, str]) -> int:
     """Return the bytes of the model's tensors, each group in its format."""
     return sum(
-        _stored_bytes(model.params[name], storage.get(group, FLOAT32))
+        _run_tensor_storage_bytes(model.params[name], storage.get(group, FLOAT32))
         for group in GROUPS
-        for name in _group_parameters(model, group)
+        for name in _run_storage_parameters(model, group)
     )
 
 
-def estimate_file_bytes(path: Path, full: Primitives, reduced: Primitives, storage: Mapping[str, str]) -> int:
+def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives, storage: Mapping[str, str]) -> int:
     """Return the bytes of a run's model file if it held ``reduced`` in these formats instead of the ``full`` model.
 
     An unchanged model has its file's own size. Otherwise a compressed file, or one without zeros, counts as tensors.
     """
-    size, after = path.stat().st_size, storage_bytes(reduced, storage)
+    size, after = path.stat().st_size, run_storage_bytes(reduced, storage)
     if not is_compressed(path) and "sparse" not in read_header(path, "model"):
-        return size - storage_bytes(full, {}) + after
-    return size if after == storage_bytes(full, {}) else after
+        return size - run_storage_bytes(full, {}) + after
+    return size if after == run_storage_bytes(full, {}) else after
 
 
 # ---------------------------------------------------------------- render configuration
 
 
 @dataclass(frozen=True)
-class RenderConfig:
+class RunRendering:
     """How to draw a model.
 
     Attributes:
@@ -134,11 +134,15 @@ class RenderConfig:
     storage: Mapping[str, str] = field(default_factory=dict)
 
     def to_overrides(self, defaults: RenderSettings) -> tuple[str, ...]:
-        """Return overrides that :func:`parse_render_config` reads back, over default settings."""
+        """Return overrides that :func:`parse_run_rendering` reads back, over default settings."""
         before = dataclasses.asdict(defaults)
         values = dataclasses.asdict(self.settings)
-        words = [_format_override(f"renderer.{name}", value) for name, value in values.items() if value != before[name]]
-        words += [_format_override("resolution", self.resolution)] if self.resolution != 1.0 else []
+        words = [
+            _format_run_render_override(f"renderer.{name}", value)
+            for name, value in values.items()
+            if value != before[name]
+        ]
+        words += [_format_run_render_override("resolution", self.resolution)] if self.resolution != 1.0 else []
         words += [f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()]
         formats = set(self.storage.values())
         if len(self.storage) == len(GROUPS) and len(formats) == 1 and formats != {FLOAT32}:
@@ -153,7 +157,7 @@ class RenderConfig:
         """
         for (kind, name), value in self.reduced.items():
             model = reduce_model(model, kind, name, value)
-        return emulate_storage(model, self.storage)
+        return emulate_run_storage(model, self.storage)
 
     def scale_view(self, view: View) -> View:
         """Return the view at the resolution to draw."""
@@ -185,7 +189,7 @@ class RenderConfig:
         return self.upsample(frame.rgb.cpu(), view.camera)
 
 
-def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, model: Primitives) -> RenderConfig:
+def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, model: Primitives) -> RunRendering:
     """Parse overrides of the rendering of a model, over default settings.
 
     Raises:
@@ -202,7 +206,7 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
         elif head in KINDS and dot:
             reduced[head, name] = validate_reduction(model.density, model.colour, head, name, assignment.value)
         elif head == "store" and dot:
-            format = _check_storage_format(name, assignment.value)
+            format = _check_run_storage_format(name, assignment.value)
             storage |= dict.fromkeys(GROUPS if name == ALL_GROUPS else [name], format)
         else:
             known = [
@@ -217,10 +221,10 @@ def parse_render_config(overrides: Sequence[str], defaults: RenderSettings, mode
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
     backends.check_backend_name(settings.backend)
     backends.check_backend_device(settings)
-    return RenderConfig(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
+    return RunRendering(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
 
 
-def _check_storage_format(group: str, name: Any) -> str:
+def _check_run_storage_format(group: str, name: Any) -> str:
     if group not in (*GROUPS, ALL_GROUPS):
         raise ConfigError(f"store.{group}: no such group of parameters{nearest(group, (*GROUPS, ALL_GROUPS))}")
     if name not in FORMATS:
@@ -228,7 +232,7 @@ def _check_storage_format(group: str, name: Any) -> str:
     return str(name)
 
 
-def _format_override(key: str, value: Any) -> str:
+def _format_run_render_override(key: str, value: Any) -> str:
     if isinstance(value, str):
         return quote_override(key, value)
     return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value).removesuffix('.0')}"

@@ -24,11 +24,11 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import call_task_facts, call_task_orbit
-from neuprim.runs.exr_layers import ExrLayers
+from neuprim.runs.exr_layers import RunExrLayers
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device
-from neuprim.runs.render_config import parse_render_config
-from neuprim.runs.run_directory import refuse_results
+from neuprim.runs.render_config import parse_run_rendering
+from neuprim.runs.run_directory import refuse_run_results
 
 SPACES = WORLD, SCENE = ("world", "scene")
 """Whose coordinates a file of cameras has, after ``--space``."""
@@ -102,7 +102,7 @@ def render_run(
     session = _RenderSession(run, request, notify, progress)
     targets = session.choose_targets()
     if not request.overwrite:
-        refuse_results(run.directory, targets)
+        refuse_run_results(run.directory, targets)
     for target in targets:
         target.parent.mkdir(parents=True, exist_ok=True)
     if session.animate:
@@ -126,13 +126,13 @@ class _RenderSession:
         channels, in_world = run.model.colour.channels, request.space == WORLD
         self.world = run.world if in_world else World()
         self.task = run.task if in_world else run.scene_task
-        self.render_config = parse_render_config(request.overrides, run.config.renderer, run.model)
+        self.render_config = parse_run_rendering(request.overrides, run.config.renderer, run.model)
         self.background = torch.tensor([float(x) for x in run.header.get("background", [0.0] * channels)])
         self.channels = read_stored_channels(run.directory, run.header, self.task, channels)
         self.lights = self._load_lights(request.environment)
         self.views, self.fps = self._load_views()
         with run.plugins.attribute_errors():
-            self.views, animated = set_view_conditions(self.views, self.task, request.conditions, notify)
+            self.views, animated = set_run_view_conditions(self.views, self.task, request.conditions, notify)
             model = self.render_config.prepare_model(run.model)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
         suffix = "" if request.out is None else request.out.suffix.lower().removeprefix(".")
@@ -142,9 +142,9 @@ class _RenderSession:
         for option, value in (("--layers", request.layers), ("--datatype", request.datatype)):
             if value is not None and self.format != "exr":
                 raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
-        self.layers: ExrLayers | None = None
+        self.layers: RunExrLayers | None = None
         if self.format == "exr":
-            self.layers = ExrLayers(
+            self.layers = RunExrLayers(
                 run.directory,
                 self.task,
                 self.channels,
@@ -202,7 +202,7 @@ class _RenderSession:
             file = read_camera_file(Path(request.camera), request.size)
             for note in file.notes:
                 self.notify(f"{request.camera}: {note}")
-            views, fps = _camera_file_views(file, self.task, request.conditions), fps or file.fps
+            views, fps = _run_views_of_camera_file(file, self.task, request.conditions), fps or file.fps
             views = [replace(view, camera=self.world.scene_camera(view.camera)) for view in views]
         else:
             dataset = load_dataset(self.run)
@@ -243,7 +243,7 @@ class _RenderSession:
     def write_images(self, paths: Sequence[Path]) -> None:
         for view, path in zip(self.views, paths, strict=True):
             if self.layers is None:
-                _write_image(path, self.format, self._render_pixels(view), self.channels, self.fps)
+                _write_run_image(path, self.format, self._render_pixels(view), self.channels, self.fps)
             else:
                 with self.run.plugins.attribute_errors():
                     self.layers.write(path, self.model, view, self._count_pass)
@@ -280,7 +280,7 @@ class _RenderSession:
         empty = [view for view, visible in zip(self.views, self._visible, strict=True) if not visible]
         if not empty:
             return
-        where = _describe_position(self.model, empty[0], self.world)
+        where = _describe_run_model_position(self.model, empty[0], self.world)
         if len(empty) < len(self.views):
             self.notify(f"warning: {len(empty)} of {len(self.views)} images are empty, first {empty[0].name}: {where}")
             return
@@ -289,7 +289,7 @@ class _RenderSession:
         raise DataError(f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}{hint}")
 
 
-def _describe_position(model: Primitives, view: View, world: World) -> str:
+def _describe_run_model_position(model: Primitives, view: View, world: World) -> str:
     """Describe where the model is, and where a camera looks that does not see it."""
     with torch.no_grad():
         geometry, _ = model.lower_density(view.conditions)
@@ -303,7 +303,7 @@ def _describe_position(model: Primitives, view: View, world: World) -> str:
     return f"the model is within {start} to {end}, and {view.name} at {at} looks towards {towards}"
 
 
-def _write_image(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
+def _write_run_image(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
     """Write one image: all channels as the data set has them in npy, or what its channels look like."""
     if format == "npy":
         write_npy(path, pixels.contiguous().numpy())
@@ -313,7 +313,7 @@ def _write_image(path: Path, format: str, pixels: torch.Tensor, channels: Channe
         write_animation(path, [channels.display(pixels)], fps or 12.0)
 
 
-def _camera_file_views(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
+def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
     """A view per camera; each at its own time where the file has times, the task has one, and the user gave no
     other."""
     has_time = any(spec.name == "time" and not spec.shape for spec in task.conditions)
@@ -322,7 +322,7 @@ def _camera_file_views(file: CameraViews, task: TaskSpec, conditions: Mapping[st
     return [View(name, camera, time) for (name, camera), time in zip(file.named, times, strict=True)]
 
 
-def set_view_conditions(
+def set_run_view_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
     """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along

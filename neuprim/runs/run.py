@@ -26,14 +26,14 @@ from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.finetune import count_finetune_steps, make_finetune_trainer
-from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_event, is_chunked, refuse_chunks
-from neuprim.runs.ground_truth import render_ground_truth_for_training
+from neuprim.runs.finetune import count_run_finetune_steps, make_run_finetune_trainer
+from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_run_event, is_chunked, refuse_chunks
+from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.jobs import ENDED, JobStatus
 from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
-from neuprim.runs.open import make_scene_context, model_file, read_metrics
-from neuprim.runs.run_directory import lock_directory
-from neuprim.runs.training import BetweenSteps, do_nothing_between, train_in_directory
+from neuprim.runs.open import make_run_scene_context, model_file, read_metrics
+from neuprim.runs.run_directory import lock_run_directory
+from neuprim.runs.training import BetweenSteps, do_nothing_between_run_steps, train_in_directory
 
 CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
 """In a run's directory: the record, and the runs of the chunks."""
@@ -52,8 +52,8 @@ class ChunksMissing(NeuprimError):
 
 def run(
     config: RunConfig,
-    events: Events = ignore_event,
-    between: BetweenSteps = do_nothing_between,
+    events: Events = ignore_run_event,
+    between: BetweenSteps = do_nothing_between_run_steps,
     group: ProcessGroup | None = None,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Path:
@@ -77,7 +77,7 @@ def run(
     first = group is None or group.is_first
     if group is not None:
         refuse_chunks(config, "several ranks train one model together")
-    with lock_directory(directory) if first else nullcontext(), find_run_plugins(config).attribute_errors():
+    with lock_run_directory(directory) if first else nullcontext(), find_run_plugins(config).attribute_errors():
         if is_chunked(config):
             fitted, interrupted = train_in_chunks(config, events, launcher, between)
         else:
@@ -121,7 +121,7 @@ def _load_chunks(config: RunConfig, events: Events) -> Chunks | None:
     job = Job.of(config)
     load = job.scene.spec.chunks
     assert load is not None, "the caller asked for chunks"
-    context = make_scene_context(config, lambda text, fraction: events(Preparing(text, fraction)))
+    context = make_run_scene_context(config, lambda text, fraction: events(Preparing(text, fraction)))
     with attribute_errors(job.plugins.scene, "chunks"):
         return load(config.to_dict(), context)
 
@@ -138,7 +138,9 @@ def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
         raise ConfigError(
             f"model.primitives={config.model.primitives}: expected at least {least} for {len(chunks.parts)} chunks"
         )
-    counts = _divide_primitives(config.model.primitives - least, [part.primitives for part in chunks.parts])
+    counts = _divide_primitives_among_chunks(
+        config.model.primitives - least, [part.primitives for part in chunks.parts]
+    )
     configs, runs = [], []
     for part, count in zip(chunks.parts, counts, strict=True):
         share = (1 - JOINT_SHARE) * part.steps
@@ -152,20 +154,20 @@ def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
         if train.max_seconds is not None:
             settings["train.max_seconds"] = share * train.max_seconds
         words = tuple(quote_override(key, value) for key, value in settings.items())
-        configs.append(_override_config(config, settings, words, config.output_dir / CHUNKS_FOLDER / part.name))
+        configs.append(_override_chunk_config(config, settings, words, config.output_dir / CHUNKS_FOLDER / part.name))
         runs.append(LaunchedRun(part.name, words))
     steps = None if train.iterations is None else round(JOINT_SHARE * train.iterations)
     seconds = None if train.max_seconds is None else JOINT_SHARE * train.max_seconds
     return ChunkPlan(chunks, tuple(configs), tuple(runs), steps, seconds)
 
 
-def _divide_primitives(total: int, shares: list[float]) -> list[int]:
+def _divide_primitives_among_chunks(total: int, shares: list[float]) -> list[int]:
     """Whole numbers close to these shares of ``total`` that add up to it."""
     ends = [round(total * sum(shares[: n + 1]) / sum(shares)) for n in range(len(shares))]
     return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
 
 
-def _override_config(
+def _override_chunk_config(
     config: RunConfig, settings: Mapping[str, Any], words: tuple[str, ...], directory: Path
 ) -> RunConfig:
     """A configuration with other settings, by dotted key, as if these words had been typed."""
@@ -192,9 +194,9 @@ def read_chunk_record(folder: Path) -> LaunchRecord | None:
 
 def train_in_chunks(
     config: RunConfig,
-    events: Events = ignore_event,
+    events: Events = ignore_run_event,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
-    between: BetweenSteps = do_nothing_between,
+    between: BetweenSteps = do_nothing_between_run_steps,
 ) -> tuple[Fitted, bool]:
     """Fit the chunks that ``scene.chunks`` asks for, join them and train what they make together; as
     :func:`~neuprim.runs.training.train_in_directory`, where ``auto`` finds one run better.
@@ -210,7 +212,7 @@ def train_in_chunks(
         NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run
         was begun with.
     """
-    render_ground_truth_for_training(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
+    render_ground_truth_before_run(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
     chunks = _load_chunks(config, events)
     if chunks is None:
         events(Note(f"scene.chunks={config.scene['chunks']}: fitted as one run"))
@@ -227,9 +229,11 @@ def train_in_chunks(
         steps = record.joined_steps
         if steps is None:
             assert plan.seconds is not None, "a budget is in steps, in seconds or both"
-            steps = min(count_finetune_steps(plan.seconds, job, dataset, model), plan.steps or 2**62)
+            steps = min(count_run_finetune_steps(plan.seconds, job, dataset, model), plan.steps or 2**62)
             replace(record, joined_steps=steps).write()
-        trainer = make_finetune_trainer(job, dataset, model, max(steps, 1), 1 - JOINT_SHARE, config.train.voxels_every)
+        trainer = make_run_finetune_trainer(
+            job, dataset, model, max(steps, 1), 1 - JOINT_SHARE, config.train.voxels_every
+        )
         trainer.elapsed = sum(float(read_metrics(own.output_dir)["train_seconds"]) for own in plan.configs)
         return trainer
 

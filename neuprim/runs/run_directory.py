@@ -22,7 +22,7 @@ LOCK_FILE = ".lock"
 
 
 @contextmanager
-def lock_directory(directory: Path, what: str = "run") -> Iterator[None]:
+def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
     """Lock a directory, so that one process at a time works in it. It is made if it is missing, and removed again if it
     is left empty.
 
@@ -92,7 +92,7 @@ def discard_results(run_dir: Path) -> None:
         path.unlink(missing_ok=True)
 
 
-def refuse_results(run_dir: Path, targets: Iterable[Path]) -> None:
+def refuse_run_results(run_dir: Path, targets: Iterable[Path]) -> None:
     """Raise ConfigError if a command would write over one of them."""
     own = {path.resolve() for path in result_files(run_dir)}
     for target in targets:

@@ -21,7 +21,7 @@ from neuprim.report.sweep_page import SweepRun, write_sweep_page
 from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.launch.launcher import OnStatus, ignore_status
 from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
-from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.run_directory import lock_run_directory
 
 SWEEP_FILE = "sweep.json"
 """In a sweep's directory."""
@@ -85,12 +85,15 @@ def write_sweep_csv(path: Path, runs: Sequence[SweepRun]) -> None:
     writer.writerow(["run", *keys, "state", "error", "attempts", "seconds", *metrics, "path"])
     for run in runs:
         numbers = run.numbers
-        swept, values = (run.swept.get(key, "") for key in keys), (_csv_number(numbers.get(name)) for name in metrics)
+        swept, values = (
+            (run.swept.get(key, "") for key in keys),
+            (_sweep_csv_number(numbers.get(name)) for name in metrics),
+        )
         writer.writerow([run.name, *swept, run.state, run.line, run.attempts, f"{run.seconds:.3f}", *values, run.name])
     write_text(path, buffer.getvalue())
 
 
-def _csv_number(value: float | None) -> str:
+def _sweep_csv_number(value: float | None) -> str:
     """With every digit, and whole numbers as such."""
     return "" if value is None else str(int(value)) if value.is_integer() else repr(value)
 
@@ -125,7 +128,7 @@ def run_sweep(
         runs.append(LaunchedRun(config.output_dir.name, own, swept))
     record = LaunchRecord(folder / SWEEP_FILE, tuple(drop_output_overrides(words)), tuple(runs))
     record = record.resume(read_sweep(folder) if configs[0].resume else None, more=True)
-    with lock_directory(folder, "sweep"):
+    with lock_run_directory(folder, "sweep"):
         record, results = launch_missing_runs(record, configs, settings, on_status)
         rows = read_sweep_runs(record)
         write_sweep_csv(folder / "sweep.csv", rows)

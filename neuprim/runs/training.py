@@ -32,13 +32,13 @@ from neuprim.runs.fit import (
     Fitted,
     Note,
     TrainerFactory,
-    compile_kernels,
-    ignore_event,
+    compile_run_kernels,
+    ignore_run_event,
     prepare_training,
-    train_steps,
-    use_one_torch_thread,
+    train_run_steps,
+    use_one_torch_thread_for_run,
 )
-from neuprim.runs.launch.worker import interruptible
+from neuprim.runs.launch.worker import interruptible_run
 from neuprim.runs.run_directory import discard_results
 
 CURVE_FILE = "metrics.jsonl"
@@ -48,16 +48,16 @@ BetweenSteps = Callable[[Fitted, threading.Event], None]
 ends the training as Ctrl-C does. It may read the state, save it and wait, and must not change it."""
 
 
-def do_nothing_between(fitted: Fitted, stop: threading.Event) -> None:
+def do_nothing_between_run_steps(fitted: Fitted, stop: threading.Event) -> None:
     """Do nothing."""
 
 
 def train_in_directory(
     config: RunConfig,
-    events: Events = ignore_event,
+    events: Events = ignore_run_event,
     dataset: Dataset | None = None,
     hold_out: int = 0,
-    between: BetweenSteps = do_nothing_between,
+    between: BetweenSteps = do_nothing_between_run_steps,
     group: ProcessGroup | None = None,
     make: TrainerFactory | None = None,
 ) -> tuple[Fitted, bool]:
@@ -84,10 +84,10 @@ def train_in_directory(
             if config.resume and not trainer.finished:
                 discard_results(config.output_dir)
             write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
-        compile_kernels(trainer, events)
+        compile_run_kernels(trainer, events)
     if isinstance(trainer, DistributedTrainer):
         trainer.check_same_start()
-    return fitted, _train_and_save(fitted, events, between) if trainer.rank == 0 else _train_as_follower(trainer)
+    return fitted, _train_and_save(fitted, events, between) if trainer.rank == 0 else _train_run_as_follower(trainer)
 
 
 def _resume_training(fitted: Fitted, events: Events) -> None:
@@ -114,13 +114,13 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
     """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
     trainer, config = fitted.trainer, fitted.config
     curve, saved = config.output_dir / CURVE_FILE, config.output_dir / "checkpoint.safetensors"
-    cut_curve(curve, trainer.step)
+    cut_run_curve(curve, trainer.step)
     last_saved, interrupted = time.monotonic(), False
     try:
-        with interruptible(terminated=trainer.ranks > 1) as stop, use_one_torch_thread():
+        with interruptible_run(terminated=trainer.ranks > 1) as stop, use_one_torch_thread_for_run():
             trainer.stop_requested = stop.is_set
             between(fitted, stop)
-            for report, held_out in train_steps(trainer, events):
+            for report, held_out in train_run_steps(trainer, events):
                 line: dict[str, Any] = {}
                 if held_out is not None:
                     line["eval_psnr"] = held_out
@@ -129,32 +129,32 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
                 if line or report.step % config.train.log_every == 0 or trainer.finished:
                     line = {"step": report.step, "seconds": round(report.seconds, 4), "loss": report.loss,
                         **report.parts, "psnr": report.psnr, "primitives": report.primitives, **line}  # fmt: skip
-                    with _warn_of_full_disk(fitted, curve):
-                        add_curve_line(curve, json.dumps(line) + "\n")
+                    with _warn_of_unwritable_run_file(fitted, curve):
+                        add_run_curve_line(curve, json.dumps(line) + "\n")
                 if time.monotonic() - last_saved > config.train.checkpoint_every_seconds:
-                    with _warn_of_full_disk(fitted, saved):
-                        save_training(fitted)
+                    with _warn_of_unwritable_run_file(fitted, saved):
+                        save_run_training(fitted)
                     last_saved = time.monotonic()
                 between(fitted, stop)
                 if trainer.stopping:
                     interrupted = True
                     break
     except RankError:  # the state is that of the last whole step
-        save_training(fitted)
+        save_run_training(fitted)
         raise
-    save_training(fitted)
+    save_run_training(fitted)
     return interrupted
 
 
-def _train_as_follower(trainer: Trainer) -> bool:
+def _train_run_as_follower(trainer: Trainer) -> bool:
     """Train on a rank that writes nothing; returns whether the training was interrupted."""
-    with interruptible(terminated=True) as stop, use_one_torch_thread():
+    with interruptible_run(terminated=True) as stop, use_one_torch_thread_for_run():
         trainer.stop_requested = stop.is_set
-        return any(trainer.stopping for _ in train_steps(trainer))
+        return any(trainer.stopping for _ in train_run_steps(trainer))
 
 
 @contextmanager
-def _warn_of_full_disk(fitted: Fitted, file: Path) -> Iterator[None]:
+def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
     """Warn once of a file that cannot be written during the training, as on a full disk. Only at the end it is an
     error."""
     try:
@@ -164,7 +164,7 @@ def _warn_of_full_disk(fitted: Fitted, file: Path) -> Iterator[None]:
         warn_once(f"{reason}; training goes on from step {fitted.trainer.step} to the next checkpoint")
 
 
-def cut_curve(path: Path, step: int) -> None:
+def cut_run_curve(path: Path, step: int) -> None:
     """Cut ``metrics.jsonl`` back to the lines up to a checkpoint's step; without lines it is empty."""
     kept = []
     if step and path.exists():
@@ -177,7 +177,7 @@ def cut_curve(path: Path, step: int) -> None:
     write_text(path, "".join(f"{text}\n" for text in kept))
 
 
-def add_curve_line(path: Path, line: str) -> None:
+def add_run_curve_line(path: Path, line: str) -> None:
     """Add a line whole or not at all. Raises OSError; the lines before it are intact."""
     with open(path, "ab", buffering=0) as file:
         data, end = line.encode(), os.fstat(file.fileno()).st_size
@@ -189,7 +189,7 @@ def add_curve_line(path: Path, line: str) -> None:
             raise
 
 
-def save_training(fitted: Fitted) -> None:
+def save_run_training(fitted: Fitted) -> None:
     """Write checkpoint and model into the run's directory."""
     trainer, config, dataset = fitted.trainer, fitted.config, fitted.dataset
     tensors, header = trainer.state()

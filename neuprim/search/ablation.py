@@ -27,13 +27,13 @@ from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.validation import validate
-from neuprim.runs.fit import use_one_torch_thread
-from neuprim.runs.ground_truth import render_ground_truth_for_training
+from neuprim.runs.fit import use_one_torch_thread_for_run
+from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.executors import count_parallel_jobs
-from neuprim.runs.launch.launcher import use_launcher_threads
+from neuprim.runs.launch.launcher import use_launcher_threads_for_runs
 from neuprim.runs.open import load_dataset
-from neuprim.runs.render_config import RenderConfig
-from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.render_config import RunRendering
+from neuprim.runs.run_directory import lock_run_directory
 from neuprim.search.ablation_plan import (
     CENTRE,
     AblationPlan,
@@ -99,15 +99,15 @@ def run_ablation(
     """
     models = _compose_model_set(request.words, seeds, launcher)
     folder, centre, task = models.folder, models.centre, load_run_task(models.centre)
-    with use_one_torch_thread(), use_launcher_threads(launcher), ExitStack() as stack:
+    with use_one_torch_thread_for_run(), use_launcher_threads_for_runs(launcher), ExitStack() as stack:
         stack.enter_context(find_run_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)
         check_knobs(request, variants, f"a model of task {task.name!r}")
         before = read_tradeoff_record(folder / TRADEOFF_FILE)
         _check_set_folder(models, before)
-        stack.enter_context(lock_directory(folder, "set"))
+        stack.enter_context(lock_run_directory(folder, "set"))
         plan = None if before is None else _parse_plan(folder / TRADEOFF_FILE, before)
-        render_ground_truth_for_training(centre, launcher, progress)
+        render_ground_truth_before_run(centre, launcher, progress)
         dataset = load_dataset(Job(centre, task), progress)
         check_dataset(dataset, task.conditions)
         views = eval_views(dataset, request.views)
@@ -295,7 +295,7 @@ class _AblationSession(TradeoffSession):
             self._setups[run_dir] = load_setup(path, (), views, self.request.lpips, self._loaded)
         return self._setups[run_dir]
 
-    def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
+    def point_setup(self, number: int) -> tuple[EvaluationSetup, RunRendering]:
         setup = self._setup(self.record.points[number].run_dir)
         return setup, setup.reference
 

@@ -17,7 +17,7 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
 from neuprim.plugins.returns import call_task_tunable_settings
-from neuprim.runs.fit import compile_kernels, prepare_training, use_one_torch_thread
+from neuprim.runs.fit import compile_run_kernels, prepare_training, use_one_torch_thread_for_run
 from neuprim.search.pareto import FrontStep, combine_front_steps
 from neuprim.search.tradeoff_record import COMBINED, TradeoffPoint, name_variant
 from neuprim.search.trials import get_setting
@@ -155,7 +155,7 @@ class StepTimes:
         config = replace(config, train=replace(config.train, population=population))
         trainer = prepare_training(config, dataset=self.dataset).trainer
         begun = time.perf_counter()
-        compile_kernels(trainer)
+        compile_run_kernels(trainer)
         self.compiling += time.perf_counter() - begun
         settings = trainer.settings
         trainer.step, trainer.elapsed = (settings.iterations or 0) // 2, (settings.max_seconds or 0.0) / 2
@@ -164,7 +164,7 @@ class StepTimes:
     def _run_turns(self, trainer: Trainer) -> tuple[float, float]:
         """Return the seconds of a trainer, and of the centre in the same turns."""
         total = [0.0, 0.0]
-        with use_one_torch_thread():
+        with use_one_torch_thread_for_run():
             for turn in range(_TURNS + 1):
                 for i, one in enumerate((trainer, self._centre)):
                     begun = time.perf_counter()

@@ -15,8 +15,8 @@ from neuprim.core.data.dataset_check import check_dataset
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.finetune import count_finetune_steps
-from neuprim.runs.fit import use_one_torch_thread
+from neuprim.runs.finetune import count_run_finetune_steps
+from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, load_run
 from neuprim.search.quantized_finetune import (
@@ -129,7 +129,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
                 notes.append(f"no training views decide the bits; they are of --level {DEFAULT_LEVEL}")
         start = time.perf_counter()
         if dataset is not None and (request.trains or not request.by_level):
-            with use_one_torch_thread():
+            with use_one_torch_thread_for_run():
                 quantized = _quantize(request, TrainingData(config, task, dataset), model, table, progress)
             stored, coding, steps = quantized.model, quantized.quantizers, quantized.steps
             notes += quantized.notes
@@ -156,7 +156,7 @@ def _quantize(
 ) -> QuantizedModel:
     steps = request.steps
     if steps is None:
-        steps = count_finetune_steps(request.seconds, Job(data.config, data.task), data.dataset, model)
+        steps = count_run_finetune_steps(request.seconds, Job(data.config, data.task), data.dataset, model)
     if request.by_level:
         return finetune_for_table(data, model, table, steps, progress)
     tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance

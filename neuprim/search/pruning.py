@@ -20,11 +20,11 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.finetune import count_finetune_steps, make_finetune_trainer
-from neuprim.runs.fit import Fitted, keep_model_settings, make_loss, use_one_torch_thread
+from neuprim.runs.finetune import count_run_finetune_steps, make_run_finetune_trainer
+from neuprim.runs.fit import Fitted, drop_unused_run_rates, make_run_loss, use_one_torch_thread_for_run
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import PRUNED, kept_shares, load_dataset, load_run, model_file, move_to_render_device
-from neuprim.runs.training import save_training
+from neuprim.runs.training import save_run_training
 from neuprim.search.model_quality import TrainingQuality, eval_views, measure_eval_views
 from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
 
@@ -212,7 +212,7 @@ class ModelShrinker:
         """Return the state after a round of fine-tuning."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
-            trainer = make_finetune_trainer(Job(self.config, self.task), self.dataset, model, steps)
+            trainer = make_run_finetune_trainer(Job(self.config, self.task), self.dataset, model, steps)
             trainer.zero_masks, left = zero_masks(trainer.model), state.numbers
             for done in range(steps):
                 trainer.train_step()
@@ -287,7 +287,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
     refuse_existing(final, request.overwrite)
     run = load_run(request.run_dir)
     config, task, model, header = replace(run.config, output_dir=request.run_dir), run.task, run.model, run.header
-    with run.plugins.attribute_errors(), use_one_torch_thread():
+    with run.plugins.attribute_errors(), use_one_torch_thread_for_run():
         progress("reading the run's data", 0.0)
         dataset = load_dataset(run)
         check_dataset(dataset, task.conditions)
@@ -295,7 +295,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
         begun, steps = time.monotonic(), request.steps
         if steps is None:
-            steps = count_finetune_steps(request.seconds, Job(config, task), dataset, model)
+            steps = count_run_finetune_steps(request.seconds, Job(config, task), dataset, model)
         shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
         small, words = shrinker.shrink(model)
         seconds = time.monotonic() - begun
@@ -312,7 +312,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
         fitted.trainer.elapsed = float(header.get("train_seconds") or 0.0) + seconds
         final.mkdir(parents=True, exist_ok=True)
         write_text(final / "config.yaml", fitted.config.to_yaml())
-        save_training(fitted)
+        save_run_training(fitted)
         metrics = evaluate_fitted(fitted, final)
         measured = metrics["psnr"], metrics["ssim"]
         after = _measure_pruned(small, final / "model.safetensors", measured, config, dataset)
@@ -346,7 +346,7 @@ def _fit_pruned(
         model=replace(config.model, primitives=model.count, reduced=reduced),
         overrides=[*(word for word in config.overrides if not word.startswith(replaced)), *own],
     )
-    settings = keep_model_settings(config.train, task, model)
-    trainer = Trainer(model, dataset, make_loss(Job(config, task)), settings, config.renderer, config.seed)
+    settings = drop_unused_run_rates(config.train, task, model)
+    trainer = Trainer(model, dataset, make_run_loss(Job(config, task)), settings, config.renderer, config.seed)
     trainer.zero_masks = zero_masks(trainer.model)
     return Fitted(config, task, dataset, find_channels(task, dataset), trainer)

@@ -20,7 +20,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
-from neuprim.runs.finetune import make_finetune_trainer
+from neuprim.runs.finetune import make_run_finetune_trainer
 from neuprim.search.model_quality import TrainingQuality
 from neuprim.search.pruning_cuts import zero_masks
 
@@ -175,7 +175,7 @@ def _error_share(decibels: float) -> float:
 
 def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
     """Train a canonical model, rendering every image from quantized numbers."""
-    trainer = make_finetune_trainer(Job(data.config, data.task), data.dataset, model, steps)
+    trainer = make_run_finetune_trainer(Job(data.config, data.task), data.dataset, model, steps)
     trainer.zero_masks = zero_masks(trainer.model)
     on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}
     trainer.fake_quantize = lambda params: fake_quantize(params, on_device)

@@ -19,8 +19,8 @@ from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
-from neuprim.runs.fit import use_one_torch_thread
-from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
+from neuprim.runs.fit import use_one_torch_thread_for_run
+from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RunRendering
 from neuprim.search.pareto import FrontStep, combine_front_steps
 from neuprim.search.tradeoff_measuring import (
     EvaluationSetup,
@@ -67,7 +67,7 @@ _VALUES: dict[str, tuple[Any, ...]] = {
 """Settings of the renderer and their values."""
 
 
-def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
+def list_render_knobs(reference: RunRendering, model: Primitives) -> dict[str, list[RunRendering]]:
     """Return knob -> the configurations that change it alone; reductions of fields are density.NAME and colour.NAME."""
     cores, compared = core_count(), [name for name in backends.backend_names() if name != backends.REFERENCE]
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
@@ -106,7 +106,7 @@ def measure_tradeoff(
     knobs = list_render_knobs(setup.reference, setup.model)
     check_knobs(request, knobs, "this run")
     record = _resume_render_tradeoff(folder / TRADEOFF_FILE, _render_identity(setup), tell)
-    with find_run_plugins(setup.config).attribute_errors(), use_one_torch_thread():
+    with find_run_plugins(setup.config).attribute_errors(), use_one_torch_thread_for_run():
         if (reason := setup.unsupported(setup.reference)) is not None:
             raise ConfigError(reason)
         record.facts |= {**describe_setup(setup), "primitives": setup.model.count}
@@ -134,7 +134,7 @@ class _RenderSession(TradeoffSession):
         super().__init__(folder, request, record, progress)
         self.setup = setup
 
-    def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
+    def point_setup(self, number: int) -> tuple[EvaluationSetup, RunRendering]:
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     @cached_property
@@ -143,7 +143,7 @@ class _RenderSession(TradeoffSession):
         self.progress("exact images", 0.0)
         return self.render_exact(self.setup, _EXACT)
 
-    def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
+    def single_changes(self, knobs: Mapping[str, list[RunRendering]]) -> Iterator[tuple[str, RunRendering]]:
         """Yield what can be drawn here and differs; the record says what is left out."""
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
@@ -154,7 +154,7 @@ class _RenderSession(TradeoffSession):
                 elif name != "backend" or self.setup.backend(config).name != base:
                     yield name, config
 
-    def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
+    def measure(self, wanted: Sequence[tuple[str, RunRendering]], part: float) -> None:
         """Measure images and bytes of the configurations that the record lacks."""
         for number, (knob, config) in enumerate(wanted):
             words, points = self.setup.overrides(config), self.record.points
@@ -179,7 +179,7 @@ class _RenderSession(TradeoffSession):
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 
-    def combinations(self) -> list[RenderConfig]:
+    def combinations(self) -> list[RunRendering]:
         """Return earlier and new combinations of single changes, for time and for bytes."""
         base, *others = self.record.points
         faster, smaller, known = [], [], []

@@ -27,12 +27,12 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.fit import Events, Finishing, Preparing, compile_kernels, ignore_event, prepare_training
-from neuprim.runs.ground_truth import render_ground_truth_for_training
-from neuprim.runs.launch.launcher import use_launcher_threads
+from neuprim.runs.fit import Events, Finishing, Preparing, compile_run_kernels, ignore_run_event, prepare_training
+from neuprim.runs.ground_truth import render_ground_truth_before_run
+from neuprim.runs.launch.launcher import use_launcher_threads_for_runs
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device
-from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.run_directory import lock_run_directory
 from neuprim.runs.training import train_in_directory
 from neuprim.search.model_quality import TrainingQuality, eval_views, measure_eval_views
 from neuprim.search.pruning import PruneRequest, prune_run
@@ -57,7 +57,7 @@ def run_target(
     config: RunConfig,
     target: Target,
     budget: float,
-    events: Events = ignore_event,
+    events: Events = ignore_run_event,
     clock: Callable[[], float] = time.monotonic,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> TargetRecord:
@@ -78,17 +78,17 @@ def run_target(
     if record.achieved:
         return record
     plugins, begun, task, folder = find_run_plugins(config), clock(), load_run_task(config), config.output_dir
-    with lock_directory(folder, "search"), plugins.attribute_errors(), use_launcher_threads(launcher):
+    with lock_run_directory(folder, "search"), plugins.attribute_errors(), use_launcher_threads_for_runs(launcher):
 
         def show_progress(text: str, fraction: float) -> None:
             events(Preparing(text, fraction))
 
-        render_ground_truth_for_training(config, launcher, show_progress)
+        render_ground_truth_before_run(config, launcher, show_progress)
         dataset = load_dataset(Job(config, task), show_progress)
         check_dataset(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
         loaded = clock()
-        compile_kernels(prepare_training(config, dataset=dataset).trainer, events)
+        compile_run_kernels(prepare_training(config, dataset=dataset).trainer, events)
         begun += clock() - loaded
         runner = TrialRunner(config, dataset, record, events, clock, launcher, begun - record.spent)
         try:

@@ -27,7 +27,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.report.tradeoff_page import TradeoffPicture, write_tradeoff_page
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
-from neuprim.runs.render_config import RenderConfig, estimate_file_bytes, parse_render_config
+from neuprim.runs.render_config import RunRendering, estimate_run_file_bytes, parse_run_rendering
 from neuprim.search.model_quality import EvalView, eval_views, fill_masked
 from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord, write_tradeoff_csv
 from neuprim.version import __version__
@@ -52,20 +52,20 @@ class EvaluationSetup:
     model: Primitives
     dataset: Dataset
     channels: Channels
-    reference: RenderConfig
+    reference: RunRendering
     views: list[EvalView]
     file: Path
     lpips: Lpips | None = None
     _prepared: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
-    def overrides(self, config: RenderConfig) -> tuple[str, ...]:
+    def overrides(self, config: RunRendering) -> tuple[str, ...]:
         """Return what reproduces a configuration with ``neuprim render``."""
         return config.to_overrides(self.config.renderer)
 
-    def parse(self, overrides: Sequence[str]) -> RenderConfig:
-        return parse_render_config(overrides, self.config.renderer, self.model)
+    def parse(self, overrides: Sequence[str]) -> RunRendering:
+        return parse_run_rendering(overrides, self.config.renderer, self.model)
 
-    def prepare_model(self, config: RenderConfig) -> Primitives:
+    def prepare_model(self, config: RunRendering) -> Primitives:
         """Return the model as a configuration draws it, on its device; recent ones are cached."""
         changes = (tuple(config.reduced.items()), tuple(config.storage.items()))
         key = (*changes, config.settings.backend, config.settings.device)
@@ -77,13 +77,13 @@ class EvaluationSetup:
             self._prepared[key] = model
         return self._prepared[key]
 
-    def backend(self, config: RenderConfig) -> backends.Backend:
+    def backend(self, config: RunRendering) -> backends.Backend:
         """Return the backend that draws a configuration."""
         model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
         lowered = model.lower(view.camera, view.conditions, shaded=False)
         return backends.choose_backend(lowered, config.settings, view.camera)
 
-    def unsupported(self, config: RenderConfig) -> str | None:
+    def unsupported(self, config: RunRendering) -> str | None:
         """Return why a configuration cannot be drawn here; None if it can."""
         try:
             backends.check_backend_device(config.settings)
@@ -92,7 +92,7 @@ class EvaluationSetup:
             return str(error)
         return None
 
-    def renderer(self, config: RenderConfig) -> Renderer:
+    def renderer(self, config: RunRendering) -> Renderer:
         """Return what draws views of a configuration, with its model prepared."""
         model = self.prepare_model(config)
         return lambda view: config.render_view(model, view, self.dataset.background)
@@ -122,7 +122,7 @@ def load_setup(
     """
     run = load_run(run_dir)
     config, task, model = run.config, run.task, run.model
-    reference = parse_render_config(overrides, config.renderer, model)
+    reference = parse_run_rendering(overrides, config.renderer, model)
     weights = lpips or config.metrics.lpips
     distance = None if weights is None else Lpips.load(weights)
     if loaded is None:
@@ -200,7 +200,7 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
         float64: whether to use the reference backend, where that is decided already.
     """
     settings = replace(setup.reference.settings, alpha_min=0.0, transmittance_min=0.0)
-    oracle = RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
+    oracle = RunRendering(replace(settings, backend=backends.REFERENCE, device="auto"))
     model, view, background = setup.model, setup.views[0].view, setup.dataset.background.double()
     params = {name: value.detach().double() for name, value in model.params.items()}
     double = Primitives(model.density, model.colour, params)
@@ -215,7 +215,7 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
     if float64 or (float64 is None and expected * len(setup.views) <= allowed):
         images = [oracle.render_view(double, v.view, background) for v in setup.views]
         return ExactImages(images, True, None, size)
-    draw = setup.renderer(RenderConfig(settings))
+    draw = setup.renderer(RunRendering(settings))
     images = [draw(v.view).double() for v in setup.views]
     return ExactImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size)
 
@@ -223,7 +223,7 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
 # ---------------------------------------------------------------- one point
 
 
-def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact: ExactImages) -> TradeoffPoint:
+def measure_point(setup: EvaluationSetup, knob: str, config: RunRendering, exact: ExactImages) -> TradeoffPoint:
     """Measure images and size of a configuration.
 
     Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
@@ -245,7 +245,7 @@ def measure_point(setup: EvaluationSetup, knob: str, config: RenderConfig, exact
     error = quality.pop("mse_exact")
     exactness = -10.0 * math.log10(error) if error > 0 else math.inf
     quality["psnr_exact"] = exactness if exact.error is None else min(exactness, exact.error)
-    size = estimate_file_bytes(setup.file, setup.model, model, config.storage)
+    size = estimate_run_file_bytes(setup.file, setup.model, model, config.storage)
     return TradeoffPoint(knob, setup.overrides(config), quality, size)
 
 
@@ -343,7 +343,7 @@ class TradeoffSession:
         self.folder, self.request, self.record, self.progress = folder, request, record, progress
         self.begun = time.monotonic()
 
-    def point_setup(self, number: int) -> tuple[EvaluationSetup, RenderConfig]:
+    def point_setup(self, number: int) -> tuple[EvaluationSetup, RunRendering]:
         """Return the setup of a point's model, and the configuration that draws the point."""
         raise NotImplementedError
 

@@ -23,11 +23,11 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.validation import validate
-from neuprim.runs.fit import Event, Events, Finishing, Note, Preparing, Step, ignore_event
+from neuprim.runs.fit import Event, Events, Finishing, Note, Preparing, Step, ignore_run_event
 from neuprim.runs.launch.jobs import ENDED, JobResult, JobStatus, LaunchJob
-from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch
+from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
 from neuprim.runs.open import load_dataset
-from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.run_directory import lock_run_directory
 from neuprim.runs.training import train_in_directory
 from neuprim.search.model_quality import eval_views, measure_eval_views
 
@@ -102,7 +102,7 @@ def read_trial(folder: Path) -> TrialRecord | None:
     return read_json_record(folder / TRIAL_FILE, what, instead, _FORMAT, parse)
 
 
-def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_event) -> Outcome:
+def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_run_event) -> Outcome:
     """Train and evaluate, or read the outcome back.
 
     Ctrl-C finishes the step, writes a checkpoint and raises KeyboardInterrupt; the same call resumes.
@@ -115,7 +115,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
         NeuprimError: as :func:`neuprim.runs.run.run`.
     """
     config, folder = trial.config, trial.config.output_dir
-    with lock_directory(folder, "trial"):
+    with lock_run_directory(folder, "trial"):
         asked, before = _trial_request(trial), read_trial(folder)
         if before is None and (folder / "config.yaml").exists():
             raise DataError(f"{folder}: holds a run and no {TRIAL_FILE}; expected a new folder, or that of a trial")
@@ -210,7 +210,7 @@ def launch_trials(
         done[number] = 1.0 if status.state in ENDED else status.progress
         progress(sum(done) / len(done))
 
-    launched = launch(jobs, settings, folder / LAUNCH_FOLDER, add_progress)
+    launched = launch_jobs(jobs, settings, folder / LAUNCH_FOLDER, add_progress)
     results = [result for result in launched if result is not None and result.state != "interrupted"]
     for result in results:
         if result.trace:

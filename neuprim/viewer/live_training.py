@@ -18,7 +18,7 @@ import numpy as np
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.runs.fit import Evaluated, Event, Events, Finishing, Fitted, Note, Preparing, Step
-from neuprim.runs.training import save_training
+from neuprim.runs.training import save_run_training
 from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.server import PageServer
 from neuprim.viewer.session import Session
@@ -188,7 +188,7 @@ class LiveTraining:
             stop.set()
         if self._save:
             self._save = False
-            save_training(fitted)
+            save_run_training(fitted)
             self._notify_all(f"step {fitted.trainer.step} is saved in {self.config.output_dir}")
         if stop.is_set() or not self.paused:
             return False

@@ -13,7 +13,7 @@ from pathlib import Path
 from neuprim.core.errors import NeuprimError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.runs.render_config import RenderConfig, parse_render_config
+from neuprim.runs.render_config import RunRendering, parse_run_rendering
 from neuprim.search.tradeoff_record import TRADEOFF_FILE, TRADEOFF_FOLDER, read_tradeoff_record
 
 SMOOTH_SECONDS = 0.05  # that an image may take while the camera moves
@@ -47,7 +47,7 @@ class QualityLevel:
         pace: measured seconds per pixel of the window; None before the first image.
     """
 
-    config: RenderConfig
+    config: RunRendering
     ratio: float
     pace: float | None = None
 
@@ -72,10 +72,10 @@ class QualityLadder:
         Raises:
             ConfigError: the overrides do not fit the model.
         """
-        levels = [QualityLevel(parse_render_config(overrides, settings, model), 1.0)]
+        levels = [QualityLevel(parse_run_rendering(overrides, settings, model), 1.0)]
         for words, ratio in front:
             try:
-                config = parse_render_config(words, settings, model)
+                config = parse_run_rendering(words, settings, model)
             except NeuprimError as error:  # the front is that of an older model in this directory
                 warn(f"{' '.join(words)}: {error}")
                 continue

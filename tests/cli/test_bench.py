@@ -13,7 +13,7 @@ from neuprim.config import presets
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.registry import load_task
 from neuprim.runs.open import read_metrics
-from neuprim.runs.paper import budget_overrides, load_paper_tables, plan_paper_runs
+from neuprim.runs.paper import load_paper_run_tables, paper_run_budget_overrides, plan_paper_runs
 from tests.core.tiny import write_blender
 
 SMALL = ["model.neurons=2", "model.sh_degree=1", "train.iterations=12"]
@@ -21,7 +21,7 @@ SMALL = ["model.neurons=2", "model.sh_degree=1", "train.iterations=12"]
 
 def test_the_tables_are_those_of_the_appendix() -> None:
     """Samples of every table, and the averages that it prints."""
-    blender, mip, tanks, blending = load_paper_tables()
+    blender, mip, tanks, blending = load_paper_run_tables()
     assert [table.numbers for table in (blender, mip, tanks, blending)] == [(3, 4, 5), (6,), (7,), (7,)]
     least, middle, most = (row.figures for row in blender.rows)
     assert (least["ship"].psnr, middle["mic"].ssim, most["drums"].lpips) == (24.23, 0.9866, 0.047)
@@ -32,7 +32,7 @@ def test_the_tables_are_those_of_the_appendix() -> None:
         own = list(table.rows[0].figures.values())
         assert math.isclose(sum(f.ssim or 0 for f in own) / len(own), ssim, abs_tol=6e-4)
         assert math.isclose(sum(f.lpips or 0 for f in own) / len(own), lpips, abs_tol=6e-4)
-    presets_of_rows = {row.preset for table in load_paper_tables() for row in table.rows}
+    presets_of_rows = {row.preset for table in load_paper_run_tables() for row in table.rows}
     assert presets_of_rows == {name for name in presets(load_task("static")) if name.startswith("paper")}
 
 
@@ -45,14 +45,14 @@ def test_without_data_it_lists(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_words() -> None:
     assert parse_table_numbers("3-5,7") == {3, 4, 5, 7}
-    budgets = [budget_overrides(text) for text in ("full", "90s", "1.5h")]
+    budgets = [paper_run_budget_overrides(text) for text in ("full", "90s", "1.5h")]
     assert budgets == [[], ["train.max_seconds=90"], ["train.max_seconds=5400"]]
     for wrong in ("2", "3-8", "5-3", "", "all"):
         with pytest.raises(ConfigError, match=f"--tables {wrong}: .*expected numbers from 3 to 7"):
             parse_table_numbers(wrong)
     for wrong in ("10", "0m", "m", "ten minutes"):
         with pytest.raises(ConfigError, match=f"--budget {wrong}: expected full, or"):
-            budget_overrides(wrong)
+            paper_run_budget_overrides(wrong)
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def data(tmp_path: Path) -> Path:
 
 def test_the_plan_is_the_protocol(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    planned = plan_paper_runs(data, load_paper_tables(), {}, [], "10m", 2, Path("out"), ["train.ssim_weight=0"])
+    planned = plan_paper_runs(data, load_paper_run_tables(), {}, [], "10m", 2, Path("out"), ["train.ssim_weight=0"])
     assert [(p.scene, p.row.name, p.config.seed) for p in planned] == [
         *(("chair", row, seed) for row in ("200", "5k", "nolimit") for seed in (0, 1)),
         *((scene, "real", seed) for scene in ("bonsai", "garden") for seed in (0, 1)),
@@ -77,7 +77,9 @@ def test_the_plan_is_the_protocol(data: Path, tmp_path: Path, monkeypatch: pytes
     assert (chair.preset, chair.model.primitives, chair.train.max_seconds) == ("paper_200", 200, 600)
     assert Path(chair.scene["path"]) == data / "Chair" and chair.output_dir == Path("out/chair-200-10m-seed0")
     assert (bonsai.preset, bonsai.scene["images"], garden.scene["images"]) == ("paper_real", "images_2", "images")
-    named = plan_paper_runs(data, load_paper_tables()[:1], {"lego": "LEGO small"}, ["5k"], "full", 1, Path("out"), [])
+    named = plan_paper_runs(
+        data, load_paper_run_tables()[:1], {"lego": "LEGO small"}, ["5k"], "full", 1, Path("out"), []
+    )
     assert [(p.scene, Path(p.config.scene["path"]).name, p.config.train.max_seconds) for p in named] == [
         ("lego", "lego small", None)
     ]

@@ -12,7 +12,7 @@ from neuprim.config import RunConfig, compose, read_stored_config
 from neuprim.config.stored_run import refuse_run_links, refuse_untrusted_settings
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.trust import ENVIRONMENT, trusting
-from neuprim.runs.open import make_scene_context
+from neuprim.runs.open import make_run_scene_context
 
 VOLUMES = ["task=dynamic", "scene=vdb", "scene.vdb=/data/fire"]
 
@@ -32,7 +32,7 @@ def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monk
     config = stored(tmp_path / "run", *VOLUMES)
     config.scene["cache"] = address
     with pytest.raises(ConfigError, match=r"config\.yaml: scene\.cache is .*; --trust allows it, NEUPRIM_TRUST=1"):
-        make_scene_context(config, lambda text, fraction: None)
+        make_run_scene_context(config, lambda text, fraction: None)
     with trusting(True):
         refuse_untrusted_settings(config)
     refuse_untrusted_settings(replace(config, source=None))  # of the user's own words

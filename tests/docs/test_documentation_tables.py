@@ -166,7 +166,7 @@ def test_paces_are_what_a_thread_computes_with_its_share_of_rare_steps(
 ) -> None:
     """A median would not see every sixteenth step, and a clock on the wall would see what else the machine does."""
     script = load("shared.trials")
-    monkeypatch.setattr(script, "compile_kernels", lambda trainer: None)
+    monkeypatch.setattr(script, "compile_run_kernels", lambda trainer: None)
     took = script.time_steps({"plain": Busy(), "waits": Busy(waits=2e-3), "sometimes more": Busy(every=16)}, 64)
     assert took["plain"] == pytest.approx(1e-3, rel=0.1)
     assert took["waits"] / took["plain"] == pytest.approx(1, rel=0.15)

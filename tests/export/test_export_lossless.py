@@ -16,7 +16,7 @@ import torch
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.io.ply import read_ply, write_ply
-from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.open import load_run
 from neuprim.runs.render_images import RenderRequest, render_run
 from tests.plugins import marked
@@ -37,13 +37,13 @@ def test_a_run_comes_back_bit_for_bit(tmp_path: Path, form: str, neurons: int, d
     run = marked.static_run(tmp_path / "run", model)
     report = export_run(run, form)
     assert report.lossless and report.files == (run / "export" / f"model.{form}",)
-    back = import_run(report.files[0], tmp_path / "back")
+    back = import_run_directory(report.files[0], tmp_path / "back")
     for name in ("model.safetensors", "config.yaml"):
         assert (back / name).read_bytes() == (run / name).read_bytes()
 
 
 def test_what_was_imported_renders_without_the_data(run_dir: Path, tmp_path: Path) -> None:
-    back = import_run(export_run(run_dir, "ply", tmp_path / "m.ply").files[0], tmp_path / "back")
+    back = import_run_directory(export_run(run_dir, "ply", tmp_path / "m.ply").files[0], tmp_path / "back")
     pose = [[1, 0, 0, 0], [0, 0, -1, -4], [0, 1, 0, 0], [0, 0, 0, 1]]
     (tmp_path / "c.json").write_text(
         json.dumps({"camera_angle_x": 0.9, "w": 20, "h": 16, "frames": [{"transform_matrix": pose}]})
@@ -106,12 +106,12 @@ def test_the_command_prints_files_and_json_and_replaces_nothing(
 def test_other_plys_are_named_for_what_they_are(run_dir: Path, tmp_path: Path) -> None:
     write_ply(tmp_path / "g.ply", np.zeros(1, [("x", "<f4")]))
     with pytest.raises(DataError, match=r"model\.init\.points"):
-        import_run(tmp_path / "g.ply", tmp_path / "out")
+        import_run_directory(tmp_path / "g.ply", tmp_path / "out")
     (tmp_path / "m.obj").write_text("x")
     with pytest.raises(ConfigError, match="no format reads"):
-        import_run(tmp_path / "m.obj", tmp_path / "out")
+        import_run_directory(tmp_path / "m.obj", tmp_path / "out")
     with pytest.raises(DataError, match="no such file"):
-        import_run(tmp_path / "none.ply", tmp_path / "out")
+        import_run_directory(tmp_path / "none.ply", tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
 
@@ -157,7 +157,7 @@ def put(*keys: str, value: Any) -> Any:
 def test_a_changed_header_is_refused(run_dir: Path, tmp_path: Path, change: Any) -> None:
     path = rewritten(run_dir, tmp_path / "m.ply", change)
     with pytest.raises(NeuprimError) as caught:
-        import_run(path, tmp_path / "out")
+        import_run_directory(path, tmp_path / "out")
     assert str(path) in str(caught.value)
     assert sorted(p.name for p in tmp_path.iterdir()) == ["m.ply"]
 
@@ -167,7 +167,7 @@ def test_numbers_that_are_not_finite_are_refused(run_dir: Path, tmp_path: Path) 
     found.rows["b2_0"][1] = np.nan
     write_ply(tmp_path / "m.ply", found.rows, found.comments)
     with pytest.raises(DataError, match="b2 has NaN"):
-        import_run(tmp_path / "m.ply", tmp_path / "out")
+        import_run_directory(tmp_path / "m.ply", tmp_path / "out")
 
 
 def test_npz_bombs_and_pickles_are_refused(run_dir: Path, tmp_path: Path) -> None:
@@ -182,7 +182,7 @@ def test_npz_bombs_and_pickles_are_refused(run_dir: Path, tmp_path: Path) -> Non
                     archive.writestr(key, value)
         return tmp_path / name
 
-    assert import_run(packed("fine.npz"), tmp_path / "fine").is_dir()
+    assert import_run_directory(packed("fine.npz"), tmp_path / "fine").is_dir()
     zeros = np.lib.format.magic(1, 0) + entries["means.npy"][8:10] + entries["means.npy"][10:]
     claims = zeros.replace(b"(5, 3)", b"(9000000000, 3)".ljust(6))
     objects = np.array([{}], object)
@@ -201,8 +201,8 @@ def test_npz_bombs_and_pickles_are_refused(run_dir: Path, tmp_path: Path) -> Non
         "garbage": {"means": b"not numpy"},
     }.items():
         with pytest.raises(DataError, match=rf"{name}\.npz"):
-            import_run(packed(f"{name}.npz", **change), tmp_path / "out")
+            import_run_directory(packed(f"{name}.npz", **change), tmp_path / "out")
     (tmp_path / "text.npz").write_text("not a zip")
     with pytest.raises(DataError, match="not a readable"):
-        import_run(tmp_path / "text.npz", tmp_path / "out")
+        import_run_directory(tmp_path / "text.npz", tmp_path / "out")
     assert not (tmp_path / "out").exists()

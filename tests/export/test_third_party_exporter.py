@@ -12,7 +12,7 @@ from neuprim.cli import main
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import read_grid
 from neuprim.plugins.registry import PluginError
-from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.inspect import InspectRequest, inspect_run
 from tests.plugins.strangers import EXPORTER, INSPECTOR, add, run_dir, site
 
@@ -268,7 +268,7 @@ def test_a_crash_of_an_exporter_names_its_package(kind: str, site: Path, run_dir
         if kind == "write":
             export_run(run_dir, "centres")
         else:
-            import_run(tmp_path / "a.centres", tmp_path / "back")
+            import_run_directory(tmp_path / "a.centres", tmp_path / "back")
     assert not (run_dir / "export").exists() and not (tmp_path / "back").exists()
 
 

@@ -438,17 +438,17 @@ def _fitted(folder: Path) -> Any:
 
 
 def _checkpoint(folder: Path) -> None:
-    from neuprim.runs.training import save_training
+    from neuprim.runs.training import save_run_training
 
     (folder / "out").mkdir()
-    save_training(_fitted(folder))
+    save_run_training(_fitted(folder))
 
 
 def _read_checkpoint(folder: Path) -> None:
-    from neuprim.runs.fit import ignore_event
+    from neuprim.runs.fit import ignore_run_event
     from neuprim.runs.training import _resume_training
 
-    _resume_training(_fitted(folder), ignore_event)
+    _resume_training(_fitted(folder), ignore_run_event)
 
 
 _DATASETS, _IMAGES = "neuprim.tasks.static.datasets", "neuprim.core.io.images"

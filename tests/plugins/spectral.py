@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from neuprim.config import compose
-from neuprim.runs.fit import Events, ignore_event
+from neuprim.runs.fit import Events, ignore_run_event
 from neuprim.runs.run import run
 from tests.plugins.fakes import install_groups
 
@@ -61,6 +61,6 @@ def install_spectral(site: Path, edits: Mapping[str, tuple[str, str]] | None = N
     return site / "neuprim_spectral"
 
 
-def fit(out: Path, *words: str, events: Events = ignore_event) -> Path:
+def fit(out: Path, *words: str, events: Events = ignore_run_event) -> Path:
     """A short run of the task."""
     return run(compose(["task=spectral", f"output_dir='{out}'", *SMALL, *words]), events)

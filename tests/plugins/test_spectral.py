@@ -28,7 +28,7 @@ from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.export import mesh, shared
 from neuprim.plugins.registry import load_task
-from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, read_metrics
@@ -183,7 +183,7 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, s
 
 def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
     for name in ("npz", "ply"):
-        back = import_run(export_run(trained, name, tmp_path / f"m.{name}").files[0], tmp_path / name)
+        back = import_run_directory(export_run(trained, name, tmp_path / f"m.{name}").files[0], tmp_path / name)
         (exr,) = render_run(back, RenderRequest("orbit", format="exr", out=tmp_path / f"{name}_out", frames=1))
         (own,) = render_run(trained, RenderRequest("orbit", format="exr", out=tmp_path / "own", frames=1))
         every = exr_channels(own)

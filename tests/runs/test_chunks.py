@@ -18,7 +18,7 @@ from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.runs import launch_record
-from neuprim.runs.fit import Event, Note, Preparing, Step, fit, ignore_event
+from neuprim.runs.fit import Event, Note, Preparing, Step, fit, ignore_run_event
 from neuprim.runs.open import load_run, read_metrics
 from neuprim.runs.run import ChunksMissing, read_chunk_record, run
 from neuprim.tasks.dynamic.time_density import TimeDensity
@@ -229,7 +229,7 @@ def test_what_trains_one_model_at_once_says_so(files: Path, tmp_path: Path) -> N
     with pytest.raises(ConfigError, match=r"scene.chunks=2: this trains one model at once"):
         fit(config)
     with pytest.raises(ConfigError, match=r"scene.chunks=2: several ranks train one model together"):
-        run(config, ignore_event, group=cast(ProcessGroup, _Two()))
+        run(config, ignore_run_event, group=cast(ProcessGroup, _Two()))
     assert not (tmp_path / "run").exists()
 
 

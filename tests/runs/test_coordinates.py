@@ -22,7 +22,7 @@ from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
 from neuprim.export.shared import Harmonics, fibonacci_sphere
-from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import open_run, read_metrics
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -117,7 +117,7 @@ def test_exported_places_are_those_of_the_world(tmp_path: Path, world: World) ->
     low, high = (np.array(corner) for corner in grid.world_bounds())  # type: ignore[union-attr]
     box = world.world_box(np.array([[-0.3, -0.3, -0.3], [0.9, 0.75, 0.95]]))
     assert np.abs(np.stack([low, high]) - box).max() < 0.1 / world.scale
-    import_run(tmp_path / "ply.ply", tmp_path / "back")
+    import_run_directory(tmp_path / "ply.ply", tmp_path / "back")
     assert torch.equal(open_run(tmp_path / "back").world.scene_from_world, world.scene_from_world)
 
 
@@ -172,7 +172,8 @@ def test_a_page_and_a_compressed_model_say_where_they_are(tmp_path: Path) -> Non
         (run / "config.yaml").read_text(),
     )
     assert torch.equal(
-        open_run(import_run(tmp_path / "m.neuprim", tmp_path / "back")).world.scene_from_world, UTM.scene_from_world
+        open_run(import_run_directory(tmp_path / "m.neuprim", tmp_path / "back")).world.scene_from_world,
+        UTM.scene_from_world,
     )
 
 

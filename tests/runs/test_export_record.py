@@ -12,7 +12,7 @@ import pytest
 import neuprim
 from neuprim.cli import main
 from neuprim.plugins.registry import EXPORTERS
-from neuprim.runs.export import EXPORTS_FILE, export_run, import_run
+from neuprim.runs.export import EXPORTS_FILE, export_run, import_run_directory
 from tests.plugins.fakes import install, site
 from tests.plugins.marked import static_run
 
@@ -107,6 +107,6 @@ def test_a_file_that_is_no_list_of_exports_is_left_alone(text: str, exported: Pa
 
 def test_an_imported_run_starts_a_list_of_its_own(exported: Path, tmp_path: Path) -> None:
     export_run(exported, "npz", out=tmp_path / "x.npz")
-    again = import_run(tmp_path / "x.npz", tmp_path / "again")
+    again = import_run_directory(tmp_path / "x.npz", tmp_path / "again")
     assert not (again / EXPORTS_FILE).exists() and len(record(exported)) == 1
-    assert (import_run(tmp_path / "x.npz", tmp_path / "third", "neuprim:npz") / "config.yaml").is_file()
+    assert (import_run_directory(tmp_path / "x.npz", tmp_path / "third", "neuprim:npz") / "config.yaml").is_file()

@@ -23,9 +23,9 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.plugins.returns import ReturnError
-from neuprim.runs.exr_layers import ExrLayers
+from neuprim.runs.exr_layers import RunExrLayers
 from neuprim.runs.measure import render_light_sum
-from neuprim.runs.render_config import RenderConfig
+from neuprim.runs.render_config import RunRendering
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.tasks.relight.colour import LightNetwork
@@ -47,11 +47,13 @@ def volume() -> Primitives:
 VIEW = View("a view", CAMERA, {"time": torch.tensor(0.4)})
 
 
-def layers(space: str = "linear", **changes: Any) -> ExrLayers:
-    return replace(ExrLayers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RenderConfig(), BLUE), **changes)
+def layers(space: str = "linear", **changes: Any) -> RunExrLayers:
+    return replace(
+        RunExrLayers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RunRendering(), BLUE), **changes
+    )
 
 
-def written(path: Path, how: ExrLayers, model: Primitives, view: View) -> tuple[dict[str, Tensor], dict[str, Any]]:
+def written(path: Path, how: RunExrLayers, model: Primitives, view: View) -> tuple[dict[str, Tensor], dict[str, Any]]:
     how.write(path, model, view)
     with OpenEXR.File(str(path), separate_channels=True) as file:
         return {name: torch.from_numpy(np.array(c.pixels)) for name, c in file.channels().items()}, dict(file.header())
@@ -152,7 +154,7 @@ def test_a_layer_that_the_model_lacks_is_left_out_or_refused_by_name(tmp_path: P
 
 
 def test_a_lower_resolution_keeps_means_at_silhouettes(tmp_path: Path) -> None:
-    found, _ = written(tmp_path / "a.exr", layers(point=RenderConfig(resolution=0.5)), volume(), VIEW)
+    found, _ = written(tmp_path / "a.exr", layers(point=RunRendering(resolution=0.5)), volume(), VIEW)
     assert found["depth.Z"].shape == (16, 20)
     seen = found["depth.Z"][found["A"] > 0]
     small = drawn(volume(), replace(VIEW, camera=CAMERA.resized(10, 8))).depth

@@ -22,7 +22,12 @@ from neuprim.core.io import store as stores
 from neuprim.core.io.vdb import write_vdb
 from neuprim.runs import ground_truth
 from neuprim.runs.fit import Event, Note, Preparing
-from neuprim.runs.ground_truth import load_ground_truth, render_ground_truth, render_ground_truth_of_runs, split_frames
+from neuprim.runs.ground_truth import (
+    launch_ground_truth_jobs,
+    load_run_ground_truth,
+    render_ground_truth_of_runs,
+    split_frames_into_jobs,
+)
 from neuprim.runs.launch.jobs import JobStatus
 from neuprim.tasks.dynamic.volume import capture
 from tests.search import truth_jobs
@@ -58,7 +63,7 @@ def contents(place: Path) -> dict[str, str]:
 
 
 def made(config: RunConfig, settings: LauncherSettings = INLINE, heard: list[Event] | None = None) -> GroundTruth:
-    truth = render_ground_truth(config, settings, (heard if heard is not None else []).append)
+    truth = launch_ground_truth_jobs(config, settings, (heard if heard is not None else []).append)
     assert truth is not None and not truth.missing()
     return truth
 
@@ -79,7 +84,9 @@ def test_a_killed_worker_loses_the_frame_it_was_at_and_a_slow_one_holds_up_nobod
 ) -> None:
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
     monkeypatch.setattr(ground_truth, "LaunchJob", truth_jobs.troubled(FRAMES))
-    monkeypatch.setattr(ground_truth, "split_frames", lambda missing, workers: iter([[0], [1, 2, 3, 4], [5], [6], [7]]))
+    monkeypatch.setattr(
+        ground_truth, "split_frames_into_jobs", lambda missing, workers: iter([[0], [1, 2, 3, 4], [5], [6], [7]])
+    )
     heard: list[Event] = []
     made(config(files, tmp_path), LauncherSettings("processes", 2), heard)
     begun = [line.split() for line in (tmp_path / "cache" / "begun.txt").read_text().splitlines()]
@@ -119,7 +126,7 @@ def test_what_is_there_is_not_made_again(
 
 def test_two_makers_at_once_and_a_job_that_is_done_twice(files: Path, tmp_path: Path, alone: dict[str, str]) -> None:
     there, errors = config(files, tmp_path), []
-    first = load_ground_truth(there)
+    first = load_run_ground_truth(there)
     assert first is not None
     first.begin()
     data = {"config": there.to_dict(), "known": dict(first.known), "key": first.key, "frames": list(range(FRAMES))}
@@ -206,16 +213,18 @@ def test_a_shared_folder_that_vanishes(
 
 
 def test_jobs_get_smaller_towards_the_end() -> None:
-    parts = list(split_frames(range(1000), 2))
+    parts = list(split_frames_into_jobs(range(1000), 2))
     assert [n for part in parts for n in part] == list(range(1000))
     sizes = [len(part) for part in parts]
     assert sizes == sorted(sizes, reverse=True) and sizes[0] == 16 and sizes[-7:] == [1] * 7
-    assert [len(part) for part in split_frames([4, 9], 8)] == [1, 1] and list(split_frames([], 2)) == []
+    assert [len(part) for part in split_frames_into_jobs([4, 9], 8)] == [1, 1] and list(
+        split_frames_into_jobs([], 2)
+    ) == []
 
 
 def test_other_files_where_a_worker_is_are_refused(files: Path, tmp_path: Path) -> None:
     there = config(files, tmp_path)
-    truth = load_ground_truth(there)
+    truth = load_run_ground_truth(there)
     assert truth is not None
     with pytest.raises(DataError, match=r"a worker sees another scene; expected the launcher's files there"):
         ground_truth.render_frames_job(
@@ -235,7 +244,7 @@ def test_runs_that_share_a_scene_wait_for_it_together_and_a_broken_one_holds_up_
         if config.scene["size"] == 24:
             raise DataError("broken")
 
-    monkeypatch.setattr(ground_truth, "render_ground_truth", make)
+    monkeypatch.setattr(ground_truth, "launch_ground_truth_jobs", make)
     configs = [
         config(files, tmp_path, f"scene.size={size}", f"model.primitives={n}") for size in (24, 16) for n in (10, 20)
     ]

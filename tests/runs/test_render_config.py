@@ -22,10 +22,10 @@ from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import (
     GROUPS,
     HEADS,
-    RenderConfig,
-    estimate_file_bytes,
-    parse_render_config,
-    storage_bytes,
+    RunRendering,
+    estimate_run_file_bytes,
+    parse_run_rendering,
+    run_storage_bytes,
 )
 from tests.search.tradeoff_runs import tiny_run
 
@@ -41,7 +41,7 @@ def model(run_dir: Path) -> Primitives:
 
 
 CONFIGS = st.builds(
-    RenderConfig,
+    RunRendering,
     st.builds(
         RenderSettings,
         backend=st.sampled_from(("auto", "cpu", "reference")),
@@ -61,10 +61,10 @@ CONFIGS = st.builds(
 
 
 @given(CONFIGS)
-def test_overrides_round_trip(model: Primitives, config: RenderConfig) -> None:
+def test_overrides_round_trip(model: Primitives, config: RunRendering) -> None:
     defaults = RenderSettings()
     words = config.to_overrides(defaults)
-    assert parse_render_config(words, defaults, model) == config
+    assert parse_run_rendering(words, defaults, model) == config
     assert split_render_overrides(["--time", "0.5", "--", *words, "x=1"]) == (list(words), ["--time", "0.5", "x=1"])
 
 
@@ -89,30 +89,30 @@ def test_the_command_line_knows_the_keys() -> None:
 )
 def test_invalid_overrides_are_refused_in_one_line(word: str, key: str, model: Primitives) -> None:
     with pytest.raises(ConfigError) as refused:
-        parse_render_config([word], RenderSettings(), model)
+        parse_run_rendering([word], RenderSettings(), model)
     assert key in str(refused.value) and "\n" not in str(refused.value)
 
 
 def test_storage_changes_its_group_alone(model: Primitives) -> None:
-    config = parse_render_config(["store.colour=float16"], RenderSettings(), model)
+    config = parse_run_rendering(["store.colour=float16"], RenderSettings(), model)
     stored = config.prepare_model(model)
     for name, value in model.params.items():
         assert torch.equal(stored.params[name], value.half().float() if name in ("sh_dc", "sh_rest") else value)
     saved = 2 * sum(model.params[name].numel() for name in ("sh_dc", "sh_rest"))
-    assert storage_bytes(stored, config.storage) == storage_bytes(model, {}) - saved
-    codes = parse_render_config(["store.colour=uint8"], RenderSettings(), model).prepare_model(model).params["sh_dc"]
+    assert run_storage_bytes(stored, config.storage) == run_storage_bytes(model, {}) - saved
+    codes = parse_run_rendering(["store.colour=uint8"], RenderSettings(), model).prepare_model(model).params["sh_dc"]
     assert len(codes[:, 0].unique()) <= 256
     huge = Primitives(model.density, model.colour, {**model.params, "means": model.params["means"] + 1e6})
     with pytest.raises(ConfigError, match=r"store\.means=float16: means"):
-        parse_render_config(["store.means=float16"], RenderSettings(), model).prepare_model(huge)
+        parse_run_rendering(["store.means=float16"], RenderSettings(), model).prepare_model(huge)
 
 
 def test_file_bytes_follow_the_tensors(model: Primitives, tmp_path: Path) -> None:
-    config = parse_render_config(["colour.degree=1", "density.neurons=2"], RenderSettings(), model)
+    config = parse_run_rendering(["colour.degree=1", "density.neurons=2"], RenderSettings(), model)
     reduced = config.prepare_model(model)
     save_model(tmp_path / "reduced.safetensors", reduced, "static", {})
     save_model(tmp_path / "full.safetensors", model, "static", {})
-    estimated = estimate_file_bytes(tmp_path / "full.safetensors", model, reduced, config.storage)
+    estimated = estimate_run_file_bytes(tmp_path / "full.safetensors", model, reduced, config.storage)
     assert abs(estimated - (tmp_path / "reduced.safetensors").stat().st_size) <= 16  # the headers differ
 
 
@@ -121,10 +121,10 @@ def test_reductions_of_a_file_without_zeros_count_as_tensors(model: Primitives, 
     sparse = Primitives(model.density, model.colour, {**model.params, "sh_rest": 0 * model.params["sh_rest"]})
     path = tmp_path / "sparse.safetensors"
     save_model(path, sparse, "static", {}, without_zeros=True)
-    assert path.stat().st_size < storage_bytes(sparse, {})
-    assert estimate_file_bytes(path, sparse, sparse, {}) == path.stat().st_size
+    assert path.stat().st_size < run_storage_bytes(sparse, {})
+    assert estimate_run_file_bytes(path, sparse, sparse, {}) == path.stat().st_size
     half = dict.fromkeys(GROUPS, "float16")
-    assert estimate_file_bytes(path, sparse, sparse, half) == storage_bytes(sparse, half)
+    assert estimate_run_file_bytes(path, sparse, sparse, half) == run_storage_bytes(sparse, half)
 
 
 def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, tmp_path: Path) -> None:
@@ -134,13 +134,13 @@ def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, t
     dataset = load_dataset(stored)
     view = dataset.test.view(1)
     words = ["renderer.alpha_min=0.25", "resolution=0.5", "colour.degree=0", "store.all=float16"]
-    config = parse_render_config(words, run_config.renderer, model)
+    config = parse_run_rendering(words, run_config.renderer, model)
     image = config.render_view(config.prepare_model(model), view, dataset.background)
     out = tmp_path / "views"
     assert main(["render", str(run_dir), "--camera", "test", "--format", "npy", "--out", str(out), *words]) == 0
     assert np.array_equal(np.load(sorted(out.iterdir())[1]), image.numpy())
     small = replace(view, camera=view.camera.resized(12, 12))
-    half = RenderConfig(run_config.renderer, 0.5).render_view(model, view, dataset.background)
+    half = RunRendering(run_config.renderer, 0.5).render_view(model, view, dataset.background)
     plain = render_image(model, small, run_config.renderer, dataset.background).permute(2, 0, 1)[None]
     expected = torch.nn.functional.interpolate(plain, (24, 24), mode="bilinear")[0].permute(1, 2, 0)
     assert torch.equal(half, expected)

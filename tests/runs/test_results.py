@@ -18,7 +18,7 @@ from neuprim.core.notices import NeuprimWarning
 from neuprim.runs.open import read_metrics
 from neuprim.runs.run import run
 from neuprim.runs.run_directory import result_files
-from neuprim.runs.training import add_curve_line, cut_curve
+from neuprim.runs.training import add_run_curve_line, cut_run_curve
 from tests.core import tiny
 from tests.short_runs import fit, words
 
@@ -101,8 +101,8 @@ def test_a_full_disk_names_the_file_and_keeps_lines_whole(tmp_path: Path, monkey
     def full(descriptor: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    cut_curve(tmp_path / "metrics.jsonl", 0)
-    add_curve_line(tmp_path / "metrics.jsonl", '{"step": 1}\n')
+    cut_run_curve(tmp_path / "metrics.jsonl", 0)
+    add_run_curve_line(tmp_path / "metrics.jsonl", '{"step": 1}\n')
     assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 1}\n', "at once"
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left") as refused:

@@ -22,7 +22,7 @@ from neuprim.core import checkpoint
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.notices import NeuprimWarning
-from neuprim.runs.fit import Event, Note, measure_curve_point
+from neuprim.runs.fit import Event, Note, measure_run_curve_point
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -141,7 +141,7 @@ def test_masked_pixels_do_not_count_on_the_curve() -> None:
     ]
     trainer = tiny.trainer(dataset, 3)
     views = measure_views(trainer.model, TASK, dataset, trainer.renderer)
-    assert measure_curve_point(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
+    assert measure_run_curve_point(trainer) == pytest.approx(sum(v.psnr for v in views) / len(views), abs=1e-9)
 
 
 def test_a_model_that_no_view_shows_says_so() -> None:
@@ -167,7 +167,7 @@ def test_a_perfect_view_leaves_the_curve_a_number(monkeypatch: pytest.MonkeyPatc
         lambda model, view, settings, background: dataset.test.pixels(0).over(background),
     )
     dataset.test.images = [dataset.test.images[0]] * 2  # type: ignore[attr-defined]
-    assert measure_curve_point(tiny.trainer(dataset, 3)) == 200.0
+    assert measure_run_curve_point(tiny.trainer(dataset, 3)) == 200.0
 
 
 def test_a_task_may_judge_views_and_make_films_and_tell_facts(

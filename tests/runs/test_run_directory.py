@@ -12,20 +12,20 @@ from pathlib import Path
 import pytest
 
 from neuprim.core.errors import ConfigError
-from neuprim.runs.run_directory import LOCK_FILE, lock_directory
+from neuprim.runs.run_directory import LOCK_FILE, lock_run_directory
 from tests.runs.launching import wait_for
 from tests.systems import posix
 
 HOLD = (
-    "import sys, time; from pathlib import Path; from neuprim.runs.run_directory import lock_directory\nwith "
-    "lock_directory(Path(sys.argv[1])): time.sleep(600)"
+    "import sys, time; from pathlib import Path; from neuprim.runs.run_directory import lock_run_directory\nwith "
+    "lock_run_directory(Path(sys.argv[1])): time.sleep(600)"
 )
 
 
 def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: Path) -> None:
-    with lock_directory(tmp_path / "run"):
+    with lock_run_directory(tmp_path / "run"):
         for _ in range(2):
-            with pytest.raises(ConfigError) as error, lock_directory(tmp_path / "run", "sweep"):
+            with pytest.raises(ConfigError) as error, lock_run_directory(tmp_path / "run", "sweep"):
                 pytest.fail("two at once")
             found = f"{tmp_path / 'run'}: process {os.getpid()} on {socket.gethostname()} (since "
             assert str(error.value).startswith(found) and "is at work on this sweep; expected that to end first" in str(
@@ -35,7 +35,7 @@ def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: P
 
         def other() -> None:
             try:
-                with lock_directory(tmp_path / "run"):
+                with lock_run_directory(tmp_path / "run"):
                     pass
             except ConfigError as error:
                 refused.append(str(error))
@@ -48,11 +48,11 @@ def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: P
 
 
 def test_what_was_there_stays(tmp_path: Path) -> None:
-    with lock_directory(tmp_path / "run"):
+    with lock_run_directory(tmp_path / "run"):
         (tmp_path / "run" / "x").touch()
     assert [p.name for p in (tmp_path / "run").iterdir()] == ["x"]
     (tmp_path / "empty").mkdir()
-    with lock_directory(tmp_path / "empty"):
+    with lock_run_directory(tmp_path / "empty"):
         pass
     assert (tmp_path / "empty").is_dir()
 
@@ -64,12 +64,12 @@ def test_a_killed_process_lets_go(tmp_path: Path) -> None:
         wait_for(tmp_path / LOCK_FILE)
         while not (tmp_path / LOCK_FILE).read_text():
             pass
-        with pytest.raises(ConfigError, match=f"process {other.pid} on"), lock_directory(tmp_path):
+        with pytest.raises(ConfigError, match=f"process {other.pid} on"), lock_run_directory(tmp_path):
             pass
     finally:
         other.kill()
         other.wait()
-    with lock_directory(tmp_path):
+    with lock_run_directory(tmp_path):
         assert f'"pid": {os.getpid()}' in (tmp_path / LOCK_FILE).read_text()
 
 
@@ -97,7 +97,7 @@ def test_what_killed_writers_left_is_gone_and_what_others_write_stays(tmp_path: 
         for writer in writers[:2]:
             writer.kill()
             writer.wait()
-        with lock_directory(run):
+        with lock_run_directory(run):
             left = [path.name for path in run.rglob("*.tmp") if path not in mine]
         assert len(left) == 1 and left[0].startswith(f".b.npz.{writers[2].pid}."), "that one is at work"
         assert not draft.exists() and all(path.exists() for path in mine)

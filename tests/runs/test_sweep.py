@@ -12,7 +12,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.core import checkpoint
-from neuprim.runs.run_directory import lock_directory
+from neuprim.runs.run_directory import lock_run_directory
 from neuprim.runs.sweep import read_sweep
 from tests.core import tiny
 from tests.short_runs import words
@@ -93,7 +93,7 @@ def test_one_fails_the_others_are_compared_and_resume_makes_the_rest(
 
 def test_two_launchers_on_one_directory(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = tmp_path / "sweep"
-    with lock_directory(out, "sweep"):
+    with lock_run_directory(out, "sweep"):
         assert main(typed(scene, out, "resume=true")) == 2
         (line,) = capsys.readouterr().err.splitlines()
         assert line.startswith(f"neuprim: error: {out}: process ") and "is at work on this sweep" in line
@@ -104,7 +104,7 @@ def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "sweep"
-    with lock_directory(out / "seed-2"):
+    with lock_run_directory(out / "seed-2"):
         assert main(typed(scene, out, "train.iterations=1", "resume=true")) == 2
     assert [(row.state, "is at work on this run" in row.line) for row in read_sweep(out).runs] == [("done", False),
         ("failed", True), ("done", False)]  # type: ignore[union-attr]  # fmt: skip

@@ -14,7 +14,7 @@ from neuprim.cli import main
 from neuprim.core import checkpoint
 from neuprim.core.compression import LEVELS
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, model_file
 from neuprim.search import compress
@@ -182,7 +182,7 @@ def test_without_data_nothing_is_trained_and_it_is_said(whole: Path, tmp_path: P
 def test_export(small: Path, tmp_path: Path, form: str) -> None:
     (file,) = export_run(small, form, tmp_path / f"m.{form.rpartition('-')[2]}").files
     if form != "gaussian-ply":
-        back = import_run(file, tmp_path / "back")
+        back = import_run_directory(file, tmp_path / "back")
         wanted = load_run(small).model.params
         assert all(torch.equal(value, wanted[name]) for name, value in load_run(back).model.params.items())
 
@@ -209,5 +209,5 @@ def test_files_that_import_refuses(small: Path, tmp_path: Path) -> None:
         ("wrong", ConfigError, r"no format reads \.neuprim files; expected one of `neuprim compress`"),
     ):
         with pytest.raises(error, match=message):
-            import_run(tmp_path / f"{name}.neuprim", tmp_path / "out")
+            import_run_directory(tmp_path / f"{name}.neuprim", tmp_path / "out")
     assert not (tmp_path / "out").exists()

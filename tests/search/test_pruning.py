@@ -12,7 +12,7 @@ from neuprim.cli import main
 from neuprim.config import RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.errors import ConfigError
-from neuprim.runs.export import export_run, import_run
+from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_run
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -80,7 +80,7 @@ def test_the_run_of_what_is_left_is_a_run(whole: Path, left: Path, made: Pruning
 def test_every_command_reads_it(left: Path, tmp_path: Path) -> None:
     assert render_run(left, RenderRequest("test", out=tmp_path / "drawn", frames=4))
     export_run(left, "npz", tmp_path / "model.npz")
-    again = import_run(tmp_path / "model.npz", tmp_path / "again")
+    again = import_run_directory(tmp_path / "model.npz", tmp_path / "again")
     assert evaluate_run(again)["psnr"] == pytest.approx(evaluate_run(left)["psnr"], abs=1e-5)
     small = compress_run(CompressRequest(left, level=1, out=tmp_path / "small.neuprim"))
     back, _ = checkpoint.load_model(small.file, load_run(left).task)

@@ -24,7 +24,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.runs.measure import render_image
 from neuprim.runs.open import load_run
-from neuprim.runs.render_config import RenderConfig, parse_render_config
+from neuprim.runs.render_config import RunRendering, parse_run_rendering
 from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
@@ -56,7 +56,7 @@ def view_at(shows: str = COLOUR) -> Viewpoint:
 
 
 def test_colour_is_what_a_render_draws(model: Primitives) -> None:
-    picture = draw_viewpoint(model, view_at(), RenderConfig(SETTINGS), WHITE, RGB)
+    picture = draw_viewpoint(model, view_at(), RunRendering(SETTINGS), WHITE, RGB)
     expected = to_uint8(RGB.display(render_image(model, View("", view_at().camera), SETTINGS, WHITE))).numpy()
     assert picture.image.shape == (30, 40, 3) and picture.image.std() > 10 and picture.seconds > 0
     assert np.array_equal(picture.image, expected) and picture.caption == ""
@@ -64,7 +64,7 @@ def test_colour_is_what_a_render_draws(model: Primitives) -> None:
 
 def test_alpha_depth_and_single_channels(model: Primitives) -> None:
     assert list_quantities(RGB) == [COLOUR, ALPHA, DEPTH, "channel R", "channel G", "channel B"]
-    point = RenderConfig(SETTINGS)
+    point = RunRendering(SETTINGS)
     alpha = draw_viewpoint(model, view_at(ALPHA), point, WHITE, RGB).image
     assert (alpha[..., 0] == alpha[..., 2]).all() and alpha.max() > 200 and alpha[0, 0].max() == 0
     depth = draw_viewpoint(model, view_at(DEPTH), point, WHITE, RGB)
@@ -80,7 +80,7 @@ def test_alpha_depth_and_single_channels(model: Primitives) -> None:
 
 
 def test_lower_resolution_is_sent_as_it_was_drawn(model: Primitives) -> None:
-    assert draw_viewpoint(model, view_at(), RenderConfig(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (
+    assert draw_viewpoint(model, view_at(), RunRendering(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (
         8,
         10,
         3,
@@ -92,7 +92,7 @@ def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
     with pytest.raises(
         ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"
     ):
-        draw_viewpoint(model, look, RenderConfig(replace(SETTINGS, samples=16)), WHITE, RGB)
+        draw_viewpoint(model, look, RunRendering(replace(SETTINGS, samples=16)), WHITE, RGB)
 
 
 def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
@@ -140,7 +140,7 @@ def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Pat
 def test_words_over_the_settings_are_the_full_picture(model: Primitives) -> None:
     levels = QualityLadder.build(model, SETTINGS, (), overrides=("resolution=0.5", "renderer.samples=2"))
     assert levels.full == QualityLevel(
-        parse_render_config(["resolution=0.5", "renderer.samples=2"], SETTINGS, model), 1.0
+        parse_run_rendering(["resolution=0.5", "renderer.samples=2"], SETTINGS, model), 1.0
     )
     with pytest.raises(ConfigError, match="no setting of rendering"):
         QualityLadder.build(model, SETTINGS, (), overrides=("resolutoin=0.5",))
@@ -282,9 +282,9 @@ def test_a_run_with_its_data(run_dir: Path) -> None:
     drawn = render_image(scene.model(), view, scene.settings, background)
     assert found.psnr == psnr(drawn, truth) > 10
     assert np.array_equal(found.truth, to_uint8(truth).numpy()) and np.array_equal(found.drawn, to_uint8(drawn).numpy())
-    few = parse_render_config(["density.neurons=1"], scene.settings, scene.model())
+    few = parse_run_rendering(["density.neurons=1"], scene.settings, scene.model())
     look = Viewpoint(view.camera, view.conditions)
-    assert not np.array_equal(scene.draw(look, few).image, scene.draw(look, RenderConfig(scene.settings)).image)
+    assert not np.array_equal(scene.draw(look, few).image, scene.draw(look, RunRendering(scene.settings)).image)
 
 
 def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path, tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path
     scene = open_scene(copy, told.append)
     assert scene.dataset is None and scene.list_views() == [] and len(told) == 1 and "no held-out views: " in told[0]
     start = scene.start_view()
-    image = scene.draw(Viewpoint(start.camera.resized(96, 54), start.conditions), RenderConfig(scene.settings)).image
+    image = scene.draw(Viewpoint(start.camera.resized(96, 54), start.conditions), RunRendering(scene.settings)).image
     assert image.std() > 10, "the model is in the picture"
     middle = image[18:36, 32:64].astype(float)
     assert np.abs(middle - image[0, 0]).mean() > np.abs(image.astype(float) - image[0, 0]).mean(), "and in its middle"
@@ -325,7 +325,7 @@ def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.Monke
         )
         start = scene.start_view()
         assert start.camera.viewmat.isfinite().all()
-        picture = scene.draw(look, RenderConfig(settings)).image
+        picture = scene.draw(look, RunRendering(settings)).image
         return picture, list_ellipsoids(model, look, channels, 5).rows, pick_primitive(model, look, direction, settings)
 
     expected = asked()

@@ -24,7 +24,7 @@ from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import machine_cores
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.runs.launch.jobs import JobResult
-from neuprim.runs.launch.worker import WorkerTask, cache_variables, start_worker_process, worker_environment
+from neuprim.runs.launch.worker import WorkerTask, start_worker_process, worker_cache_variables, worker_environment
 
 _RAY_TIMEOUT = 5.0
 """Seconds for a Ray cluster to answer; Ray itself would wait for minutes."""
@@ -63,7 +63,7 @@ class LaunchExecutor(Protocol):
         """Release everything; ``now`` kills what still works."""
 
 
-def divide_cores(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
+def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """(jobs at once, threads of each) on this machine.
 
     Raises:
@@ -85,7 +85,7 @@ def divide_cores(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
 
 
 def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """(jobs at once, threads of each, 0 for all) that a search may count on; raises as :func:`divide_cores`.
+    """(jobs at once, threads of each, 0 for all) that a search may count on; raises as :func:`divide_cores_among_jobs`.
 
     What a cluster has at a given time is unknown: there it is what the user says, else as many as this machine has
     cores, with one thread.
@@ -94,7 +94,7 @@ def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int
         return 1, settings.threads or 0
     here = {"processes": (None,), "ray": (None, "local"), "slurm": ("local",)}[settings.name]
     if settings.address in here:
-        return divide_cores(settings, jobs)
+        return divide_cores_among_jobs(settings, jobs)
     return min(settings.workers or machine_cores(), jobs), settings.threads or 1
 
 
@@ -120,7 +120,7 @@ class ProcessExecutor:
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:
-        self.workers, self.threads = divide_cores(settings, jobs)
+        self.workers, self.threads = divide_cores_among_jobs(settings, jobs)
         self._folder, self._numbers = folder.absolute(), itertools.count()
         self._idle: list[_WorkerProcess] = []
         self._busy: list[_WorkerProcess] = []
@@ -190,12 +190,12 @@ class RayExecutor:
         if self._connected:
             _connect_to_ray(ray, settings.address or os.environ.get("RAY_ADDRESS") or "local")
         try:
-            self.workers, self.threads = _divide_ray_cluster(ray, settings, jobs)
+            self.workers, self.threads = _divide_ray_cluster_among_jobs(ray, settings, jobs)
             options = {"num_cpus": self.threads, **settings.options}
             self._call = ray.remote(WorkerTask.__call__).options(**options, max_retries=0)
         except (ValueError, TypeError) as error:
             self.close(True)
-            raise ConfigError(f"launcher.options: Ray refuses them: {_error_line(error)}") from None
+            raise ConfigError(f"launcher.options: Ray refuses them: {_job_error_line(error)}") from None
         except ConfigError:
             self.close(True)
             raise
@@ -213,9 +213,11 @@ class RayExecutor:
             result: JobResult = self._ray.get(handle)
             return result
         except self._ray.exceptions.RayTaskError as error:  # the worker lacks a package; a job's errors are results
-            return JobResult("failed", line=f"the worker cannot do it: {_error_line(error.cause)}", trace=str(error))
+            return JobResult(
+                "failed", line=f"the worker cannot do it: {_job_error_line(error.cause)}", trace=str(error)
+            )
         except self._ray.exceptions.RayError as error:
-            raise WorkerDied(_error_line(error)) from None
+            raise WorkerDied(_job_error_line(error)) from None
 
     def cancel(self, handle: Any) -> None:
         self._ray.cancel(handle, force=False)
@@ -232,11 +234,11 @@ def _connect_to_ray(ray: Any, address: str) -> None:
     options: dict[str, Any] = {"num_cpus": machine_cores(), "include_dashboard": False}
     if address != "local":
         _check_ray_address(address)
-        options = {"runtime_env": {"env_vars": cache_variables()}}
+        options = {"runtime_env": {"env_vars": worker_cache_variables()}}
     try:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **options)
     except (ValueError, ConnectionError, RuntimeError, SystemExit) as error:
-        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_error_line(error)})") from None
+        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_job_error_line(error)})") from None
 
 
 def _check_ray_address(address: str) -> None:
@@ -259,11 +261,11 @@ def _check_ray_address(address: str) -> None:
         ) from None
 
 
-def _divide_ray_cluster(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
+def _divide_ray_cluster_among_jobs(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """(jobs at once, threads of each); jobs that the cluster has no cores for wait in Ray's queue."""
     machines = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if len(machines) == 1 and settings.address is None:
-        return divide_cores(settings, jobs)
+        return divide_cores_among_jobs(settings, jobs)
     most, cores = int(max(machines, default=1)), int(sum(machines))
     workers = settings.workers or jobs
     threads = settings.threads or max(min(cores // workers, most), 1)
@@ -296,7 +298,7 @@ class SlurmExecutor:
             raise ConfigError(f"launcher.address={address}: expected slurm or local")
         self.workers, self.threads = settings.workers or jobs, settings.threads or 1
         if address == "local":
-            self.workers, self.threads = divide_cores(settings, jobs)
+            self.workers, self.threads = divide_cores_among_jobs(settings, jobs)
         folder.mkdir(parents=True, exist_ok=True)
         # results are pickles, which run code when they are read: only this user can write into the new folder
         self._folder, self._died = Path(tempfile.mkdtemp(prefix="submitit-", dir=folder.absolute())), False
@@ -310,9 +312,9 @@ class SlurmExecutor:
             with suppress(OSError):  # it has other files
                 folder.rmdir()
             if not isinstance(error, RuntimeError):
-                raise ConfigError(f"launcher.options: submitit refuses them: {_error_line(error)}") from None
+                raise ConfigError(f"launcher.options: submitit refuses them: {_job_error_line(error)}") from None
             raise BackendUnavailable(
-                f"launcher=slurm: {_error_line(error)}; launcher.address=local does without a cluster"
+                f"launcher=slurm: {_job_error_line(error)}; launcher.address=local does without a cluster"
             ) from None
 
     def submit(self, task: WorkerTask) -> Any:
@@ -348,5 +350,5 @@ class SlurmExecutor:
             shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def _error_line(error: BaseException) -> str:
+def _job_error_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__

@@ -19,10 +19,10 @@ from neuprim.runs.launch.executors import (
     RayExecutor,
     SlurmExecutor,
     WorkerDied,
-    divide_cores,
+    divide_cores_among_jobs,
 )
 from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob, StatusListener, perform_job, read_status
-from neuprim.runs.launch.worker import WorkerTask, interruptible, worker_environment
+from neuprim.runs.launch.worker import WorkerTask, interruptible_run, worker_environment
 
 if TYPE_CHECKING:
     from neuprim.runs.fit import Event
@@ -52,7 +52,7 @@ def ignore_status(number: int, status: JobStatus) -> None:
     """Do nothing."""
 
 
-def ignore_result(number: int, result: JobResult) -> None:
+def ignore_job_result(number: int, result: JobResult) -> None:
     """Do nothing."""
 
 
@@ -64,7 +64,7 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
         ConfigError: more workers than this machine has cores.
     """
     if settings.name == "processes":
-        divide_cores(settings, jobs)
+        divide_cores_among_jobs(settings, jobs)
     if (package := _PACKAGES.get(settings.name)) is None:
         return
     try:
@@ -75,18 +75,18 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
         ) from None
 
 
-def use_launcher_threads(settings: LauncherSettings) -> AbstractContextManager[None]:
+def use_launcher_threads_for_runs(settings: LauncherSettings) -> AbstractContextManager[None]:
     """Give this process the threads of ``launcher.threads`` where runs work in it; otherwise it keeps its own."""
     own = settings.name == "inline" and settings.threads is not None
     return limit_process_threads(settings.threads or 1) if own else nullcontext()
 
 
-def launch(
+def launch_jobs(
     jobs: Sequence[LaunchJob],
     settings: LauncherSettings,
     folder: Path,
     on_status: OnStatus = ignore_status,
-    on_result: OnResult = ignore_result,
+    on_result: OnResult = ignore_job_result,
     stop_at_failure: bool = False,
 ) -> list[JobResult | None]:
     """Do all jobs.
@@ -129,7 +129,7 @@ def _launch_inline(
 ) -> list[JobResult | None]:
     """Do one job after the other in this process, up to the one that Ctrl-C or a failure ends."""
     results = list[JobResult | None]([None] * len(jobs))
-    with use_launcher_threads(settings):
+    with use_launcher_threads_for_runs(settings):
         for number, job in enumerate(jobs):
             listener = StatusListener()
 
@@ -178,7 +178,7 @@ class _JobLoop:
         self._stop.unlink(missing_ok=True)
         finished = False
         try:
-            with interruptible() as stopped:
+            with interruptible_run() as stopped:
                 while self._waiting or self._running:
                     if stopped.is_set() and not self._stop.exists():
                         self._stop_all()

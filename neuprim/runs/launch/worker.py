@@ -36,14 +36,14 @@ _GRACE = 60.0
 _working = threading.Event()
 
 
-def cache_variables() -> dict[str, str]:
+def worker_cache_variables() -> dict[str, str]:
     """Environment variables that a worker gets from its launcher."""
     return {name: os.environ[name] for name in _CACHE_VARIABLES if name in os.environ}
 
 
 def worker_environment(threads: int) -> dict[str, str]:
     """Environment variables of a worker with so many threads."""
-    return cache_variables() | dict.fromkeys(_THREAD_VARIABLES, str(threads))
+    return worker_cache_variables() | dict.fromkeys(_THREAD_VARIABLES, str(threads))
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class WorkerTask:
 @contextmanager
 def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]:
     """Have a thread write the task's status, and interrupt the main thread once the task shall stop."""
-    over, blocked = threading.Event(), _blocks_interrupts()
+    over, blocked = threading.Event(), _worker_blocks_interrupts()
 
     def watch() -> None:
         written, stopped, last = None, False, False
@@ -107,7 +107,7 @@ def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]
                 write_status(task.status, written)
             if not last and not stopped and task.stop.exists():
                 stopped = True
-                _interrupt_main_thread(blocked)
+                _interrupt_worker_main_thread(blocked)
 
     thread = threading.Thread(target=watch, name="neuprim-status", daemon=True)
     _working.set()
@@ -124,7 +124,7 @@ def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]
 
 
 @contextmanager
-def interruptible(terminated: bool = False) -> Iterator[threading.Event]:
+def interruptible_run(terminated: bool = False) -> Iterator[threading.Event]:
     """Yield an event that the first Ctrl-C sets; the second one interrupts at once. Outside the main thread nothing
     changes.
 
@@ -151,7 +151,7 @@ def interruptible(terminated: bool = False) -> Iterator[threading.Event]:
             signal.signal(number, before)
 
 
-def _interrupt_main_thread(blocked: bool = False) -> None:
+def _interrupt_worker_main_thread(blocked: bool = False) -> None:
     """Interrupt the main thread as Ctrl-C does: a run finishes its step and writes a checkpoint.
 
     Args:
@@ -164,7 +164,7 @@ def _interrupt_main_thread(blocked: bool = False) -> None:
         _thread.interrupt_main()
 
 
-def _blocks_interrupts() -> bool:
+def _worker_blocks_interrupts() -> bool:
     """Whether the main thread, which calls this, blocks Ctrl-C. A process whose parent ignored it, as in the background
     of a script, listens to it again."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
@@ -186,15 +186,15 @@ def start_worker_process(log: Path, variables: Mapping[str, str]) -> None:
     with open(log, "ab") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
-    threading.Thread(target=_end_without_launcher, name="neuprim-orphaned", daemon=True).start()
+    threading.Thread(target=_end_worker_without_launcher, name="neuprim-orphaned", daemon=True).start()
 
 
-def _end_without_launcher() -> None:
+def _end_worker_without_launcher() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None, "a worker has a launcher"
     parent.join()
     if _working.is_set():
-        _interrupt_main_thread()
+        _interrupt_worker_main_thread()
     until = time.monotonic() + _GRACE
     while _working.is_set() and time.monotonic() < until:
         time.sleep(0.1)

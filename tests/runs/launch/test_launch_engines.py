@@ -17,7 +17,7 @@ import pytest
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.errors import BackendUnavailable, ConfigError, NeuprimError
 from neuprim.runs.launch.jobs import JobStatus
-from neuprim.runs.launch.launcher import check_launcher, launch
+from neuprim.runs.launch.launcher import check_launcher, launch_jobs
 from tests.runs import launching
 from tests.runs.launching import job
 from tests.systems import posix
@@ -51,7 +51,7 @@ def all_sorts(settings: LauncherSettings, folder: Path) -> None:
         job("share", launching.share),
         job("once", launching.die, 1),
     ]
-    results = launch(jobs, settings, folder, lambda n, s: heard.append((n, s)))
+    results = launch_jobs(jobs, settings, folder, lambda n, s: heard.append((n, s)))
     assert all(result is not None for result in results)
     double, refused, bug, share, once = (result for result in results if result is not None)
     assert double.value == 42 and refused.line == "no images" and not refused.trace
@@ -74,7 +74,7 @@ def test_ctrl_c_reaches_what_ray_has_at_work(ray: Any, tmp_path: Path) -> None:
             begun.set()
             threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
 
-    first, second = launch(
+    first, second = launch_jobs(
         [job(str(n), launching.toil, 60.0) for n in range(2)],
         LauncherSettings("ray", workers=1),
         tmp_path / "launch",
@@ -90,7 +90,7 @@ def test_ray_that_does_not_answer_is_said_within_seconds(tmp_path: Path) -> None
         address = f"127.0.0.1:{taken.getsockname()[1]}"
         start = time.monotonic()
         with pytest.raises(BackendUnavailable) as error:
-            launch([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
+            launch_jobs([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
     assert (
         str(error.value).startswith(f"launcher.address={address}: nothing answers there")
         and time.monotonic() - start < 20
@@ -102,13 +102,13 @@ def test_ray_that_does_not_answer_is_said_within_seconds(tmp_path: Path) -> None
 def test_an_address_that_is_none(address: str, tmp_path: Path) -> None:
     pytest.importorskip("ray")
     with pytest.raises(ConfigError, match=r"expected auto, HOST:PORT or ray://HOST:PORT"):
-        launch([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
+        launch_jobs([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
 
 
 def test_submitit_does_jobs(tmp_path: Path) -> None:
     pytest.importorskip("submitit")
     settings = LauncherSettings("slurm", workers=2, address="local")
-    double, refused = launch(
+    double, refused = launch_jobs(
         [job("double", launching.double, 21), job("refused", launching.refuse, "no images")],
         settings,
         tmp_path / "launch",
@@ -157,7 +157,7 @@ def test_without_slurm_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     with pytest.raises(
         BackendUnavailable, match=r"launcher=slurm: .*srun.*; launcher.address=local does without a cluster"
     ):
-        launch([job("x", launching.double, 1)], LauncherSettings("slurm"), tmp_path / "launch")
+        launch_jobs([job("x", launching.double, 1)], LauncherSettings("slurm"), tmp_path / "launch")
     assert not (tmp_path / "launch").exists()
 
 

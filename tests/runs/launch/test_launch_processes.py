@@ -16,9 +16,9 @@ from neuprim.config.command_settings import LauncherSettings
 from neuprim.core import checkpoint
 from neuprim.core.compute.threads import core_count, limit_process_threads
 from neuprim.core.errors import ConfigError
-from neuprim.runs.launch.executors import divide_cores
+from neuprim.runs.launch.executors import divide_cores_among_jobs
 from neuprim.runs.launch.jobs import JobResult, JobStatus
-from neuprim.runs.launch.launcher import launch, use_launcher_threads
+from neuprim.runs.launch.launcher import launch_jobs, use_launcher_threads_for_runs
 from tests.core import tiny
 from tests.runs import launching
 from tests.runs.launching import PHASES, job, processes
@@ -52,7 +52,7 @@ def test_what_comes_back_and_what_stays(tmp_path: Path) -> None:
     ]
     jobs.insert(0, job("slow", launching.doze, 2.0))
     folder = tmp_path / "launch"
-    results = launch(
+    results = launch_jobs(
         jobs, processes(2, retries=1), folder, lambda n, s: heard.append((n, s)), lambda n, r: ended.append(n)
     )
     _, double, share, refused, bug, once, often = results
@@ -85,7 +85,7 @@ def test_ctrl_c_ends_what_works_and_does_not_begin_the_rest(tmp_path: Path) -> N
             threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
 
     start = time.monotonic()
-    results = launch([job(str(n), launching.doze, 60.0) for n in range(2)], processes(), tmp_path / "launch", hear)
+    results = launch_jobs([job(str(n), launching.doze, 60.0) for n in range(2)], processes(), tmp_path / "launch", hear)
     assert states(results) == ["interrupted", None] and time.monotonic() - start < 40
     assert not (tmp_path / "launch").exists()
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
@@ -100,7 +100,7 @@ def test_killed_in_every_phase_a_run_ends_as_if_nothing_had_been(tmp_path: Path)
     for phase in PHASES:
         config = compose(words(scene, tmp_path / phase, 60, *more))
         jobs.append(job(phase, launching.fit_and_die, {"phase": phase, "config": config.to_dict()}))
-    results = launch(jobs, processes(2), tmp_path / "launch")
+    results = launch_jobs(jobs, processes(2), tmp_path / "launch")
     assert [(r.state, r.attempts) for r in results if r is not None] == [("done", 2)] * len(PHASES), [
         r and r.line for r in results
     ]
@@ -135,16 +135,16 @@ def test_killed_in_every_phase_a_run_ends_as_if_nothing_had_been(tmp_path: Path)
 def test_cores_are_shared_out_and_never_promised_twice(asked: dict[str, int], jobs: int, expected: object) -> None:
     settings = launching.LauncherSettings("processes", **asked)
     if isinstance(expected, tuple):
-        assert divide_cores(settings, jobs) == expected
+        assert divide_cores_among_jobs(settings, jobs) == expected
     else:
         with pytest.raises(ConfigError) as error:
-            divide_cores(settings, jobs)
+            divide_cores_among_jobs(settings, jobs)
         assert str(error.value).startswith(str(expected))
 
 
 def test_jobs_in_a_worker_keep_its_share_of_the_cores() -> None:
     """As the chunks of a run that is itself one of a sweep."""
-    with limit_process_threads(1), use_launcher_threads(LauncherSettings()):
+    with limit_process_threads(1), use_launcher_threads_for_runs(LauncherSettings()):
         assert core_count() == 1
-    with use_launcher_threads(LauncherSettings(threads=1)):
+    with use_launcher_threads_for_runs(LauncherSettings(threads=1)):
         assert core_count() == 1

@@ -21,7 +21,7 @@ from shared.arguments import make_parser, require_folders
 from shared.records import RESULTS, read_record, update_record
 from shared.tables import DOCS, ROOT, between_markers, make_table
 
-from neuprim.config.command_settings import parse_duration
+from neuprim.config.command_settings import parse_duration_setting
 from neuprim.core.compute.threads import cpu_name
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.search.ablation import run_ablation
@@ -77,7 +77,7 @@ def measure(name: str, data: Path | None, out: Path) -> dict[str, Any]:
     where = [] if data is None else [f"{scene.data}={data.resolve()}"]
     words = [*scene.words, *where, "renderer.threads=1", f"output_dir={(out / name).resolve()}"]
     _, record = run_ablation(
-        TradeoffRequest(words, parse_duration(scene.budget, scene.budget), VIEWS, knobs=scene.knobs), tell=print
+        TradeoffRequest(words, parse_duration_setting(scene.budget, scene.budget), VIEWS, knobs=scene.knobs), tell=print
     )
     whole = record.to_dict()
     models = [

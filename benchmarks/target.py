@@ -33,8 +33,8 @@ from shared.arguments import make_parser, require_folders
 from shared.records import RESULTS, read_record, update_record
 from shared.tables import DOCS, Run, Table, between_markers, make_table
 
-from neuprim.config import Job, compose, load_run_task
-from neuprim.config.command_settings import Target
+from neuprim.config import ConfigWithTask, compose, load_config_task
+from neuprim.config.command_settings import TargetSettings
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
@@ -114,7 +114,7 @@ def search(name: str, data: Sequence[str], work: Path, seed: int) -> list[dict[s
     for psnr in scene.targets:
         out = work / f"{name}-{psnr:g}-{seed}"
         config = compose([*words_of(name, data, out), f"model.primitives={scene.start}", f"seed={seed}"])
-        record = run_target(config, Target(psnr=psnr), scene.budget, tell)
+        record = run_target(config, TargetSettings(psnr=psnr), scene.budget, tell)
         full = [a for a in record.attempts if a.purpose == "full"]
         chosen = next(a for a in full if a.folder == record.chosen)
         runs.append(
@@ -148,8 +148,8 @@ def train_grid(name: str, data: Sequence[str], work: Path) -> dict[str, Any]:
         for size in scene.sizes:
             out = work / f"{name}-grid-{size}{'-' if less else ''}{less.rpartition('.')[2]}"
             config = compose([*words_of(name, data, out), f"model.primitives={size}", *([less] if less else [])])
-            task = load_run_task(config)
-            dataset = dataset or load_dataset(Job(config, task))
+            task = load_config_task(config)
+            dataset = dataset or load_dataset(ConfigWithTask(config, task))
             every = choose_hold_out(dataset)
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
             model, _ = load_model(out / "model.safetensors", task)

@@ -76,17 +76,17 @@ def _describe_plugin_note(report: PluginReport[Any]) -> str:
 
 
 def _describe_task_choices(spec: TaskSpec, scenes: list[PluginReport[SceneExtension]]) -> list[str]:
-    from neuprim.config import check_groups, presets, task_choices
-    from neuprim.config.task_files import LEVELS, read_effort_levels
+    from neuprim.config import check_config_groups, list_task_presets, read_task_config
+    from neuprim.config.task_files import LEVELS, read_config_effort_levels
 
-    check_groups(spec)
-    default, levels = task_choices(spec), read_effort_levels(spec, presets(spec))
+    check_config_groups(spec)
+    default, levels = read_task_config(spec), read_config_effort_levels(spec, list_task_presets(spec))
     rows = [(s.name, f"{s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
     rows += [_describe_scene(spec, report) for report in scenes if report.info.name.startswith(f"{spec.name}.")]
     width = max(len(name) for name, _ in rows)
     found = {
         "scenes": [f"{name:{width}}  {text}" for name, text in rows],
-        "presets": [", ".join(name + " (default)" * (name == default.preset) for name in presets(spec))],
+        "presets": [", ".join(name + " (default)" * (name == default.preset) for name in list_task_presets(spec))],
         "effort": [f"{LEVELS[0]} (fast) to {LEVELS[-1]} (good), of preset {levels[1].preset}"] if levels else [],
         "conditions": [", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)] if spec.conditions else [],
         "options": _describe_options(spec),
@@ -100,7 +100,7 @@ def _describe_options(spec: TaskSpec | LossExtension) -> list[str]:
 
 def _describe_scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, str]:
     """(name, summary or error) of a scene that another package adds to a task."""
-    from neuprim.config import check_scene
+    from neuprim.config import check_scene_config
 
     name = report.info.name.removeprefix(f"{spec.name}.")
     problem, note = report.error, _describe_plugin_note(report)
@@ -108,7 +108,7 @@ def _describe_scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tup
         note = f"  [hidden by the task's own; {SCENES.choice(report.info)} chooses it]"
     if report.spec is not None:
         try:
-            check_scene(spec, name, report.spec.config_package)
+            check_scene_config(spec, name, report.spec.config_package)
             return name, f"({report.info.origin})  {report.spec.scene.summary}{note}"
         except ConfigError as error:
             problem = str(error)

@@ -106,7 +106,7 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 def _bench(args: argparse.Namespace) -> int:
     """List the tables, or run what stands for their rows."""
     from neuprim.cli.run_commands import run_one
-    from neuprim.config.overrides import CommandLine
+    from neuprim.config.overrides import ConfigArguments
     from neuprim.runs.open import read_metrics
     from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
 
@@ -127,7 +127,7 @@ def _bench(args: argparse.Namespace) -> int:
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
-        results.append((one, read_metrics(run_one(one.config, CommandLine(one.config.overrides)))))
+        results.append((one, read_metrics(run_one(one.config, ConfigArguments(one.config.overrides)))))
         print(*_describe_paper_result(*results[-1]), sep="\n", flush=True)
     print(*_describe_paper_averages(results), _PAPER_RULES, sep="\n")
     return 0
@@ -295,7 +295,7 @@ def _tradeoff(args: argparse.Namespace) -> int:
 
 def _render_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
-    from neuprim.config.command_settings import parse_duration
+    from neuprim.config.command_settings import parse_duration_setting
     from neuprim.search.render_tradeoff import format_render_command, measure_tradeoff
     from neuprim.search.tradeoff_measuring import TradeoffRequest
     from neuprim.search.tradeoff_record import TRADEOFF_FOLDER
@@ -304,7 +304,7 @@ def _render_tradeoff(args: argparse.Namespace) -> int:
     check_run_directory(run_dir)
     if args.seeds is not None:
         raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
-    budget = parse_duration(args.budget or "5m", f"--budget {args.budget}")
+    budget = parse_duration_setting(args.budget or "5m", f"--budget {args.budget}")
     request = TradeoffRequest(args.words, budget, args.views, args.repeats, args.knobs, args.lpips)
     folder = run_dir / TRADEOFF_FOLDER
     try:
@@ -322,17 +322,17 @@ def _render_tradeoff(args: argparse.Namespace) -> int:
 
 def _train_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
-    from neuprim.config.command_settings import parse_duration, take_launcher
-    from neuprim.config.overrides import parse
+    from neuprim.config.command_settings import parse_duration_setting, take_launcher_overrides
+    from neuprim.config.overrides import parse_overrides
     from neuprim.search.ablation import format_run_command, run_ablation
     from neuprim.search.tradeoff_measuring import TradeoffRequest
 
-    launcher, words = take_launcher([args.run_dir, *args.words])
-    said = [str(a.value) for a in parse(words) if a.key == "budget"]
+    launcher, words = take_launcher_overrides([args.run_dir, *args.words])
+    said = [str(a.value) for a in parse_overrides(words) if a.key == "budget"]
     if said and args.budget is not None:
         raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
     asked = f"budget={said[-1]}" if said else f"--budget {args.budget}"
-    budget = parse_duration(said[-1] if said else args.budget or "20m", asked)
+    budget = parse_duration_setting(said[-1] if said else args.budget or "20m", asked)
     request = TradeoffRequest(words, budget, args.views, args.repeats, args.knobs, args.lpips)
     try:
         with DrawProgress() as progress:

@@ -18,8 +18,8 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.config.command_settings import LauncherSettings, Target, ViewerSettings
-    from neuprim.config.overrides import CommandLine
+    from neuprim.config.command_settings import LauncherSettings, TargetSettings, ViewerSettings
+    from neuprim.config.overrides import ConfigArguments
     from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
     from neuprim.runs.launch.jobs import JobResult
     from neuprim.search.target_record import TargetRecord
@@ -79,18 +79,23 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _run(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, read_stored_config
-    from neuprim.config.command_settings import LauncherSettings, take_launcher, take_target, take_viewer
-    from neuprim.config.overrides import CommandLine, drop_output_overrides
+    from neuprim.config.command_settings import (
+        LauncherSettings,
+        take_launcher_overrides,
+        take_target_overrides,
+        take_viewer_overrides,
+    )
+    from neuprim.config.overrides import ConfigArguments, drop_output_overrides
     from neuprim.core.train.distributed.process_group import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
     place = read_torchrun_rank()
     if place is not None:
         return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
-    typed = CommandLine(args.overrides, args.config)
-    viewer, overrides = take_viewer(args.overrides)
-    launcher, overrides = take_launcher(overrides)
-    wanted, overrides = take_target(overrides)
+    typed = ConfigArguments(args.overrides, args.config)
+    viewer, overrides = take_viewer_overrides(args.overrides)
+    launcher, overrides = take_launcher_overrides(overrides)
+    wanted, overrides = take_target_overrides(overrides)
     launched = launcher != LauncherSettings()
     for name, given in (("-m", args.multirun), ("target", wanted is not None), ("launcher", launched)):
         if viewer is not None and given:
@@ -101,7 +106,7 @@ def _run(args: argparse.Namespace) -> int:
         from neuprim.runs.sweep import read_sweep_overrides
 
         overrides = read_sweep_overrides(overrides)
-        typed = CommandLine([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
+        typed = ConfigArguments([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
     stored = None if args.config is None else read_stored_config(args.config)
     check = not args.cfg
     configs = compose_all(overrides, check, stored) if args.multirun else [compose(overrides, check, stored)]
@@ -122,7 +127,7 @@ def _run(args: argparse.Namespace) -> int:
 
 def run_one(
     config: RunConfig,
-    typed: CommandLine,
+    typed: ConfigArguments,
     viewer: ViewerSettings | None = None,
     launcher: LauncherSettings | None = None,
 ) -> Path:
@@ -148,7 +153,7 @@ def run_one(
 
 
 def _search_target(
-    config: RunConfig, target: Target, budget: float, launcher: LauncherSettings, typed: CommandLine
+    config: RunConfig, target: TargetSettings, budget: float, launcher: LauncherSettings, typed: ConfigArguments
 ) -> int:
     """Search for a model that reaches a target; print what was achieved and the run's directory."""
     from neuprim.cli.progress import RunProgress
@@ -194,7 +199,7 @@ RUN_COMMAND = Command("run", "fit a scene", _run, _add_run_arguments, _run_help,
 
 
 def launch_runs(
-    configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: CommandLine
+    configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: ConfigArguments
 ) -> int:
     """Launch the runs of a sweep, or a single run in another process; return the exit status.
 
@@ -221,7 +226,7 @@ def launch_runs(
 
 
 def _report_launched_runs(
-    configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
+    configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: ConfigArguments
 ) -> int:
     """Print failures, and raise KeyboardInterrupt with the command that continues; return the exit status: 2 for bad
     input, 1 for a bug."""
@@ -269,10 +274,10 @@ def _add_truth_arguments(parser: argparse.ArgumentParser) -> None:
 def _truth(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
-    from neuprim.config.command_settings import take_launcher
+    from neuprim.config.command_settings import take_launcher_overrides
     from neuprim.runs.ground_truth import launch_ground_truth_jobs
 
-    launcher, rest = take_launcher(args.overrides)
+    launcher, rest = take_launcher_overrides(args.overrides)
     try:
         for config in compose_all(rest) if args.multirun else [compose(rest)]:
             with RunProgress(f"{config.task}/{config.scene_name}") as events:
@@ -353,9 +358,12 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
 def _compose_for_rank(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
     """Compose the configuration; all ranks take the output directory of rank 0, which writes there."""
     from neuprim.config import compose
-    from neuprim.config.command_settings import take_launcher, take_target, take_viewer
+    from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
 
-    more = more or any(len(take(words)[1]) < len(words) for take in (take_target, take_launcher, take_viewer))
+    more = more or any(
+        len(take(words)[1]) < len(words)
+        for take in (take_target_overrides, take_launcher_overrides, take_viewer_overrides)
+    )
     if group.is_first and more:
         raise ConfigError(
             f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, "
@@ -394,12 +402,12 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 def _fit_as_rank(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
     """Train, and show it on rank 0."""
     from neuprim.cli.progress import RunProgress
-    from neuprim.config.overrides import CommandLine
+    from neuprim.config.overrides import ConfigArguments
     from neuprim.runs.fit import ignore_run_event
     from neuprim.runs.run import run
 
     ranks = f"--nproc-per-node {group.place.local_size}" if group.size == group.place.local_size else "…"
-    typed = CommandLine(overrides)
+    typed = ConfigArguments(overrides)
     try:
         if not group.is_first:
             with warnings.catch_warnings():

@@ -1,27 +1,33 @@
 """A run's configuration: Hydra's key=value words and the tasks' YAML files in, one validated :class:`RunConfig` out."""
 
 from neuprim.config.compose import compose, compose_all, preset_settings
-from neuprim.config.job import Job, current_provenance, find_run_plugins, find_run_scene, load_run_task
-from neuprim.config.overrides import expand_sweep
+from neuprim.config.job import (
+    ConfigWithTask,
+    current_config_provenance,
+    find_config_plugins,
+    find_config_scene,
+    load_config_task,
+)
+from neuprim.config.overrides import expand_sweep_overrides
 from neuprim.config.run_config import RunConfig, RunSettings
 from neuprim.config.stored_run import read_stored_config
-from neuprim.config.task_files import check_groups, check_scene, presets, task_choices
+from neuprim.config.task_files import check_config_groups, check_scene_config, list_task_presets, read_task_config
 
 __all__ = [
-    "Job",
+    "ConfigWithTask",
     "RunConfig",
     "RunSettings",
-    "check_groups",
-    "check_scene",
+    "check_config_groups",
+    "check_scene_config",
     "compose",
     "compose_all",
-    "expand_sweep",
-    "current_provenance",
+    "expand_sweep_overrides",
+    "current_config_provenance",
     "preset_settings",
-    "presets",
+    "list_task_presets",
     "read_stored_config",
-    "find_run_scene",
-    "find_run_plugins",
-    "task_choices",
-    "load_run_task",
+    "find_config_scene",
+    "find_config_plugins",
+    "read_task_config",
+    "load_config_task",
 ]

@@ -42,7 +42,7 @@ class LauncherSettings:
     def __post_init__(self) -> None:
         validate_fields(self, "launcher")
 
-    def given(self) -> dict[str, Any]:
+    def given_settings(self) -> dict[str, Any]:
         """Name -> value of what differs from the defaults, and the launcher's own name."""
         values, default = dataclasses.asdict(self), dataclasses.asdict(LauncherSettings())
         return {name: value for name, value in values.items() if name == "name" or value != default[name]}
@@ -65,7 +65,7 @@ class ViewerSettings:
 
 
 @dataclass(frozen=True)
-class Target:
+class TargetSettings:
     """What a model is to reach: ``target.psnr=30``.
 
     With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and ``megabytes`` and ``fps`` are
@@ -82,27 +82,27 @@ class Target:
     megabytes: Annotated[float, Range(above=0, says="a positive number of megabytes")] | None = None
     fps: Annotated[float, Range(above=0, says="a positive number of frames per second")] | None = None
 
-    def given(self) -> dict[str, float]:
+    def given_settings(self) -> dict[str, float]:
         """Name -> value of what was asked for."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     @property
     def quality(self) -> dict[str, float]:
         """Name -> value of the measures of quality among them."""
-        return {name: value for name, value in self.given().items() if name in ("psnr", "ssim")}
+        return {name: value for name, value in self.given_settings().items() if name in ("psnr", "ssim")}
 
     def __str__(self) -> str:
-        return " ".join(f"target.{name}={value:g}" for name, value in self.given().items())
+        return " ".join(f"target.{name}={value:g}" for name, value in self.given_settings().items())
 
 
-def take_launcher(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
+def take_launcher_overrides(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
     """Return the launcher that overrides ask for, with settings that it uses, and the other overrides."""
     name, settings, others = take_settings(overrides, "launcher", LauncherSettings)
     if name is not None:
         if name not in LAUNCHERS:
             raise ConfigError(f"launcher={format_value(name)}: no such launcher{nearest(str(name), LAUNCHERS)}")
         settings = dataclasses.replace(settings, name=name)
-    given = settings.given()
+    given = settings.given_settings()
     engines, pools = "ray or launcher=slurm", "processes, launcher=ray or launcher=slurm"
     users = {"address": engines, "options": engines, "workers": pools, "retries": pools}
     for key, launchers in users.items():
@@ -113,7 +113,7 @@ def take_launcher(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]
     return settings, others
 
 
-def take_viewer(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
+def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
     """Return the viewer that is asked for, None for none, and the other overrides; a host or port asks for one, too."""
     shown, settings, others = take_settings(overrides, "viewer", ViewerSettings)
     if shown is None:
@@ -121,21 +121,21 @@ def take_viewer(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[s
     return (settings if coerce(shown, bool, "viewer") else None), others
 
 
-def take_target(overrides: Sequence[str]) -> tuple[tuple[Target, float] | None, list[str]]:
+def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[TargetSettings, float] | None, list[str]]:
     """Return the target and its budget in seconds, None where neither is asked for, and the other overrides."""
     budget, _, rest = take_settings(overrides, "budget", _Budget)
-    whole, target, others = take_settings(rest, "target", Target)
+    whole, target, others = take_settings(rest, "target", TargetSettings)
     if len(others) == len(overrides):
         return None, others
     if whole is not None:
         raise ConfigError(f"target={format_value(whole)}: expected one of {_TARGETS}")
     asked = "target" if budget is None else f"budget={format_value(budget)}"
-    if not target.given():
+    if not target.given_settings():
         raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
     if budget is None:
         expected = "a budget beside it, the time for search and training together, such as budget=10m"
         raise ConfigError(f"{target}: expected {expected}")
-    return (target, parse_duration(budget if isinstance(budget, str) else "", asked)), others
+    return (target, parse_duration_setting(budget if isinstance(budget, str) else "", asked)), others
 
 
 @dataclass(frozen=True)
@@ -143,7 +143,7 @@ class _Budget:
     """The group of ``budget=10m``, which has no settings of its own."""
 
 
-def parse_duration(text: str, asked: str) -> float:
+def parse_duration_setting(text: str, asked: str) -> float:
     """Return the seconds of a time such as 90s, 5m or 1h; ``asked`` is what the user typed, for the message."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
     if match is None or float(match[1]) == 0:

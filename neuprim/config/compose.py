@@ -13,34 +13,34 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config.job import refuse_missing_plugins
-from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
+from neuprim.config.job import refuse_missing_config_plugins
+from neuprim.config.outputs import DEFAULT_TASK, config_output_directory, config_output_name
 from neuprim.config.overrides import (
     Assignment,
     drop_output_overrides,
-    expand_sweep,
+    expand_sweep_overrides,
     key_of,
-    parse,
+    parse_overrides,
     quote_override,
-    sweep_names,
-    swept_keys,
+    sweep_override_names,
+    swept_override_keys,
 )
 from neuprim.config.run_config import RunConfig, RunSettings, flatten
 from neuprim.config.setting_checks import (
     CHOICES,
-    check_parameter_names,
-    check_setting_key,
+    check_config_key,
+    check_config_parameter_names,
     complete_task_options,
     refuse_unused,
     task_and_loss_options,
     unused_settings,
 )
 from neuprim.config.stored_run import (
-    find_resumed_run,
+    find_resumed_config,
     refuse_contradictions,
     refuse_untrusted_settings,
-    restore_references,
-    resumed_choices,
+    restore_config_references,
+    resumed_config_choices,
     stored_choices,
     stored_settings,
 )
@@ -49,13 +49,13 @@ from neuprim.config.task_files import (
     LEVELS,
     PRESET_GROUPS,
     Level,
-    check_groups,
-    check_scene,
-    choose_effort_level,
+    check_config_groups,
+    check_scene_config,
+    choose_config_effort_level,
+    list_task_presets,
     omegaconf_to_plain,
-    presets,
     read_config_group,
-    task_choices,
+    read_task_config,
 )
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
@@ -118,25 +118,27 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     Raises:
         ConfigError: one line that names the key, what was found and what was expected.
     """
-    assignments = parse(overrides)
+    assignments = parse_overrides(overrides)
     typed = {a.key: a.value for a in assignments}
     choices: dict[str, str | None] = {key: _read_choice(assignments, key) for key in CHOICES}
-    begun = find_resumed_run(typed, choices, stored is not None)
+    begun = find_resumed_config(typed, choices, stored is not None)
     earlier = [config for config in (begun, stored) if config is not None]
     for config in earlier:
         refuse_untrusted_settings(config, typed)
     # Where torchrun's ranks get the overrides that describe a run, these say how many views each rank has.
     new_launch = begun is not None and read_torchrun_rank() is not None and bool(choices["task"] or choices["scene"])
     if begun is not None:
-        choices = resumed_choices(begun, choices)
+        choices = resumed_config_choices(begun, choices)
     elif stored is not None:
         choices = stored_choices(stored, choices)
     values = [a for a in assignments if a.key not in CHOICES]
     try:
-        config, paths = _make_run_config(_select_task_and_scene(choices), values, earlier, check_output, new_launch)
+        config, paths = _compose_run_config(
+            _select_task_scene_and_preset(choices), values, earlier, check_output, new_launch
+        )
     except UnknownPlugin:
         if begun is not None:
-            refuse_missing_plugins(begun)  # naming the package says more
+            refuse_missing_config_plugins(begun)  # naming the package says more
         raise
     if begun is not None:
         refuse_contradictions(begun, config, paths)
@@ -148,24 +150,28 @@ def compose_all(
     overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
 ) -> list[RunConfig]:
     """As :func:`compose`: return the configurations of a sweep, each in its own folder of one output directory."""
-    swept = set(swept_keys(overrides))
+    swept = set(swept_override_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]
-    combinations = expand_sweep(overrides)
-    place = {a.key: a for a in parse([text for text in overrides if key_of(text) in ("output_dir", "resume")])}
+    combinations = expand_sweep_overrides(overrides)
+    place = {
+        a.key: a for a in parse_overrides([text for text in overrides if key_of(text) in ("output_dir", "resume")])
+    }
     resume = "resume" in place and place["resume"].value is True
     asked = place["output_dir"].text if "output_dir" in place and place["output_dir"].value is not None else None
     first = compose([*drop_output_overrides(combinations[0]), *([] if asked is None else [asked])], False, stored)
-    typed = parse(combinations[0])
+    typed = parse_overrides(combinations[0])
     names = [("task", first.task), ("scene", first.scene_name)]
-    fixed = [run_name(_read_choice(typed, key) or name, "") for key, name in names if not swept & {key, "task"}]
+    fixed = [
+        config_output_name(_read_choice(typed, key) or name, "") for key, name in names if not swept & {key, "task"}
+    ]
     explicit = None if asked is None else str(first.output_dir)
-    folder = output_directory(explicit, "-".join([*fixed, "sweep"]), resume, check_output)
+    folder = config_output_directory(explicit, "-".join([*fixed, "sweep"]), resume, check_output)
     made = []
-    for texts, name in zip(combinations, sweep_names(overrides, combinations), strict=True):
+    for texts, name in zip(combinations, sweep_override_names(overrides, combinations), strict=True):
         own = drop_output_overrides(texts)
         directory = folder / name
-        goes_on = resume and _continues_own_run(directory, own, (folder / "sweep.json").is_file())
+        goes_on = resume and _uses_own_stored_config(directory, own, (folder / "sweep.json").is_file())
         output_dir = quote_override("output_dir", str(directory))
         config = compose([*own, output_dir, *(["resume=true"] if goes_on else [])], False, stored)
         typed_now = [text for text in config.overrides if text not in (output_dir, "resume=true")]
@@ -174,7 +180,7 @@ def compose_all(
     return made
 
 
-def _continues_own_run(directory: Path, own: Sequence[str], recorded: bool) -> bool:
+def _uses_own_stored_config(directory: Path, own: Sequence[str], recorded: bool) -> bool:
     """Whether a run of a sweep goes on from its own configuration; the sweep's record refuses other overrides."""
     if not (directory / "config.yaml").is_file():
         return False
@@ -187,10 +193,10 @@ def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None
     Raises:
         ConfigError: its files lack something, cannot be read, or hold an impossible value.
     """
-    check_groups(spec)
+    check_config_groups(spec)
     base = _read_base(spec, scene, spec.config_package, preset, {})
     for assignment in level.settings if level is not None else ():
-        check_setting_key(assignment, base.tree["scene"], scene)
+        check_config_key(assignment, base.tree["scene"], scene)
     return _validate_settings(_resolve_config(base, {}, level))
 
 
@@ -206,24 +212,24 @@ def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
     return str(value)
 
 
-def _select_task_and_scene(choices: Mapping[str, str | None]) -> _Selection:
+def _select_task_scene_and_preset(choices: Mapping[str, str | None]) -> _Selection:
     """Load the task, and find its scene, preset and level."""
     task_name = choices["task"] or DEFAULT_TASK
     info, spec = TASKS.load_with_info(task_name)
-    check_groups(spec)
-    defaults, names = task_choices(spec), presets(spec)
-    level = choose_effort_level(spec, choices[EFFORT], choices["preset"], names)
+    check_config_groups(spec)
+    defaults, names = read_task_config(spec), list_task_presets(spec)
+    level = choose_config_effort_level(spec, choices[EFFORT], choices["preset"], names)
     preset = choices["preset"] or (defaults.preset if level is None else level.preset)
     scene_name = choices["scene"] or defaults.scene
     scene = find_scene(spec, scene_name)
-    check_scene(spec, scene.spec.name, scene.config_package)
+    check_scene_config(spec, scene.spec.name, scene.config_package)
     if preset not in names:
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, names)}")
-    name = run_name(task_name, scene_name)
+    name = config_output_name(task_name, scene_name)
     return _Selection(info, spec, scene, preset, defaults.preset, level, name, defaults.options)
 
 
-def _make_run_config(
+def _compose_run_config(
     chosen: _Selection,
     values: Sequence[Assignment],
     earlier: Sequence[RunConfig],
@@ -235,7 +241,7 @@ def _make_run_config(
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
     declared = base.tree["scene"]
     for assignment in (*(() if chosen.level is None else chosen.level.settings), *values):
-        check_setting_key(assignment, declared, scene.spec.name)
+        check_config_key(assignment, declared, scene.spec.name)
     below: dict[str, Any] = {}
     for config in earlier:
         same_scene = scene.spec.name == split_plugin_name(config.scene_name)[1]
@@ -254,7 +260,7 @@ def _make_run_config(
     for tree in (plain, full):
         tree["task"]["options"] = complete_task_options(available, tree["task"]["options"], owner)
     options = full["task"]["options"]
-    check_parameter_names(spec, settings)
+    check_config_parameter_names(spec, settings)
     source = find_plugin_source(TASKS, qualified_plugin_name(chosen.task_info.distribution, spec.name))
     with attribute_errors(source, "check"):
         spec.check(build_settings(spec, settings.model, options))
@@ -267,12 +273,12 @@ def _make_run_config(
         scene_name=scene.spec.name,
         scene=full["scene"],
         preset=chosen.preset,
-        output_dir=output_directory(settings.output_dir, chosen.name, settings.resume, check_output),
+        output_dir=config_output_directory(settings.output_dir, chosen.name, settings.resume, check_output),
         options=options,
         unused=unused_settings(spec, loss),
         non_default=preset
-        | _find_non_default_settings(
-            _flatten_run_settings(plain, _validate_settings(plain)), _flatten_run_settings(full, settings)
+        | _find_non_default_config(
+            _flatten_config_settings(plain, _validate_settings(plain)), _flatten_config_settings(full, settings)
         ),
         made_by=Provenance.of_installed(chosen.task_info, scene, loss_info),
         **{name: getattr(settings, name) for name in ("model", "train", "renderer", "metrics", "seed", "resume")},
@@ -349,7 +355,7 @@ def _resolve_config(
         OmegaConf.update(tree, "train.max_seconds", None)  # the other budget was the earlier run's
     if other_strategy and _find_typed_value(values, "train.population", "grow_from") is None:
         OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's value is for its own strategy
-    plain: dict[str, Any] = restore_references(omegaconf_to_plain(tree))
+    plain: dict[str, Any] = restore_config_references(omegaconf_to_plain(tree))
     return plain
 
 
@@ -387,13 +393,13 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
     return result
 
 
-def _flatten_run_settings(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
+def _flatten_config_settings(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
     """Return flat dotted values, with the settings in their own types, so that 1 and 1.0 are the same rate."""
     values = {**dataclasses.asdict(settings), "scene": tree["scene"], "task": tree["task"]}
     return flatten({key: value for key, value in values.items() if key not in ("output_dir", "resume")})
 
 
-def _find_non_default_settings(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
+def _find_non_default_config(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
     """Return key -> (default, value) of the flat settings that differ."""
     before = {key: None if value == _REQUIRED else value for key, value in default.items()}
     pairs = {key: (before.get(key), actual.get(key)) for key in {**default, **actual}}

@@ -13,12 +13,12 @@ ROOT = Path("outputs")
 DEFAULT_TASK = "static"
 
 
-def run_name(task: str, scene: str) -> str:
+def config_output_name(task: str, scene: str) -> str:
     """Return the name of a run's directory where users chose none; ``PACKAGE:NAME`` becomes a part of it."""
     return "-".join(part for word in (task, scene) for part in split_plugin_name(word) if part)
 
 
-def output_directory(asked: str | None, name: str, resume: bool, check: bool = True) -> Path:
+def config_output_directory(asked: str | None, name: str, resume: bool, check: bool = True) -> Path:
     """Return the directory of a run or sweep; nothing is created.
 
     Args:
@@ -28,7 +28,7 @@ def output_directory(asked: str | None, name: str, resume: bool, check: bool = T
         check: whether an ``asked`` directory that holds files is refused (unless ``resume``).
     """
     if asked is None:
-        number = max(_numbers_in_use(name), default=0) + (not resume)
+        number = max(_config_output_numbers(name), default=0) + (not resume)
         return ROOT / (name if number <= 1 else f"{name}-{number}")
     if not asked.strip():
         raise ConfigError("output_dir='': expected a directory")
@@ -50,7 +50,7 @@ def output_directory(asked: str | None, name: str, resume: bool, check: bool = T
     return path
 
 
-def _numbers_in_use(name: str) -> list[int]:
+def _config_output_numbers(name: str) -> list[int]:
     """Numbers of the existing ``NAME`` (1) and ``NAME-n`` under the output root."""
     if not ROOT.is_dir():
         return []

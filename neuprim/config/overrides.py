@@ -36,7 +36,7 @@ class Assignment:
 
 
 @dataclass(frozen=True)
-class CommandLine:
+class ConfigArguments:
     """The arguments of ``neuprim run``: overrides, and the file of ``--config``."""
 
     overrides: Sequence[str]
@@ -44,7 +44,7 @@ class CommandLine:
 
     def resume_command(self, directory: Path) -> str:
         """Return the command that continues what these began: a run in ``directory``, or the sweep it is a part of."""
-        sweep = bool(swept_keys(self.overrides))
+        sweep = bool(swept_override_keys(self.overrides))
         overrides = drop_output_overrides(self.overrides)
         if not overrides and self.file is None and not (directory / "config.yaml").is_file():
             overrides = ["task=static"]  # the default, which a bare resume=true does not begin
@@ -54,13 +54,14 @@ class CommandLine:
         return shlex.join(["neuprim", "run", *flags, *overrides, *last])
 
 
-def parse(overrides: Sequence[str]) -> list[Assignment]:
+def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
     """Read assignments of one value each; a leading ``+`` or ``++`` means nothing, as keys are checked by name."""
     found = []
     for override, text in zip(_parse_with_hydra(overrides), overrides, strict=True):
         if override.is_sweep_override():
             raise ConfigError(
-                f"{text}: several values; add -m to run each of them, or quote the value: {_quote_for_shell(text)}"
+                f"{text}: several values; add -m to run each of them, or quote the value: "
+                f"{_quote_override_for_shell(text)}"
             )
         if override.package is not None:
             raise ConfigError(f"{text}: packages (@) are not used here; expected KEY=VALUE")
@@ -76,10 +77,10 @@ def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[A
         ``group.name.key=VALUE``; and the other overrides.
     """
     own = [text for text in overrides if key_of(text).partition(".")[0] == group]
-    for key in swept_keys(own):
+    for key in swept_override_keys(own):
         raise ConfigError(f"{key}: several values; expected one")
     values: dict[str, Any] = {}
-    for assignment in parse(own):
+    for assignment in parse_overrides(own):
         name, _, entry = assignment.key.partition(".")[2].partition(".")
         if entry:
             values.setdefault(name, {})[entry] = assignment.value
@@ -89,7 +90,7 @@ def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[A
     return whole, validate(cls, values, group), [text for text in overrides if text not in own]
 
 
-def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
+def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:
     """Return every combination of the values separated by commas, or given by ``range(...)`` or ``choice(...)``.
 
     The last key varies fastest: ``["a=1,2", "b=3"]`` gives ``[["a=1", "b=3"], ["a=2", "b=3"]]``.
@@ -103,7 +104,7 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
         key = override.get_key_element()
         if key.lstrip("+") in NOT_SWEPT:
             raise ConfigError(
-                f"{text}: {key} cannot be swept; quote a value that contains commas: {_quote_for_shell(text)}"
+                f"{text}: {key} cannot be swept; quote a value that contains commas: {_quote_override_for_shell(text)}"
             )
         try:
             values = [f"{key}={v}" for v in itertools.islice(override.sweep_string_iterator(), MAX_RUNS + 1)]
@@ -119,7 +120,7 @@ def expand_sweep(overrides: Sequence[str]) -> list[list[str]]:
     return [list(combination) for combination in itertools.product(*choices)]
 
 
-def sweep_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]]) -> list[str]:
+def sweep_override_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]]) -> list[str]:
     """Return a directory name for each combination, made of the swept keys and their values; all different."""
     swept = [i for i, override in enumerate(_parse_with_hydra(overrides)) if override.is_sweep_override()]
     names: list[str] = []
@@ -132,14 +133,14 @@ def sweep_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]])
 
 
 def quote_override(key: str, value: Any) -> str:
-    """Return ``key=value`` as :func:`parse` reads it back; text that would be read as something else is quoted."""
+    """Return ``key=value`` as :func:`parse_overrides` reads it back; text that would be read otherwise is quoted."""
     if value is None:
         return f"{key}=null"
     if not isinstance(value, str):
         return f"{key}={str(value).lower() if isinstance(value, bool) else repr(value)}"
     plain = f"{key}={value}"
     try:
-        if value and parse([plain])[0].value == value:
+        if value and parse_overrides([plain])[0].value == value:
             return plain
     except ConfigError:
         pass
@@ -156,7 +157,7 @@ def drop_output_overrides(overrides: Iterable[str]) -> list[str]:
     return [text for text in overrides if key_of(text) not in NOT_SWEPT]
 
 
-def swept_keys(overrides: Iterable[str]) -> list[str]:
+def swept_override_keys(overrides: Iterable[str]) -> list[str]:
     """Return the keys that have several values."""
     return [override.key_or_group for override in _parse_with_hydra(list(overrides)) if override.is_sweep_override()]
 
@@ -177,12 +178,12 @@ def _parse_with_hydra(overrides: Sequence[str]) -> list[Any]:
         try:
             found.append(parser.parse_override(text))
         except HydraException as error:
-            hint = f"quote values that contain , = or brackets: {_quote_for_shell(text)}"
+            hint = f"quote values that contain , = or brackets: {_quote_override_for_shell(text)}"
             raise ConfigError(f"{text}: cannot be read; {hint}") from error
     return found
 
 
-def _quote_for_shell(text: str) -> str:
+def _quote_override_for_shell(text: str) -> str:
     """Return how to type an assignment so that both the shell and the grammar take its value literally."""
     key, _, value = text.partition("=")
     value = value.strip("'\"")

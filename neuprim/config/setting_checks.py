@@ -21,7 +21,7 @@ CHOICES = ("task", "scene", "preset", "effort")
 """Keys that choose files and levels."""
 
 
-def check_setting_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str) -> None:
+def check_config_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str) -> None:
     """Raise ConfigError for a key that names no setting, with the nearest that do.
 
     Args:
@@ -120,7 +120,7 @@ def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | No
             raise ConfigError(f"{name}: {owner} does not use this setting{used}")
 
 
-def check_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
+def check_config_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
     """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far
     as the task lists its fields. The model itself may have fewer; what it lacks is refused when it is made."""
     if not spec.fields:

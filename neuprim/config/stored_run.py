@@ -12,10 +12,10 @@ from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from neuprim.config.outputs import DEFAULT_TASK, output_directory, run_name
+from neuprim.config.outputs import DEFAULT_TASK, config_output_directory, config_output_name
 from neuprim.config.run_config import RunConfig, flatten
 from neuprim.config.setting_checks import CHOICES
-from neuprim.config.task_files import task_choices
+from neuprim.config.task_files import read_task_config
 from neuprim.core.errors import ConfigError, cut
 from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
 from neuprim.core.notices import warn_once
@@ -55,26 +55,28 @@ def stored_choices(stored: RunConfig, typed: Choices) -> dict[str, str | None]:
 def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
     """Return the settings of a stored run by the keys that they replace whole; ``$`` is hidden from OmegaConf.
 
-    A file is data: only what users type or packages contain may refer to something (:func:`restore_references`).
+    A file is data: only what users type or packages contain may refer to something (:func:`restore_config_references`).
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
     found["task.options"] = stored.options
     if same_scene:
         found |= {f"scene.{key}": value for key, value in stored.scene.items()}
-    return {key: _replace_text(value, "$", "$\0") for key, value in found.items()}
+    return {key: _replace_config_text(value, "$", "$\0") for key, value in found.items()}
 
 
-def restore_references(value: Any) -> Any:
+def restore_config_references(value: Any) -> Any:
     """Undo what :func:`stored_settings` does to ``$``. No YAML text has the character 0."""
-    return _replace_text(value, "$\0", "$")
+    return _replace_config_text(value, "$\0", "$")
 
 
-def _replace_text(value: Any, old: str, new: str) -> Any:
+def _replace_config_text(value: Any, old: str, new: str) -> Any:
     if isinstance(value, Mapping):
-        return {_replace_text(key, old, new): _replace_text(item, old, new) for key, item in value.items()}
+        return {
+            _replace_config_text(key, old, new): _replace_config_text(item, old, new) for key, item in value.items()
+        }
     if isinstance(value, list | tuple):
-        return [_replace_text(item, old, new) for item in value]
+        return [_replace_config_text(item, old, new) for item in value]
     return value.replace(old, new) if isinstance(value, str) else value
 
 
@@ -99,7 +101,7 @@ def _choice_differs(typed: str | None, own: str | None) -> bool:
 # ---------------------------------------------------------------- resume=true
 
 
-def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool) -> RunConfig | None:
+def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bool) -> RunConfig | None:
     """Return the configuration of the run that ``resume=true`` continues; None where nothing was begun there yet.
 
     Args:
@@ -118,11 +120,11 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
         directory = Path(str(typed["output_dir"])).expanduser()
     else:
         task = choices["task"] or DEFAULT_TASK
-        scene = choices["scene"] or task_choices(TASKS.load_with_info(task)[1]).scene
-        directory = output_directory(None, run_name(task, scene), True)
+        scene = choices["scene"] or read_task_config(TASKS.load_with_info(task)[1]).scene
+        directory = config_output_directory(None, config_output_name(task, scene), True)
     bare = not has_file and typed.keys() <= {"resume", "output_dir"}
     if (directory / "config.yaml").is_file() and (bare or not (directory / _SEARCH).exists()):
-        refuse_run_links(directory)
+        refuse_untrusted_run_links(directory)
         try:
             return RunConfig.from_yaml(directory)
         except ConfigError as error:  # as of a version with other settings
@@ -139,14 +141,14 @@ def find_resumed_run(typed: Mapping[str, Any], choices: Choices, has_file: bool)
     return None
 
 
-def resumed_choices(begun: RunConfig, typed: Choices) -> dict[str, str | None]:
+def resumed_config_choices(begun: RunConfig, typed: Choices) -> dict[str, str | None]:
     """Return task, scene and preset of a run that goes on, which may not change, and the level that was typed."""
     own = _stored_choices_of(begun)
     for key in ("task", "scene", "preset"):
         if _choice_differs(typed[key], own[key]):
             if key == "task":
                 TASKS.find(str(typed[key]))  # a typing error is no other task
-            raise _resume_contradiction(begun, key, typed[key], own[key])
+            raise _resumed_config_error(begun, key, typed[key], own[key])
     return {key: typed[key] or own[key] for key in CHOICES}
 
 
@@ -156,20 +158,20 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
     Budgets, rates, renderers, memory, and the scene's ``paths`` (its settings that say where data lie) may change.
     """
     free = {f"scene.{name}" for name in (*paths, *_FREE)}
-    before, after = _fixed_settings(begun), _fixed_settings(now)
+    before, after = _fixed_config_settings(begun), _fixed_config_settings(now)
     for key, value in before.items():
         if key not in free and key in after and after[key] != value:
-            raise _resume_contradiction(begun, key, after[key], value)
+            raise _resumed_config_error(begun, key, after[key], value)
 
 
-def _resume_contradiction(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
+def _resumed_config_error(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
     return ConfigError(
         f"{key}={format_value(typed)}: the run to resume was begun with {key}={format_value(was)} ({begun.source}); "
         f"expected that, no {key}, or another output_dir"
     )
 
 
-def _fixed_settings(config: RunConfig) -> dict[str, Any]:
+def _fixed_config_settings(config: RunConfig) -> dict[str, Any]:
     tree = config.to_dict()
     options = {"options": tree["task"]["options"]}
     found = flatten({"model": tree["model"], "scene": config.scene, "task": options, "seed": config.seed})
@@ -196,7 +198,7 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
         "metrics.lpips": config.metrics.lpips,
     }
     run_dir = config.source.parent.resolve()
-    for key, value in _list_texts("", tree):
+    for key, value in _list_config_texts("", tree):
         if typed is not None and any(key == name or key.startswith(f"{name}.") for name in typed):
             continue
         share = value.startswith("\\\\" if os.name != "nt" else ("\\\\", "//"))
@@ -213,7 +215,7 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
         )
 
 
-def refuse_run_links(run_dir: Path) -> None:
+def refuse_untrusted_run_links(run_dir: Path) -> None:
     """Raise ConfigError for a folder in a run directory that is a link out of it, unless the user trusts it."""
     if trusted() or not run_dir.is_dir():
         return
@@ -225,12 +227,12 @@ def refuse_run_links(run_dir: Path) -> None:
             )
 
 
-def _list_texts(key: str, value: Any) -> Iterator[tuple[str, str]]:
+def _list_config_texts(key: str, value: Any) -> Iterator[tuple[str, str]]:
     if isinstance(value, Mapping):
         for name, item in value.items():
-            yield from _list_texts(f"{key}.{name}" if key else str(name), item)
+            yield from _list_config_texts(f"{key}.{name}" if key else str(name), item)
     elif isinstance(value, list | tuple):
         for item in value:
-            yield from _list_texts(key, item)
+            yield from _list_config_texts(key, item)
     elif isinstance(value, str | Path):
         yield key, str(value)

@@ -53,7 +53,7 @@ class Level:
     settings: tuple[Assignment, ...]
 
 
-def task_choices(spec: TaskSpec) -> TaskChoices:
+def read_task_config(spec: TaskSpec) -> TaskChoices:
     """Read ``task/NAME.yaml``, which names only what the task has."""
     place = f"task/{spec.name}.yaml"
     who = f"task {spec.name!r}: {place}"
@@ -61,7 +61,10 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
     try:
         refuse_unknown(node, ("scene", "preset", "options"), "")
         scene, preset = node.get("scene") or spec.scenes[0].name, node.get("preset") or DEFAULT_PRESET
-        for key, value, names in (("scene", scene, [s.name for s in spec.scenes]), ("preset", preset, presets(spec))):
+        for key, value, names in (
+            ("scene", scene, [s.name for s in spec.scenes]),
+            ("preset", preset, list_task_presets(spec)),
+        ):
             if value not in names:
                 raise ConfigError(f"{key}={value}: no such {key}" + nearest(str(value), names))
         options = complete_task_options(spec.options, node.get("options") or {}, "its TaskSpec", "options")
@@ -70,14 +73,14 @@ def task_choices(spec: TaskSpec) -> TaskChoices:
     return TaskChoices(scene, preset, options)
 
 
-def presets(spec: TaskSpec) -> list[str]:
+def list_task_presets(spec: TaskSpec) -> list[str]:
     """Return the names of a task's presets."""
     folder = find_config_package(spec) / "preset" / spec.name
     entries = folder.iterdir() if folder.is_dir() else ()
     return sorted(entry.name.removesuffix(".yaml") for entry in entries if entry.name.endswith(".yaml"))
 
 
-def check_groups(spec: TaskSpec) -> None:
+def check_config_groups(spec: TaskSpec) -> None:
     """Raise ConfigError when the configuration package cannot be used or lacks a file that a run would need."""
     who = f"task {spec.name!r}"
     if not spec.scenes:
@@ -85,11 +88,11 @@ def check_groups(spec: TaskSpec) -> None:
     places = [f"task/{spec.name}.yaml", *(f"scene/{spec.name}/{scene.name}.yaml" for scene in spec.scenes)]
     for place in places:
         _require_config_file(spec.config_package, place, who)
-    if not presets(spec):
+    if not list_task_presets(spec):
         raise ConfigError(f"{who}: {spec.config_package} has no preset/{spec.name}/*.yaml")
 
 
-def check_scene(spec: TaskSpec, scene: str, package: str) -> None:
+def check_scene_config(spec: TaskSpec, scene: str, package: str) -> None:
     """Raise ConfigError when the package that adds ``scene`` to a task has no YAML file for it."""
     _require_config_file(package, f"scene/{spec.name}/{scene}.yaml", f"scene {scene!r} of task {spec.name!r}")
 
@@ -170,13 +173,15 @@ def _open_config_package(name: str, who: str) -> Traversable:
 # ---------------------------------------------------------------- levels of effort
 
 
-def choose_effort_level(spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]) -> Level | None:
+def choose_config_effort_level(
+    spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]
+) -> Level | None:
     """Return the level that ``effort=N`` names, which must be of the ``preset`` that was typed, if any."""
     if chosen is None:
         return None
     if chosen not in map(str, LEVELS):
         raise ConfigError(f"{EFFORT}={chosen}: expected a level from {LEVELS[0]} (fast) to {LEVELS[-1]} (good)")
-    levels = read_effort_levels(spec, presets)
+    levels = read_config_effort_levels(spec, presets)
     typed = f"{EFFORT}={chosen}"
     if levels is None:
         instead = "set model.primitives=N and train.iterations=N instead"
@@ -188,7 +193,7 @@ def choose_effort_level(spec: TaskSpec, chosen: str | None, preset: str | None, 
     return level
 
 
-def read_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
+def read_config_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
     """Return a task's levels by their numbers; None where it has none."""
     place = f"effort/{spec.name}.yaml"
     file = find_config_package(spec) / place
@@ -197,12 +202,12 @@ def read_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, L
     who = f"task {spec.name!r}: {place}"
     node = read_task_yaml(file, who)
     try:
-        return _parse_effort_levels(node, presets)
+        return _parse_config_effort_levels(node, presets)
     except ConfigError as error:
         raise ConfigError(f"{who}: {error}") from error
 
 
-def _parse_effort_levels(node: Mapping[str, Any], presets: Sequence[str]) -> dict[int, Level]:
+def _parse_config_effort_levels(node: Mapping[str, Any], presets: Sequence[str]) -> dict[int, Level]:
     refuse_unknown(node, ("preset", "levels"), "")
     preset, levels = node.get("preset"), node.get("levels")
     if preset not in presets:

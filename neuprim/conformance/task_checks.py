@@ -12,9 +12,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.config import check_groups, preset_settings, presets, task_choices
+from neuprim.config import check_config_groups, list_task_presets, preset_settings, read_task_config
 from neuprim.config.setting_checks import complete_task_options
-from neuprim.config.task_files import Level, read_effort_levels
+from neuprim.config.task_files import Level, read_config_effort_levels
 from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest, drawn_range, random_condition
 from neuprim.core import checkpoint
 from neuprim.core.channels import find_channels
@@ -53,11 +53,13 @@ def check_description(t: TaskUnderTest) -> None:
     t.require(problem is None, "TaskSpec", problem, "members as documented in neuprim.core.task.TaskSpec")
     t.require(t.task.api == API_VERSION, "TaskSpec.api", t.task.api, API_VERSION)
     t.require(bool(t.task.fields), "TaskSpec.fields", t.task.fields, "every field class by its name")
-    check_groups(t.task)
-    choice = task_choices(t.task)
+    check_config_groups(t.task)
+    choice = read_task_config(t.task)
     known = t.task.parameter_names() | {s.name for s in GEOMETRY_SPECS}
-    chosen: list[tuple[str, str, Level | None]] = [(f"preset {preset}", preset, None) for preset in presets(t.task)]
-    levels = read_effort_levels(t.task, presets(t.task)) or {}
+    chosen: list[tuple[str, str, Level | None]] = [
+        (f"preset {preset}", preset, None) for preset in list_task_presets(t.task)
+    ]
+    levels = read_config_effort_levels(t.task, list_task_presets(t.task)) or {}
     chosen += [(f"effort {number}", level.preset, level) for number, level in levels.items()]
     for where, preset, level in chosen:
         settings = preset_settings(t.task, preset, choice.scene, level)

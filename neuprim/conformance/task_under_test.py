@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.config import RunSettings, preset_settings, task_choices
+from neuprim.config import RunSettings, preset_settings, read_task_config
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.errors import NonFiniteError
@@ -87,7 +87,7 @@ class TaskUnderTest:
     @cached_property
     def settings(self) -> RunSettings:
         """The preset's settings with a few primitives and the reference backend."""
-        choice = task_choices(self.task)
+        choice = read_task_config(self.task)
         found = preset_settings(self.task, self.preset or choice.preset, choice.scene)
         model = replace(found.model, **{"primitives": PRIMITIVES, **self.changes})
         return replace(found, model=model, renderer=RenderSettings(backend=REFERENCE))
@@ -95,7 +95,7 @@ class TaskUnderTest:
     @cached_property
     def options(self) -> dict[str, Any]:
         """The task's own options at their defaults."""
-        return task_choices(self.task).options
+        return read_task_config(self.task).options
 
     @cached_property
     def dataset(self) -> Dataset:

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from neuprim.config import Job
+from neuprim.config import ConfigWithTask
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
@@ -34,7 +34,12 @@ _PACE_WARMUP, _PACE_STEPS = 5, 20
 
 
 def make_run_finetune_trainer(
-    job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
+    job: ConfigWithTask,
+    dataset: Dataset,
+    model: Primitives,
+    steps: int,
+    begin: float = BEGIN,
+    voxels_every: int = VOXELS_EVERY,
 ) -> Trainer:
     """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 
@@ -68,7 +73,7 @@ def make_run_finetune_trainer(
     return trainer
 
 
-def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
+def count_run_finetune_steps(seconds: float, job: ConfigWithTask, dataset: Dataset, model: Primitives) -> int:
     """How many steps of fine-tuning fit into some seconds, at the measured pace; none in 0 seconds."""
     if seconds <= 0:
         return 0

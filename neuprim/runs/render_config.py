@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import interpolate
 
-from neuprim.config.overrides import parse, quote_override
+from neuprim.config.overrides import parse_overrides, quote_override
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.checkpoint import read_header
 from neuprim.core.compression import is_compressed
@@ -197,7 +197,7 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
     """
     values: dict[str, Any] = dataclasses.asdict(defaults)
     resolution, reduced, storage = 1.0, dict[tuple[str, str], int](), dict[str, str]()
-    for assignment in parse(overrides):
+    for assignment in parse_overrides(overrides):
         head, dot, name = assignment.key.partition(".")
         if head == "resolution" and not dot:
             resolution = coerce(assignment.value, _Resolution, "resolution")

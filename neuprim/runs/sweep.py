@@ -13,7 +13,7 @@ from pathlib import Path
 
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.config.overrides import drop_output_overrides, parse, swept_keys
+from neuprim.config.overrides import drop_output_overrides, parse_overrides, swept_override_keys
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import write_text
 from neuprim.report.run_record import RunRecord, read_run
@@ -42,7 +42,7 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
     Raises:
         ConfigError: there is no sweep.
     """
-    given = {a.key: a.value for a in parse(words)}
+    given = {a.key: a.value for a in parse_overrides(words)}
     folder = Path(str(given["output_dir"])).expanduser() if given.get("output_dir") is not None else None
     before = None if folder is None or given.get("resume") is not True else read_sweep(folder)
     if before is None:
@@ -120,11 +120,11 @@ def run_sweep(
         NeuprimError: another process is at work in the sweep's directory, or a launcher cannot work here.
         OSError: the sweep's own files cannot be written.
     """
-    folder, keys = configs[0].output_dir.parent, set(swept_keys(words))
+    folder, keys = configs[0].output_dir.parent, set(swept_override_keys(words))
     runs = []
     for config in configs:
         own = tuple(drop_output_overrides(config.overrides))
-        swept = {a.key: a.text.partition("=")[2] for a in parse(own) if a.key in keys}
+        swept = {a.key: a.text.partition("=")[2] for a in parse_overrides(own) if a.key in keys}
         runs.append(LaunchedRun(config.output_dir.name, own, swept))
     record = LaunchRecord(folder / SWEEP_FILE, tuple(drop_output_overrides(words)), tuple(runs))
     record = record.resume(read_sweep(folder) if configs[0].resume else None, more=True)

@@ -18,10 +18,10 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import Job, RunConfig, compose, find_run_plugins, load_run_task
+from neuprim.config import ConfigWithTask, RunConfig, compose, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.outputs import ROOT
-from neuprim.config.overrides import parse, quote_override
+from neuprim.config.overrides import parse_overrides, quote_override
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset
@@ -98,9 +98,9 @@ def run_ablation(
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
     models = _compose_model_set(request.words, seeds, launcher)
-    folder, centre, task = models.folder, models.centre, load_run_task(models.centre)
+    folder, centre, task = models.folder, models.centre, load_config_task(models.centre)
     with use_one_torch_thread_for_run(), use_launcher_threads_for_runs(launcher), ExitStack() as stack:
-        stack.enter_context(find_run_plugins(centre).attribute_errors())
+        stack.enter_context(find_config_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)
         check_knobs(request, variants, f"a model of task {task.name!r}")
         before = read_tradeoff_record(folder / TRADEOFF_FILE)
@@ -108,7 +108,7 @@ def run_ablation(
         stack.enter_context(lock_run_directory(folder, "set"))
         plan = None if before is None else _parse_plan(folder / TRADEOFF_FILE, before)
         render_ground_truth_before_run(centre, launcher, progress)
-        dataset = load_dataset(Job(centre, task), progress)
+        dataset = load_dataset(ConfigWithTask(centre, task), progress)
         check_dataset(dataset, task.conditions)
         views = eval_views(dataset, request.views)
         if not views:
@@ -279,7 +279,7 @@ class _AblationSession(TradeoffSession):
 
     def _trial(self, variant: Variant, seed: int) -> Trial:
         words = self.plan.overrides(variant, self.words, self.centre)
-        quiet = [] if any(a.key == "train.eval_every" for a in parse(words)) else ["train.eval_every=0"]
+        quiet = [] if any(a.key == "train.eval_every" for a in parse_overrides(words)) else ["train.eval_every=0"]
         place = quote_override("output_dir", str(self._run_dir(variant, seed)))
         own = [*quiet, quote_override("seed", self.centre.seed + seed), place]
         return Trial(compose(merge_overrides(words, own), check_output=False), views=self.request.views)
@@ -344,7 +344,7 @@ class _AblationSession(TradeoffSession):
 
 
 def _compose_model_set(overrides: Sequence[str], seeds: int, launcher: LauncherSettings) -> _ModelSet:
-    typed = parse(overrides)
+    typed = parse_overrides(overrides)
     words = [a.text for a in typed if a.key not in ("output_dir", "resume", "budget")]
     places = [a.value for a in typed if a.key == "output_dir" and a.value is not None]
     centre = compose([*words, "output_dir=null"], check_output=False)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 from neuprim.config import RunConfig
-from neuprim.config.overrides import parse, quote_override
+from neuprim.config.overrides import parse_overrides, quote_override
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
@@ -74,8 +74,8 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
 
 def merge_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
     """Return overrides with others over them, each setting once."""
-    again = {assignment.key for assignment in parse(over)}
-    return [*(a.text for a in parse(words) if a.key not in again), *over]
+    again = {assignment.key for assignment in parse_overrides(over)}
+    return [*(a.text for a in parse_overrides(words) if a.key not in again), *over]
 
 
 @dataclass
@@ -100,7 +100,7 @@ class AblationPlan:
         budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
         every, key = centre.train.population.every, "train.population.every"
         scaled = max(1, round(every * steps / self.whole)) if self.whole else every
-        if scaled != every and key not in {assignment.key for assignment in parse(words)}:
+        if scaled != every and key not in {assignment.key for assignment in parse_overrides(words)}:
             budget.append(quote_override(key, scaled))
         return merge_overrides(words, [*variant.turned, *budget])
 

@@ -14,7 +14,7 @@ from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import find_run_plugins
+from neuprim.config import find_config_plugins
 from neuprim.core.compute.threads import core_count
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
@@ -106,7 +106,7 @@ def measure_tradeoff(
     knobs = list_render_knobs(setup.reference, setup.model)
     check_knobs(request, knobs, "this run")
     record = _resume_render_tradeoff(folder / TRADEOFF_FILE, _render_identity(setup), tell)
-    with find_run_plugins(setup.config).attribute_errors(), use_one_torch_thread_for_run():
+    with find_config_plugins(setup.config).attribute_errors(), use_one_torch_thread_for_run():
         if (reason := setup.unsupported(setup.reference)) is not None:
             raise ConfigError(reason)
         record.facts |= {**describe_setup(setup), "primitives": setup.model.count}

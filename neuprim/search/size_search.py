@@ -10,8 +10,8 @@ from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
-from neuprim.config import RunConfig, load_run_task
-from neuprim.config.command_settings import Target
+from neuprim.config import RunConfig, load_config_task
+from neuprim.config.command_settings import TargetSettings
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
@@ -122,7 +122,7 @@ class SizeSearch:
     """One search; resumes from its record."""
 
     config: RunConfig
-    target: Target
+    target: TargetSettings
     dataset: Dataset
     record: TargetRecord
     runner: TrialRunner
@@ -283,7 +283,7 @@ class SizeSearch:
         """Try settings that save bytes, at the size nearest to the wanted one."""
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return
-        values = list_smaller_settings(self.config, load_run_task(self.config), self.dataset)
+        values = list_smaller_settings(self.config, load_config_task(self.config), self.dataset)
         for _ in range(_MAX_CHANGES):
             change = next_setting_change(values, self.record.turns)
             wanted = self._wanted()

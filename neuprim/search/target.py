@@ -16,8 +16,8 @@ from typing import Any
 
 import torch
 
-from neuprim.config import Job, RunConfig, find_run_plugins, load_run_task
-from neuprim.config.command_settings import LauncherSettings, Target
+from neuprim.config import ConfigWithTask, RunConfig, find_config_plugins, load_config_task
+from neuprim.config.command_settings import LauncherSettings, TargetSettings
 from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import Quantizers
 from neuprim.core.data import Dataset
@@ -55,7 +55,7 @@ _MEASURES = ("psnr", "ssim")
 
 def run_target(
     config: RunConfig,
-    target: Target,
+    target: TargetSettings,
     budget: float,
     events: Events = ignore_run_event,
     clock: Callable[[], float] = time.monotonic,
@@ -74,17 +74,17 @@ def run_target(
         NeuprimError: invalid input, or a budget in which nothing can be trained.
     """
     _check_target_config(config)
-    record = _resume_target(config, {**target.given(), "budget": budget})
+    record = _resume_target(config, {**target.given_settings(), "budget": budget})
     if record.achieved:
         return record
-    plugins, begun, task, folder = find_run_plugins(config), clock(), load_run_task(config), config.output_dir
+    plugins, begun, task, folder = find_config_plugins(config), clock(), load_config_task(config), config.output_dir
     with lock_run_directory(folder, "search"), plugins.attribute_errors(), use_launcher_threads_for_runs(launcher):
 
         def show_progress(text: str, fraction: float) -> None:
             events(Preparing(text, fraction))
 
         render_ground_truth_before_run(config, launcher, show_progress)
-        dataset = load_dataset(Job(config, task), show_progress)
+        dataset = load_dataset(ConfigWithTask(config, task), show_progress)
         check_dataset(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
         loaded = clock()
@@ -251,7 +251,7 @@ def _prune_full_run(
     if made.run_dir is None:
         record.why.append("nothing could be pruned")
         return before
-    task = load_run_task(runner.config)
+    task = load_config_task(runner.config)
     model, _ = load_model(made.run_dir / "model.safetensors", task)
     held = _measure_held_out(runner, model)
     old, new = (default_compressed_bytes(one, task) for one in (before.run_dir, made.run_dir))
@@ -272,7 +272,7 @@ def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _Tar
 
     With a limit of bytes alone, quantize as finely as it allows.
     """
-    target, task, file = predictor.target, load_run_task(runner.config), before.run_dir / COMPRESSED
+    target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model(before.run_dir / "model.safetensors", task)
     text = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
     margin = predictor.margin(before.held)

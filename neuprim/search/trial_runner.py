@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from neuprim.config import RunConfig, load_run_task
+from neuprim.config import RunConfig, load_config_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
@@ -130,7 +130,7 @@ class TrialRunner:
         attempt.outcome = asdict(outcome)
         if attempt.purpose != "pace":
             config = self.configure(attempt)
-            attempt.packed = default_compressed_bytes(config.output_dir, load_run_task(config))
+            attempt.packed = default_compressed_bytes(config.output_dir, load_config_task(config))
         self.write_record()
 
     def pace(self, primitives: float) -> float:

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import Job, RunConfig, current_provenance, find_run_plugins, load_run_task
+from neuprim.config import ConfigWithTask, RunConfig, current_config_provenance, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.run_config import flatten
 from neuprim.core.data import Dataset
@@ -137,7 +137,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
             if isinstance(event, Step):
                 ends.append(event.report.seconds)
 
-        with find_run_plugins(config).attribute_errors():
+        with find_config_plugins(config).attribute_errors():
             resumed = replace(config, resume=before is not None)
             fitted, interrupted = train_in_directory(resumed, note_steps, dataset, trial.hold_out)
             if interrupted:
@@ -167,7 +167,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
 def _trial_request(trial: Trial) -> dict[str, Any]:
     """Return the settings that must be equal to reuse a folder, as JSON reads them back."""
-    config = replace(trial.config, made_by=current_provenance(trial.config, load_run_task(trial.config)))
+    config = replace(trial.config, made_by=current_config_provenance(trial.config, load_config_task(trial.config)))
     settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))
     return request
@@ -184,7 +184,7 @@ def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outc
     key = json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True)
     if key not in _trial_datasets:
         _trial_datasets.clear()
-        _trial_datasets[key] = load_dataset(Job.of(config), lambda text, part: events(Preparing(text, part)))
+        _trial_datasets[key] = load_dataset(ConfigWithTask.of(config), lambda text, part: events(Preparing(text, part)))
     return run_trial(Trial(config, data["hold_out"], data["views"]), _trial_datasets[key], events)
 
 

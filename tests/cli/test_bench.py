@@ -9,7 +9,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.cli.measure_commands import parse_table_numbers
-from neuprim.config import presets
+from neuprim.config import list_task_presets
 from neuprim.core.errors import ConfigError
 from neuprim.plugins.registry import load_task
 from neuprim.runs.open import read_metrics
@@ -33,7 +33,7 @@ def test_the_tables_are_those_of_the_appendix() -> None:
         assert math.isclose(sum(f.ssim or 0 for f in own) / len(own), ssim, abs_tol=6e-4)
         assert math.isclose(sum(f.lpips or 0 for f in own) / len(own), lpips, abs_tol=6e-4)
     presets_of_rows = {row.preset for table in load_paper_run_tables() for row in table.rows}
-    assert presets_of_rows == {name for name in presets(load_task("static")) if name.startswith("paper")}
+    assert presets_of_rows == {name for name in list_task_presets(load_task("static")) if name.startswith("paper")}
 
 
 def test_without_data_it_lists(capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,12 +10,12 @@ import pytest
 from neuprim.config.command_settings import (
     LOOPBACK,
     LauncherSettings,
-    Target,
+    TargetSettings,
     ViewerSettings,
-    parse_duration,
-    take_launcher,
-    take_target,
-    take_viewer,
+    parse_duration_setting,
+    take_launcher_overrides,
+    take_target_overrides,
+    take_viewer_overrides,
 )
 from neuprim.core.errors import ConfigError
 
@@ -27,21 +27,29 @@ PROCESSES = "launcher=processes"
 @pytest.mark.parametrize(
     ("take", "words", "expected"),
     [
-        (take_launcher, [], LauncherSettings()),
-        (take_launcher, [PROCESSES, "launcher.workers=4"], LauncherSettings("processes", workers=4)),
+        (take_launcher_overrides, [], LauncherSettings()),
+        (take_launcher_overrides, [PROCESSES, "launcher.workers=4"], LauncherSettings("processes", workers=4)),
         (
-            take_launcher,
+            take_launcher_overrides,
             ["+launcher=ray", "launcher.options.num_gpus=1"],
             LauncherSettings("ray", options={"num_gpus": 1}),
         ),
-        (take_viewer, [], None),
-        (take_viewer, ["viewer=false", "viewer.port=1"], None),
-        (take_viewer, ["viewer=true"], ViewerSettings(LOOPBACK, 8080)),
-        (take_viewer, ["viewer.port=0"], ViewerSettings(LOOPBACK, 0)),
-        (take_viewer, ["++viewer=true", "viewer.host=0.0.0.0"], ViewerSettings("0.0.0.0", 8080)),
-        (take_target, [], None),
-        (take_target, ["target.psnr=30", "target.megabytes=1.5", BUDGET], (Target(psnr=30, megabytes=1.5), 600.0)),
-        (take_target, ["target.fps=30", "budget=1h", "target.fps=60", "budget=1.5m"], (Target(fps=60), 90.0)),
+        (take_viewer_overrides, [], None),
+        (take_viewer_overrides, ["viewer=false", "viewer.port=1"], None),
+        (take_viewer_overrides, ["viewer=true"], ViewerSettings(LOOPBACK, 8080)),
+        (take_viewer_overrides, ["viewer.port=0"], ViewerSettings(LOOPBACK, 0)),
+        (take_viewer_overrides, ["++viewer=true", "viewer.host=0.0.0.0"], ViewerSettings("0.0.0.0", 8080)),
+        (take_target_overrides, [], None),
+        (
+            take_target_overrides,
+            ["target.psnr=30", "target.megabytes=1.5", BUDGET],
+            (TargetSettings(psnr=30, megabytes=1.5), 600.0),
+        ),
+        (
+            take_target_overrides,
+            ["target.fps=30", "budget=1h", "target.fps=60", "budget=1.5m"],
+            (TargetSettings(fps=60), 90.0),
+        ),
     ],
 )
 def test_a_group_is_taken_out_of_the_overrides(take: Take, words: list[str], expected: Any) -> None:
@@ -51,26 +59,34 @@ def test_a_group_is_taken_out_of_the_overrides(take: Take, words: list[str], exp
 @pytest.mark.parametrize(
     ("take", "words", "message"),
     [
-        (take_launcher, ["launcher=prosesses"], "launcher=prosesses: no such launcher; did you mean 'processes'?"),
-        (take_launcher, ["launcher=ray,processes"], "launcher: several values; expected one"),
-        (take_launcher, [PROCESSES, "launcher.worker=2"], "did you mean 'launcher.workers'"),
-        (take_launcher, ["launcher.workers=2"], "launcher.workers: launcher=inline does not use it"),
-        (take_launcher, [PROCESSES, "launcher.address=auto"], "launcher=processes does not use it; expected it with"),
-        (take_launcher, [PROCESSES, "launcher.options.num_gpus=1"], "launcher.options: launcher=processes"),
-        (take_launcher, ["launcher=ray", "launcher.options=3"], "launcher.options=3: expected entries"),
-        (take_viewer, ["viewer=yes"], "viewer=yes: expected true or false"),
-        (take_viewer, ["viewer.prot=80"], "viewer.prot: no such setting; did you mean 'viewer.port'"),
-        (take_viewer, ["viewer.port=1,2"], "viewer.port: several values; expected one"),
-        (take_target, ["target.psnr=30"], "target.psnr=30: expected a budget beside it"),
-        (take_target, [BUDGET], "budget=10m: no target; expected one of target.psnr=DB, target.ssim=S"),
-        (take_target, ["target.pnsr=30", BUDGET], "target.pnsr: no such setting; did you mean 'target.psnr'"),
-        (take_target, ["target=30", BUDGET], "target=30: expected one of target.psnr=DB"),
-        (take_target, ["target.psnr=null"], "target: no target; expected one of"),
-        (take_target, ["target.psnr=-3", BUDGET], "target.psnr=-3: expected decibels, above 0"),
-        (take_target, ["target.psnr=28,30", BUDGET], "target.psnr: several values; expected one"),
-        (take_target, ["target.psnr=30", "budget=600"], "budget=600: expected a time such as 90s"),
-        (take_target, ["target.psnr=30", "budget=0m"], "budget=0m: expected a time such as 90s"),
-        (take_target, ["target.psnr=30", "budget.minutes=3"], "budget.minutes: no such setting"),
+        (
+            take_launcher_overrides,
+            ["launcher=prosesses"],
+            "launcher=prosesses: no such launcher; did you mean 'processes'?",
+        ),
+        (take_launcher_overrides, ["launcher=ray,processes"], "launcher: several values; expected one"),
+        (take_launcher_overrides, [PROCESSES, "launcher.worker=2"], "did you mean 'launcher.workers'"),
+        (take_launcher_overrides, ["launcher.workers=2"], "launcher.workers: launcher=inline does not use it"),
+        (
+            take_launcher_overrides,
+            [PROCESSES, "launcher.address=auto"],
+            "launcher=processes does not use it; expected it with",
+        ),
+        (take_launcher_overrides, [PROCESSES, "launcher.options.num_gpus=1"], "launcher.options: launcher=processes"),
+        (take_launcher_overrides, ["launcher=ray", "launcher.options=3"], "launcher.options=3: expected entries"),
+        (take_viewer_overrides, ["viewer=yes"], "viewer=yes: expected true or false"),
+        (take_viewer_overrides, ["viewer.prot=80"], "viewer.prot: no such setting; did you mean 'viewer.port'"),
+        (take_viewer_overrides, ["viewer.port=1,2"], "viewer.port: several values; expected one"),
+        (take_target_overrides, ["target.psnr=30"], "target.psnr=30: expected a budget beside it"),
+        (take_target_overrides, [BUDGET], "budget=10m: no target; expected one of target.psnr=DB, target.ssim=S"),
+        (take_target_overrides, ["target.pnsr=30", BUDGET], "target.pnsr: no such setting; did you mean 'target.psnr'"),
+        (take_target_overrides, ["target=30", BUDGET], "target=30: expected one of target.psnr=DB"),
+        (take_target_overrides, ["target.psnr=null"], "target: no target; expected one of"),
+        (take_target_overrides, ["target.psnr=-3", BUDGET], "target.psnr=-3: expected decibels, above 0"),
+        (take_target_overrides, ["target.psnr=28,30", BUDGET], "target.psnr: several values; expected one"),
+        (take_target_overrides, ["target.psnr=30", "budget=600"], "budget=600: expected a time such as 90s"),
+        (take_target_overrides, ["target.psnr=30", "budget=0m"], "budget=0m: expected a time such as 90s"),
+        (take_target_overrides, ["target.psnr=30", "budget.minutes=3"], "budget.minutes: no such setting"),
     ],
 )
 def test_what_makes_no_sense_is_refused_in_one_line(take: Take, words: list[str], message: str) -> None:
@@ -80,6 +96,6 @@ def test_what_makes_no_sense_is_refused_in_one_line(take: Take, words: list[str]
 
 
 def test_times_in_words() -> None:
-    assert [parse_duration(text, text) for text in ("90s", "10m", "1.5h")] == [90.0, 600.0, 5400.0]
+    assert [parse_duration_setting(text, text) for text in ("90s", "10m", "1.5h")] == [90.0, 600.0, 5400.0]
     with pytest.raises(ConfigError, match="--budget 5 m: expected a time"):
-        parse_duration("5 m", "--budget 5 m")
+        parse_duration_setting("5 m", "--budget 5 m")

@@ -2,7 +2,7 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.config import RunConfig, compose, compose_all, expand_sweep
+from neuprim.config import RunConfig, compose, compose_all, expand_sweep_overrides
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.task import SceneContext
 from neuprim.plugins.registry import load_task
@@ -193,13 +193,13 @@ def test_occupied_directory_is_refused(toy: Path) -> None:
 
 
 def test_expand_sweep() -> None:
-    made = expand_sweep(["a=1,2", "b=3", "c=x,y"])
+    made = expand_sweep_overrides(["a=1,2", "b=3", "c=x,y"])
     assert made == [[a, "b=3", c] for a in ("a=1", "a=2") for c in ("c=x", "c=y")]
-    assert expand_sweep(["a=range(1,4)"]) == [["a=1"], ["a=2"], ["a=3"]]
-    assert expand_sweep(["a=choice(x,y)"]) == [["a=x"], ["a=y"]]
-    assert expand_sweep(["a=[1,2]", "p='x,y=z w'"]) == [["a=[1,2]", "p='x,y=z w'"]]
-    assert expand_sweep(["p='a,b','c=d e'"]) == [["p='a,b'"], ["p='c=d e'"]]
-    assert expand_sweep([]) == [[]]
+    assert expand_sweep_overrides(["a=range(1,4)"]) == [["a=1"], ["a=2"], ["a=3"]]
+    assert expand_sweep_overrides(["a=choice(x,y)"]) == [["a=x"], ["a=y"]]
+    assert expand_sweep_overrides(["a=[1,2]", "p='x,y=z w'"]) == [["a=[1,2]", "p='x,y=z w'"]]
+    assert expand_sweep_overrides(["p='a,b','c=d e'"]) == [["p='a,b'"], ["p='c=d e'"]]
+    assert expand_sweep_overrides([]) == [[]]
 
 
 @pytest.mark.parametrize(
@@ -215,7 +215,7 @@ def test_expand_sweep() -> None:
 )
 def test_impossible_sweeps(word: str, text: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        expand_sweep([word])
+        expand_sweep_overrides([word])
     assert text in str(caught.value)
 
 

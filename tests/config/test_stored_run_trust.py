@@ -9,7 +9,7 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose, read_stored_config
-from neuprim.config.stored_run import refuse_run_links, refuse_untrusted_settings
+from neuprim.config.stored_run import refuse_untrusted_run_links, refuse_untrusted_settings
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io.trust import ENVIRONMENT, trusting
 from neuprim.runs.open import make_run_scene_context
@@ -93,9 +93,9 @@ def test_folders_that_are_links_out_of_the_run_are_refused(tmp_path: Path) -> No
     run = tmp_path / "run"
     (run / "own").mkdir(parents=True)
     (run / "inside").symlink_to(run / "own")
-    refuse_run_links(run)
+    refuse_untrusted_run_links(run)
     (run / "renders").symlink_to(tmp_path)
     with pytest.raises(ConfigError, match=r"run/renders: is a link to .*, outside of the run"):
-        refuse_run_links(run)
+        refuse_untrusted_run_links(run)
     with trusting(True):
-        refuse_run_links(run)
+        refuse_untrusted_run_links(run)

@@ -17,7 +17,7 @@ from neuprim.cli import COMMANDS
 from neuprim.cli.command import split_render_overrides
 from neuprim.cli.measure_commands import is_override
 from neuprim.config import compose, compose_all
-from neuprim.config.command_settings import take_launcher, take_target, take_viewer
+from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
 from neuprim.config.overrides import drop_output_overrides
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_conditions
@@ -167,21 +167,21 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     settings = [*getattr(args, "overrides", []), *(word for word in rest if not word.startswith("-"))]
     flags = [word for word in rest if word.startswith("-")]
     if name == "run":
-        for take in (take_viewer, take_launcher, take_target):
+        for take in (take_viewer_overrides, take_launcher_overrides, take_target_overrides):
             _, settings = take(settings)
         if (args.multirun and not drop_output_overrides(settings)) or args.config is not None:
             settings = ["task=static", *settings]  # the others are in a file
         (compose_all if args.multirun else compose)(settings, False)
         rest = flags
     elif name == "truth":
-        (compose_all if args.multirun else compose)(take_launcher(settings)[1], False)
+        (compose_all if args.multirun else compose)(take_launcher_overrides(settings)[1], False)
         rest = flags
     elif name == "bench":
         compose(["scene=blender", "scene.path=DIR", *settings], False)
         rest = flags
     elif name == "tradeoff" and is_override(args.run_dir):
         typed = [word for word in (args.run_dir, *settings) if not word.startswith("budget=")]
-        compose(take_launcher(typed)[1], False)
+        compose(take_launcher_overrides(typed)[1], False)
         rest = flags
     elif name in ("eval", "render", "tradeoff"):
         _, rest = split_render_overrides(rest)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.config.command_settings import Target
+from neuprim.config.command_settings import TargetSettings
 from neuprim.search import size_search
 from neuprim.search.size_forecast import SizePredictor
 from neuprim.search.size_search import SizeSearch
@@ -109,13 +109,13 @@ class SimulatedRunner(TrialRunner):
 
 
 def simulate_search(
-    curves: dict[str, Curves], target: Target, start: int, seed: int = 0, more: Callable[..., Any] | None = None
+    curves: dict[str, Curves], target: TargetSettings, start: int, seed: int = 0, more: Callable[..., Any] | None = None
 ) -> tuple[Attempt, SimulatedRunner]:
     """Search with simulated trainings; returns the chosen full run."""
     train = SimpleNamespace(iterations=3000)
     config: Any = SimpleNamespace(model=SimpleNamespace(primitives=start), train=train, task="static")
     dataset: Any = SimpleNamespace(train=range(64), test=range(16))
-    record = TargetRecord({**target.given(), "budget": 60.0}, {}, hold_out=8)
+    record = TargetRecord({**target.given_settings(), "budget": 60.0}, {}, hold_out=8)
     runner = SimulatedRunner(config, dataset, record, lambda event: None, curves=curves, seed=seed)
     ladder = {}
     for word in curves:
@@ -123,7 +123,7 @@ def simulate_search(
             key, _, value = word.partition("=")
             ladder[key] = (int(value) if value.isdigit() else value, "usual")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(size_search, "load_run_task", lambda config: None)
+        patch.setattr(size_search, "load_config_task", lambda config: None)
         patch.setattr(size_search, "list_smaller_settings", lambda *args: ladder)
         search = SizeSearch(config, target, dataset, record, runner)
         search.run()

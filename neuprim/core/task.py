@@ -9,7 +9,7 @@ from typing import Any
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.data.dataset import GroundTruth, SceneContext
+from neuprim.core.data.dataset import DatasetImages, SceneContext
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, Field
 from neuprim.core.model.primitives import Primitives
@@ -90,7 +90,7 @@ class SceneSpec:
         load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
         volume: for scenes made of voxel files: (scene settings, context) -> the files, without rendering anything.
         truth: for scenes whose images are rendered frame by frame: (scene settings, context, what another process
-            knows of them or None) -> that work; see :class:`~neuprim.core.data.dataset.GroundTruth`.
+            knows of them or None) -> that work; see :class:`~neuprim.core.data.dataset.DatasetImages`.
         chunks: for scenes that can be fitted in chunks, by their setting ``chunks``: (the run's configuration with the
             command line's keys, context) -> the chunks, or None if one run is better.
     """
@@ -99,7 +99,7 @@ class SceneSpec:
     summary: str
     load: Callable[[Mapping[str, Any], SceneContext], Dataset]
     volume: Callable[[Mapping[str, Any], SceneContext], VolumeSource] | None = None
-    truth: Callable[[Mapping[str, Any], SceneContext, Mapping[str, Any] | None], GroundTruth] | None = None
+    truth: Callable[[Mapping[str, Any], SceneContext, Mapping[str, Any] | None], DatasetImages] | None = None
     chunks: Callable[[Mapping[str, Any], SceneContext], Chunks | None] | None = None
 
 

@@ -16,7 +16,7 @@ from neuprim.config import ConfigWithTask, RunConfig, current_config_provenance,
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
-from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
 from neuprim.core.metrics.lpips import Lpips
@@ -184,7 +184,7 @@ def prepare_training(
     lpips = None if config.metrics.lpips is None else Lpips.load(config.metrics.lpips)
     if dataset is None:
         dataset = load_dataset(job, lambda text, fraction: events(Preparing(text, fraction)))
-    check_dataset(dataset, task.conditions)
+    check_dataset_views(dataset, task.conditions)
     call_task_clips(task, dataset)
     call_task_facts(task, dataset)
     channels = find_channels(task, dataset)

@@ -10,7 +10,7 @@ from typing import Any
 
 from neuprim.config import ConfigWithTask, RunConfig
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.core.data.dataset import GroundTruth
+from neuprim.core.data.dataset import DatasetImages
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.store import WAIT_MESSAGE
 from neuprim.plugins.attribution import attribute_errors
@@ -23,13 +23,13 @@ from neuprim.runs.open import Progress, ignore_progress, make_run_scene_context
 _MOST_FRAMES = 16
 """Frames that a worker takes at a time."""
 
-_loaded: dict[str, GroundTruth] = {}
+_loaded: dict[str, DatasetImages] = {}
 """Of this process's last job: all jobs of a launch have one scene."""
 
 
 def load_run_ground_truth(
     config: RunConfig, progress: Progress = ignore_progress, known: Mapping[str, Any] | None = None
-) -> GroundTruth | None:
+) -> DatasetImages | None:
     """The ground truth of a configuration's scene; None of a scene whose images are not rendered frame by frame.
 
     Raises:
@@ -45,7 +45,7 @@ def load_run_ground_truth(
 
 def launch_ground_truth_jobs(
     config: RunConfig, settings: LauncherSettings, events: Events = ignore_run_event
-) -> GroundTruth | None:
+) -> DatasetImages | None:
     """Have what is missing of the ground truth made where the launcher says; None of a scene that renders none.
 
     Frames that are there are not made again, and each is kept as it is done. The first frame that cannot be made ends
@@ -138,7 +138,7 @@ def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> 
 
 
 def _launch_ground_truth_frames(
-    config: RunConfig, truth: GroundTruth, missing: Sequence[int], settings: LauncherSettings, events: Events
+    config: RunConfig, truth: DatasetImages, missing: Sequence[int], settings: LauncherSettings, events: Events
 ) -> None:
     parts = list(split_frames_into_jobs(missing, count_parallel_jobs(settings, len(missing))[0]))
     outputs = config.output_dir.parent.absolute()  # which every machine sees

@@ -25,7 +25,7 @@ from neuprim.config import ConfigWithTask
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
-from neuprim.core.data.dataset_check import check_dataset, check_pixels
+from neuprim.core.data.dataset_check import check_dataset_views, check_pixels
 from neuprim.core.data.ray_points import GIVE_POINTS
 from neuprim.core.io import images
 from neuprim.core.metrics import mean_metrics, metric_to_json, psnr, psnr_gain, ssim, ssim_3dgs
@@ -206,7 +206,7 @@ def evaluate_run(
     distance = None if weights is None else Lpips.load(weights)
     with run.plugins.attribute_errors():
         dataset = load_dataset(run)
-        check_dataset(dataset, run.task.conditions)
+        check_dataset_views(dataset, run.task.conditions)
         training = {name: run.header.get(name) for name in ("iterations", "train_seconds")}
         model = config.prepare_model(run.model)
         size = estimate_run_file_bytes(model_file(run.directory), run.model, model, config.storage)

@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.data.distortion import Radial
+from neuprim.core.data.distortion import RadialDistortion
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import write_json
 from neuprim.core.io.ply import write_ply
@@ -43,7 +43,7 @@ from neuprim.scenes.shapes import Solid, build_solids, uniform_colour
 GENERATOR_VERSION = 1
 """Part of the cache's key: raise it with every change to the room, its light, cameras or file layout."""
 
-LENS = Radial(k1=-0.08, k2=0.02, p1=0.001, p2=-0.0005)
+LENS = RadialDistortion(k1=-0.08, k2=0.02, p1=0.001, p2=-0.0005)
 
 NOISE = 0.005  # root of the mean squared displacement of a point, over its distance to the camera that found it
 OUTLIERS = 0.02  # share of points that lie anywhere between their camera and the surface
@@ -153,7 +153,7 @@ class Lens:
     """Intrinsics of images ``width`` pixels wide; all-zero ``distortion`` is a pinhole."""
 
     width: int
-    distortion: Radial = LENS
+    distortion: RadialDistortion = LENS
 
     @property
     def height(self) -> int:
@@ -205,7 +205,7 @@ class Lens:
 
 def room_lens(settings: RoomSettings) -> Lens:
     """The lens that the images are taken with."""
-    return Lens(settings.size, LENS if settings.distortion else Radial())
+    return Lens(settings.size, LENS if settings.distortion else RadialDistortion())
 
 
 def photograph_room(

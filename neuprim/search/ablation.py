@@ -24,7 +24,7 @@ from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse_overrides, quote_override
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
-from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
 from neuprim.core.validation import validate
 from neuprim.runs.fit import use_one_torch_thread_for_run
@@ -109,7 +109,7 @@ def run_ablation(
         plan = None if before is None else _parse_plan(folder / TRADEOFF_FILE, before)
         render_ground_truth_before_run(centre, launcher, progress)
         dataset = load_dataset(ConfigWithTask(centre, task), progress)
-        check_dataset(dataset, task.conditions)
+        check_dataset_views(dataset, task.conditions)
         views = eval_views(dataset, request.views)
         if not views:
             raise DataError(f"{dataset.name} has no test views; expected some to measure on")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from neuprim.config import ConfigWithTask
 from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
-from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
@@ -120,7 +120,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
         progress("reading the run's data", 0.0)
         try:
             dataset = load_dataset(run)
-            check_dataset(dataset, task.conditions)
+            check_dataset_views(dataset, task.conditions)
         except NeuprimError as error:
             dataset = None
             untrained = " and it was not trained for few bits" if request.trains else ""

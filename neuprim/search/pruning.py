@@ -11,7 +11,7 @@ from neuprim.config import ConfigWithTask, RunConfig
 from neuprim.core.channels import find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
-from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import refuse_existing, write_json, write_text
 from neuprim.core.model.primitives import Primitives
@@ -290,7 +290,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
     with run.plugins.attribute_errors(), use_one_torch_thread_for_run():
         progress("reading the run's data", 0.0)
         dataset = load_dataset(run)
-        check_dataset(dataset, task.conditions)
+        check_dataset_views(dataset, task.conditions)
         if request.hold_out:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
         begun, steps = time.monotonic(), request.steps

@@ -22,7 +22,7 @@ from neuprim.core.checkpoint import load_model, read_header_extra, save_compress
 from neuprim.core.compression import Quantizers
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
-from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.files import atomic_path, write_text
 from neuprim.core.model.primitives import Primitives
@@ -85,7 +85,7 @@ def run_target(
 
         render_ground_truth_before_run(config, launcher, show_progress)
         dataset = load_dataset(ConfigWithTask(config, task), show_progress)
-        check_dataset(dataset, task.conditions)
+        check_dataset_views(dataset, task.conditions)
         record.hold_out = choose_hold_out(dataset)
         loaded = clock()
         compile_run_kernels(prepare_training(config, dataset=dataset).trainer, events)

@@ -21,7 +21,7 @@ from neuprim.config.command_settings import take_launcher_overrides, take_target
 from neuprim.config.overrides import drop_output_overrides
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_conditions
-from neuprim.core.data.dataset_check import check_dataset
+from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.images import write_png
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
@@ -106,7 +106,7 @@ def has_a_loader_of_photographs(names: dict[str, Any]) -> None:
         frames.append({"fl_x": camera.fx, "w": 16, "h": 16, "transform_matrix": pose.tolist()})
     (folder / "cameras.json").write_text(json.dumps({"frames": frames}))
     read = names["photographs"]({"path": "capture"}, SceneContext(0, Path("cache")))
-    check_dataset(read, ())
+    check_dataset_views(read, ())
     assert (len(read.train), len(read.test), read.name, read.extent) == (7, 2, "capture", pytest.approx(4.4, rel=0.2))
     assert torch.allclose(read.train.view(0).camera.viewmat, data.train.cameras[1].viewmat.double(), atol=1e-5)
     assert torch.allclose(read.center, torch.zeros(3), atol=1e-4)

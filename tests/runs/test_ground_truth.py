@@ -16,7 +16,7 @@ import pytest
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.core.data.dataset import GroundTruth
+from neuprim.core.data.dataset import DatasetImages
 from neuprim.core.errors import DataError
 from neuprim.core.io import store as stores
 from neuprim.core.io.vdb import write_vdb
@@ -62,7 +62,7 @@ def contents(place: Path) -> dict[str, str]:
     return {str(f.relative_to(place)): hashlib.sha256(f.read_bytes()).hexdigest() for f in found}
 
 
-def made(config: RunConfig, settings: LauncherSettings = INLINE, heard: list[Event] | None = None) -> GroundTruth:
+def made(config: RunConfig, settings: LauncherSettings = INLINE, heard: list[Event] | None = None) -> DatasetImages:
     truth = launch_ground_truth_jobs(config, settings, (heard if heard is not None else []).append)
     assert truth is not None and not truth.missing()
     return truth

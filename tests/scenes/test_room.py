@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.data import Dataset
-from neuprim.core.data.distortion import Radial, resample_image, undistortion_grid
+from neuprim.core.data.distortion import RadialDistortion, resample_image, undistortion_grid
 from neuprim.core.io.ply import read_ply
 from neuprim.core.task import SceneContext
 from neuprim.scenes.room import (
@@ -177,7 +177,7 @@ def test_the_loaders_undistorted_image_is_what_a_pinhole_sees(tmp_path: Path) ->
     loaded = load_room(asdict(settings), SceneContext(seed=0, cache_dir=tmp_path))
     camera, found = loaded.test.view(0).camera, loaded.test.pixels(0)
     lens, pose = room_lens(settings), room_camera_poses(2, 1)["test"][0]
-    pinhole = photograph_room(build_room(settings), Lens(128, Radial()), pose, 2)
+    pinhole = photograph_room(build_room(settings), Lens(128, RadialDistortion()), pose, 2)
     assert found.mask is None or found.mask.all()  # a barrel lens shows all that the pinhole would
     bent = np.asarray(Image.open(next(tmp_path.glob("room-*")) / "images" / "test_0000.png"))
     agreement = psnr(found.rgb.numpy() * 255, pinhole)

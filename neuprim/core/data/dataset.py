@@ -254,7 +254,7 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))
 
 
-class GroundTruth(ABC):
+class DatasetImages(ABC):
     """Images of a scene that are rendered frame by frame, possibly by several processes."""
 
     frames: Sequence[str]  # names, in order

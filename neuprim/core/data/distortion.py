@@ -23,7 +23,7 @@ class Distortion(ABC):
 
 
 @dataclass(frozen=True)
-class Radial(Distortion):
+class RadialDistortion(Distortion):
     """OpenCV's model: radius times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and tangential terms p1, p2."""
 
     k1: float = 0.0
@@ -43,7 +43,7 @@ class Radial(Distortion):
 
 
 @dataclass(frozen=True)
-class Fisheye(Distortion):
+class FisheyeDistortion(Distortion):
     """OpenCV's fisheye: the angle t to the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)."""
 
     k1: float = 0.0

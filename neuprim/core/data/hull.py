@@ -14,7 +14,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import ViewSet
 from neuprim.core.data.ray_points import evenly_spaced
-from neuprim.core.data.scene_frame import focus_point
+from neuprim.core.data.scene_frame import dataset_focus_point
 from neuprim.core.errors import DataError
 
 _VIEWS = 100
@@ -56,7 +56,7 @@ def hull_surface(
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
-    center = focus_point(cameras)
+    center = dataset_focus_point(cameras)
     half = torch.stack([c.position.double() for c in cameras]).sub(center).norm(dim=-1).median().item() or 1.0
     everything = torch.ones((_COARSE,) * 3, dtype=torch.bool)
     grid = _carve_voxels(
@@ -114,7 +114,7 @@ def _carve_voxels(
     tables = torch.cat([s.table.reshape(-1) for s in silhouettes]).numpy()
     allowed, needed = int(wrong_views * len(silhouettes)), max(1.0, seen_views * len(silhouettes))
     points = grid.centers(cells).numpy()
-    keep = _test_voxel_centers(
+    keep = _carve_hull_points(
         points, poses, lenses, np.cumsum(sizes) - sizes, tables, reach * grid.voxel, allowed, needed
     )
     cells = cells[torch.from_numpy(keep)]
@@ -128,7 +128,7 @@ def _carve_voxels(
 
 
 @exact_kernel
-def _test_voxel_centers(
+def _carve_hull_points(
     points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
 ) -> Any:
     """(M,) bool of the points that ``needed`` views look at and at most ``allowed`` of those rule out.

@@ -68,7 +68,7 @@ def average_pixels(values: Tensor, factor: int) -> Tensor:
     return F.avg_pool2d(values.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
 
 
-def reduce_mask(mask: Tensor, factor: int) -> Tensor:
+def reduce_image_mask(mask: Tensor, factor: int) -> Tensor:
     """(H // factor, W // factor) bool: all pixels of a block count."""
     return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
 
@@ -101,7 +101,7 @@ class _StoredImage:
 
 
 @exact_kernel
-def _premultiply_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
+def _premultiply_dataset_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
     scale = np.float32(1.0 / 255.0)
     for i in range(rgba.shape[0]):
         a = np.float32(rgba[i, 3]) * scale
@@ -110,10 +110,10 @@ def _premultiply_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
             rgb[i, c] = np.float32(rgba[i, c]) * scale * a
 
 
-def _premultiply_pixels(rgba: Tensor) -> tuple[Tensor, Tensor]:
+def _premultiply_dataset_pixels(rgba: Tensor) -> tuple[Tensor, Tensor]:
     """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass, as every step needs them."""
     rgb, alpha = torch.empty(*rgba.shape[:2], 3), torch.empty(rgba.shape[:2])
-    _premultiply_kernel(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
+    _premultiply_dataset_kernel(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
     return rgb, alpha
 
 
@@ -136,7 +136,7 @@ class ImageViews(ViewSet):
         self._to_linear = to_linear
         self.scale = 1.0  # of linear colours
         self._factor = downsample
-        self._cameras = [_reduced_camera(f, downsample) for f in self._frames]
+        self._cameras = [_reduced_image_camera(f, downsample) for f in self._frames]
         self._cache_bytes = cache_bytes
         self._used = 0
         self._stored: dict[int, _StoredImage] = {}
@@ -159,7 +159,7 @@ class ImageViews(ViewSet):
         if self._to_linear:
             return self._linear_pixels(stored)
         if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
-            return Pixels(*_premultiply_pixels(stored.data), stored.mask)
+            return Pixels(*_premultiply_dataset_pixels(stored.data), stored.mask)
         data = stored.data.float()
         if stored.data.dtype == torch.uint8:
             data = data / 255.0
@@ -258,7 +258,7 @@ class ImageViews(ViewSet):
         n = self._factor
         if n > 1:
             values = average_pixels(values, n)
-            mask = None if mask is None else reduce_mask(mask, n)
+            mask = None if mask is None else reduce_image_mask(mask, n)
         return (values.round().clamp(0.0, 255.0).to(torch.uint8) if eight_bit else values), mask
 
     def _lens_grid(self, camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
@@ -271,7 +271,7 @@ class ImageViews(ViewSet):
             return self._grids[key]
 
 
-def _reduced_camera(frame: ImageFrame, factor: int) -> Camera:
+def _reduced_image_camera(frame: ImageFrame, factor: int) -> Camera:
     camera = frame.camera
     if min(camera.width, camera.height) < factor:
         found = f"{frame.path} has only {camera.width}x{camera.height} pixels"

@@ -12,8 +12,8 @@ from torch import Tensor
 
 from neuprim.core.data.dataset import PointCloud, ViewSet
 from neuprim.core.data.hull import hull_surface
-from neuprim.core.data.ray_points import count_seeing_views, ray_points
-from neuprim.core.data.scene_frame import focus_point, optical_axes_meet
+from neuprim.core.data.ray_points import count_seeing_views, ray_starting_points
+from neuprim.core.data.scene_frame import dataset_axes_meet, dataset_focus_point
 from neuprim.core.errors import ConfigError
 
 _FPS_WORK = 5e8  # distances that exact farthest-point sampling may evaluate (1.5 s); above, a grid thins the points
@@ -26,18 +26,18 @@ def initial_points(views: ViewSet, points: PointCloud | None, count: int, genera
     """Return at most ``count`` distinct starting points of a static scene.
 
     Given points win. Cameras that do not look at one point start along their rays
-    (:func:`~neuprim.core.data.ray_points.ray_points`). Otherwise data with alpha use the surface of the visual hull,
-    and data without use a box around the focus. Inferred points are seen by at least two cameras. Raises ConfigError:
-    ``count`` is not positive; DataError: the alpha masks have no common volume, or an image is damaged.
+    (:func:`~neuprim.core.data.ray_points.ray_starting_points`). Otherwise data with alpha use the surface of the visual
+    hull, and data without use a box around the focus. Inferred points are seen by at least two cameras. Raises
+    ConfigError: ``count`` is not positive; DataError: the alpha masks have no common volume, or an image is damaged.
     """
     check_point_count(count)
     if points is not None:
         return draw_points(points, count, generator)
-    if not optical_axes_meet([views.view(i).camera for i in range(len(views))]):
-        return drop_repeated_points(ray_points(views, count, generator)[0])
+    if not dataset_axes_meet([views.view(i).camera for i in range(len(views))]):
+        return drop_repeated_points(ray_starting_points(views, count, generator)[0])
     if views_have_alpha(views):
         return hull_points(views, count, generator)
-    return box_points(views, count, generator)
+    return box_starting_points(views, count, generator)
 
 
 def check_point_count(count: int) -> None:
@@ -69,10 +69,10 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
     return drop_repeated_points(PointCloud(means, median_colors(views, means)))
 
 
-def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+def box_starting_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """Draw points in a cube around the focus, half the median camera distance to a side, seen by two cameras."""
     cameras = [views.view(i).camera for i in range(len(views))]
-    center = focus_point(cameras)
+    center = dataset_focus_point(cameras)
     half = 0.5 * torch.stack([c.position for c in cameras]).sub(center).norm(dim=-1).median()
     if half <= 0:
         half = torch.tensor(1.0, dtype=torch.float64)
@@ -83,7 +83,7 @@ def box_points(views: ViewSet, count: int, generator: torch.Generator) -> PointC
         if len(found) == count:
             break
     if not len(found):
-        return drop_repeated_points(ray_points(views, count, generator)[0])
+        return drop_repeated_points(ray_starting_points(views, count, generator)[0])
     return drop_repeated_points(PointCloud(found, median_colors(views, found)))
 
 
@@ -143,7 +143,7 @@ def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
     samples = torch.stack(
-        [_sample_point_colors(views, i, means, matter) for i in indices]
+        [_sample_starting_point_colors(views, i, means, matter) for i in indices]
     )  # (V, N, C), NaN where none counts
     colors = torch.cat([samples[:, i : i + _CHUNK].nanmedian(dim=0).values for i in range(0, len(means), _CHUNK)])
     hidden = colors.isnan().any(dim=-1)
@@ -151,7 +151,7 @@ def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
     return torch.where(hidden[:, None], typical, colors)
 
 
-def _sample_point_colors(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
+def _sample_starting_point_colors(views: ViewSet, index: int, means: Tensor, matter: float) -> Tensor:
     camera, pixels = views.view(index).camera, views.pixels(index)
     inside = camera.sees(means)
     column, row = torch.where(inside[:, None], camera.project(means)[0], 0.0).long().unbind(-1)
@@ -184,7 +184,7 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
     shell = _surrounding_shell(views, points.means, max(round(_SHELL * count), 1), generator)
-    lifted = _lift_uncovered_pixels(views, points.means, count, generator)
+    lifted = _lift_starting_points(views, points.means, count, generator)
     wanted = count - len(shell.means)
     if len(lifted.means) > wanted:
         lifted = lifted.rows(torch.randperm(len(lifted.means), generator=generator)[:wanted].sort().values)
@@ -192,7 +192,7 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
     return drop_repeated_points(both)
 
 
-def _lift_uncovered_pixels(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
+def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
     """Lift pixels without nearby points, coarse grids first, so that the largest gaps are filled first."""
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
@@ -201,7 +201,7 @@ def _lift_uncovered_pixels(views: ViewSet, given: Tensor, count: int, generator:
     side = max(views.view(order[0]).camera.width, views.view(order[0]).camera.height)
     for cells in _CELLS:
         for index in order:
-            found, seen = _find_uncovered_pixels(views, index, known, side / cells)
+            found, seen = _find_starting_pixels(views, index, known, side / cells)
             known, means = np.concatenate([known, found]), np.concatenate([means, found])
             colors = np.concatenate([colors, seen])
         if len(means) >= count:
@@ -209,13 +209,13 @@ def _lift_uncovered_pixels(views: ViewSet, given: Tensor, count: int, generator:
     return PointCloud(torch.from_numpy(means[:count]).float(), torch.from_numpy(colors[:count]).float())
 
 
-def _find_uncovered_pixels(
+def _find_starting_pixels(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """Positions and colours of pixels ``cell`` apart without a known point that near, in image and space."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
-    spots = _pixel_grid(camera.width, camera.height, cell)
+    spots = _starting_pixel_grid(camera.width, camera.height, cell)
     cols, rows = spots.astype(np.int64).T
     counts = np.ones(len(spots), dtype=bool)
     if image.mask is not None:
@@ -237,7 +237,7 @@ def _find_uncovered_pixels(
     return found[fresh], image.rgb.numpy()[rows[keep], cols[keep]][fresh]
 
 
-def _pixel_grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
+def _starting_pixel_grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
     """(N, 2) pixel positions (x, y), about ``cell`` apart."""
     across, down = max(round(width / cell), 1), max(round(height / cell), 1)
     x, y = (np.arange(across) + 0.5) * width / across, (np.arange(down) + 0.5) * height / down
@@ -247,7 +247,7 @@ def _pixel_grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
 def _surrounding_shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
     """At most ``count`` points on a sphere around cameras and points, where some view looks."""
     cameras = [views.view(i).camera for i in range(len(views))]
-    center = focus_point(cameras)
+    center = dataset_focus_point(cameras)
     eyes = torch.stack([c.position.double() for c in cameras]) - center
     reach = torch.quantile((given.double() - center).norm(dim=-1)[:1_000_000], 0.99)
     radius = 2.0 * torch.maximum(reach, eyes.norm(dim=-1).max())

@@ -39,18 +39,18 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     or one without usable points.
     """
     if path.suffix.lower() in COMPRESSED:
-        raise _compressed_points_error(path, f"{path.suffix} is a compressed format of Gaussians")
+        raise _compressed_start_points_error(path, f"{path.suffix} is a compressed format of Gaussians")
     found = read_ply(path)
     if "packed_position" in found.names:
-        raise _compressed_points_error(path, "a compressed PLY (property packed_position)")
-    means = _vertex_columns(found, ("x", "y", "z"))
+        raise _compressed_start_points_error(path, "a compressed PLY (property packed_position)")
+    means = _starting_point_columns(found, ("x", "y", "z"))
     if means is None:
         raise DataError(f"{path}: no properties x, y, z; expected points")
     if not len(means):
         raise DataError(f"{path}: no vertices; expected at least one point")
-    scales, opacity = _gaussian_log_sizes(found, path), _vertex_columns(found, ("opacity",))
-    quats = _vertex_columns(found, _ROTATION) if "scale_1" in found.names else None
-    colors = _vertex_colors(found, path)
+    scales, opacity = _starting_point_log_sizes(found, path), _starting_point_columns(found, ("opacity",))
+    quats = _starting_point_columns(found, _ROTATION) if "scale_1" in found.names else None
+    colors = _starting_point_colors(found, path)
     faults = {"place": ~(np.abs(means) < 1e30).all(1), "colour": ~np.isfinite(colors).all(1)}
     if scales is not None:
         faults["size"] = ~(scales <= _LARGEST_LOG).all(1) | ~(scales >= -_LARGEST_LOG).any(1)
@@ -71,8 +71,8 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
         if not kept.any():
             raise DataError(f"{text}; expected at least one with finite numbers")
         warn_once(f"{text}; left out")
-    _warn_of_rounding(found, means[kept], path)
-    rgb = _convert_color_space(torch.from_numpy(colors[kept]).float(), LINEAR in found.comments, color_space)
+    _warn_of_rounded_starting_points(found, means[kept], path)
+    rgb = _convert_starting_point_colors(torch.from_numpy(colors[kept]).float(), LINEAR in found.comments, color_space)
     if channels != 3:
         rgb = rgb.mean(1, keepdim=True).expand(-1, channels)
     deviations = rotations = None
@@ -88,19 +88,19 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     return PointCloud(torch.from_numpy(means[kept]), rgb.contiguous(), {}, None, rotations, alphas, deviations)
 
 
-def _compressed_points_error(path: Path, what: str) -> DataError:
+def _compressed_start_points_error(path: Path, what: str) -> DataError:
     return DataError(
         f"{path}: {what}, which is not read; expected an uncompressed PLY. "
         "Convert it with SuperSplat (export as PLY) or splat-transform FILE OUT.ply"
     )
 
 
-def _vertex_columns(found: PlyVertices, names: tuple[str, ...]) -> np.ndarray | None:
+def _starting_point_columns(found: PlyVertices, names: tuple[str, ...]) -> np.ndarray | None:
     """(N, len(names)) float64; None if one is missing."""
     return found.columns(names) if set(names) <= set(found.names) else None
 
 
-def _gaussian_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
+def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
     """(N, 3) logarithms of sizes, -inf along the missing axis of discs; None without usable sizes."""
     there = [name for name in _SCALES if name in found.names]
     if not there:
@@ -116,13 +116,13 @@ def _gaussian_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
     return np.pad(scales, ((0, 0), (0, 3 - len(there))), constant_values=-np.inf)
 
 
-def _vertex_colors(found: PlyVertices, path: Path) -> np.ndarray:
+def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
     """(N, 3) as the file has them, 0..1 unless it holds more light than that."""
-    dc = _vertex_columns(found, ("f_dc_0", "f_dc_1", "f_dc_2"))
+    dc = _starting_point_columns(found, ("f_dc_0", "f_dc_1", "f_dc_2"))
     if dc is not None:
         return dc * C0 + 0.5
     for names in _COLOURS:
-        rgb = _vertex_columns(found, names)
+        rgb = _starting_point_columns(found, names)
         if rgb is not None:
             kind = found.rows.dtype[names[0]]
             bytes_as_floats = kind.kind == "f" and bool(np.nanmax(rgb, initial=0.0, where=np.isfinite(rgb)) > 2.0)
@@ -132,7 +132,7 @@ def _vertex_colors(found: PlyVertices, path: Path) -> np.ndarray:
     return np.full((len(found.rows), 3), 0.5)
 
 
-def _warn_of_rounding(found: PlyVertices, means: np.ndarray, path: Path) -> None:
+def _warn_of_rounded_starting_points(found: PlyVertices, means: np.ndarray, path: Path) -> None:
     """Warn where float32 coordinates far from the origin are too coarse for the cloud."""
     largest = np.abs(means).max(initial=0.0)
     size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
@@ -141,7 +141,7 @@ def _warn_of_rounding(found: PlyVertices, means: np.ndarray, path: Path) -> None
         warn_once(f"{path}: {what}; expected double there")
 
 
-def _convert_color_space(colors: Tensor, linear: bool, color_space: str) -> Tensor:
+def _convert_starting_point_colors(colors: Tensor, linear: bool, color_space: str) -> Tensor:
     if linear:
         colors = colors.clamp_min(0)
         return colors if color_space == "linear" else images.linear_to_srgb(colors.clamp_max(1))

@@ -17,7 +17,7 @@ from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
 from neuprim.core.data.dataset import SceneContext
 from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.scene_frame import choose_world, focus_point
+from neuprim.core.data.scene_frame import choose_dataset_world, dataset_focus_point
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import ImageInfo
 from neuprim.core.notices import warn_once
@@ -63,7 +63,7 @@ _P = ParamSpec("_P")
 _T = TypeVar("_T")
 
 
-class BadViews:
+class BadImageViews:
     """Collects damaged views, which are left out with a warning each; if ``strict``, the first is raised."""
 
     def __init__(self, where: str, strict: bool) -> None:
@@ -111,12 +111,12 @@ def find_image(folder: Path, text: str) -> Path | None:
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
-        return found or _find_other_case(folder, Path(text))
+        return found or _find_image_in_other_case(folder, Path(text))
     except OSError:  # a name longer than the file system can hold
         return None
 
 
-def _warn_of_outside_images(where: str, home: Path, paths: Iterable[Path]) -> None:
+def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path]) -> None:
     """Warn once of images outside of the data set; they are read, as other tools write such paths."""
     own = home.resolve()
     own = own if own.is_dir() else own.parent
@@ -126,7 +126,7 @@ def _warn_of_outside_images(where: str, home: Path, paths: Iterable[Path]) -> No
         warn_once(f"{where}: {found}; they are read as it says")
 
 
-def _find_other_case(folder: Path, path: Path) -> Path | None:
+def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
     """The only file whose path differs from ``path`` in upper and lower case alone."""
     if not path.is_relative_to(folder):
         return None
@@ -148,7 +148,7 @@ def exif_hint(info: ImageInfo) -> str:
     )
 
 
-def missing_files_error(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
+def missing_dataset_files_error(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
     """Make one error for all absent files, naming the first ten."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return MissingFiles(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
@@ -209,12 +209,12 @@ def assemble_dataset(
     Raises DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``;
     ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
     """
-    _check_image_splits(where, train, test, settings)
+    _check_dataset_splits(where, train, test, settings)
     both = [*train, *test]
-    _warn_of_outside_images(where, details.home or Path(where), [frame.path for frame in both])
-    background = _choose_background(where, settings.background, alpha=both[0].info.channels == 4)
-    world = choose_world([f.camera for f in both], where) if context.world is None else context.world
-    train, test = ([frame_in_scene(f, world, details.positions) for f in frames] for frames in (train, test))
+    _warn_of_images_outside_dataset(where, details.home or Path(where), [frame.path for frame in both])
+    background = _choose_dataset_background(where, settings.background, alpha=both[0].info.channels == 4)
+    world = choose_dataset_world([f.camera for f in both], where) if context.world is None else context.world
+    train, test = ([image_frame_in_scene(f, world, details.positions) for f in frames] for frames in (train, test))
     points = None if details.points is None else details.points.within(world)
     factor = settings.downsample
     views = [ImageViews(frames, factor, to_linear=details.to_linear) for frames in (train, test)]
@@ -226,7 +226,7 @@ def assemble_dataset(
     for images in views:
         images.scale = 1.0 / exposure
     cameras = [views[0].view(i).camera for i in range(len(views[0]))]
-    reductions = [details.prefix, _describe_reduction(both, views[0].view(0).camera, factor)]
+    reductions = [details.prefix, _describe_dataset_downsampling(both, views[0].view(0).camera, factor)]
     return Dataset(
         name=name,
         train=views[0],
@@ -237,15 +237,15 @@ def assemble_dataset(
         background=torch.full((3,), 0.0 if background == "black" else 1.0),
         random_background=background == "random",
         downsampling=", then ".join(text for text in reductions if text) or "none",
-        up=_mean_camera_up(cameras) if details.up is None else details.up,
-        center=focus_point(cameras).float(),
+        up=_mean_dataset_up(cameras) if details.up is None else details.up,
+        center=dataset_focus_point(cameras).float(),
         exposure=exposure,
         world=world,
         extra=details.extra,
     )
 
 
-def _check_image_splits(
+def _check_dataset_splits(
     where: str, train: Sequence[ImageFrame], test: Sequence[ImageFrame], settings: FolderSettings
 ) -> None:
     for split, frames in (("training", train), ("test", test)):
@@ -266,7 +266,7 @@ def _check_image_splits(
             raise DataError(f"{frame.path}: {found}; expected all RGB or all RGBA")
 
 
-def _choose_background(where: str, background: str, alpha: bool) -> str:
+def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
     if background == "random" and not alpha:
         found = f"the images in {where} have no alpha"
         raise ConfigError(f"scene.background is 'random', but {found}; expected auto, white or black")
@@ -277,7 +277,7 @@ def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
     """Decode all images of a split and leave out the damaged ones; ``empty`` ones may show nothing."""
-    bad = BadViews(f"{where} ({split})", strict)
+    bad = BadImageViews(f"{where} ({split})", strict)
     faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
     for index, error in faults.items():
         bad.add(images.view(index).name, error)
@@ -285,13 +285,13 @@ def _preload_split(
     images.drop(faults)
 
 
-def frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
+def image_frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
     """Move the camera and the conditions ``positions`` of a frame into the scene, in float64."""
     moved = {name: world.scene_points(frame.conditions[name]).float() for name in positions}
     return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 
 
-def _describe_reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
+def _describe_dataset_downsampling(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
     """E.g. "200x200 from 800x800 by area", "1/4 by area" where sizes differ, "" for none."""
     if factor == 1:
         return ""
@@ -302,7 +302,7 @@ def _describe_reduction(frames: Sequence[ImageFrame], reduced: Camera, factor: i
     return f"{reduced.width}x{reduced.height} from {width}x{height} by area"
 
 
-def _mean_camera_up(cameras: Sequence[Camera]) -> Tensor:
+def _mean_dataset_up(cameras: Sequence[Camera]) -> Tensor:
     """(3,) mean of the cameras' upward directions; +z where they cancel."""
     up = -torch.stack([c.viewmat[1, :3] for c in cameras]).mean(0)
     if up.norm() < 1e-3:

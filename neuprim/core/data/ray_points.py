@@ -32,7 +32,7 @@ def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
     return torch.stack([views.view(i).camera.sees(means) for i in evenly_spaced(len(views), _VIEWS)]).sum(0)
 
 
-def ray_points(
+def ray_starting_points(
     views: ViewSet, count: int, generator: torch.Generator, matter: float = 0.5
 ) -> tuple[PointCloud, Tensor]:
     """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with pixel colours.
@@ -42,16 +42,16 @@ def ray_points(
     as one. A pixel shows matter where alpha is above ``matter``. Returned are the points, and the (N,) views that they
     come from. Raises DataError: no two cameras see the same place, or no pixel shows matter.
     """
-    depths, mean, needed = _find_fitting_depths(views, generator, matter)
+    depths, mean, needed = _find_starting_depths(views, generator, matter)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
     for _ in range(_ROUNDS):
-        eyes, rays, colors, owner = _draw_random_pixels(views, count, generator, matter)
+        eyes, rays, colors, owner = _draw_starting_pixels(views, count, generator, matter)
         share = torch.rand((_TRIED if needed > 1 else 1, len(owner)), generator=generator).double()
         z = 1.0 / (share / depths[0] + (1.0 - share) / depths[-1])
         tried = eyes + z[..., None] * rays
         if needed > 1:
             usual = torch.from_numpy(np.interp(z.log().numpy(), depths.log().numpy(), mean.numpy()))
-            errors = torch.stack([_view_color_difference(views, t, colors, owner) for t in tried]).nan_to_num(
+            errors = torch.stack([_starting_color_difference(views, t, colors, owner) for t in tried]).nan_to_num(
                 nan=math.inf
             )
             tried = tried[(errors + _PRIOR * usual).argmin(0), torch.arange(len(owner))][None]
@@ -72,7 +72,7 @@ def evenly_spaced(count: int, most: int) -> list[int]:
     return sorted({round(i * (count - 1) / max(min(count, most) - 1, 1)) for i in range(min(count, most))})
 
 
-def _draw_random_pixels(
+def _draw_starting_pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     """Random pixels that show matter: eyes and rays with camera z = 1 (N, 3) float64, colours (N, C), views (N,)."""
@@ -96,16 +96,16 @@ def _draw_random_pixels(
     return eyes, rays, colors, owner
 
 
-def _find_fitting_depths(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
+def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
     """Depths that fit, the mean colour difference at each, and how many cameras must see a point."""
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
     unit = camera_extent(cameras)
     if not same:
-        eyes, rays, colors, owner = _draw_random_pixels(views, _PROBES, generator, matter)
+        eyes, rays, colors, owner = _draw_starting_pixels(views, _PROBES, generator, matter)
         depths = torch.cat([unit * _STEPS, torch.tensor([unit * _INFINITY])])
         errors = torch.stack(
-            [_view_color_difference(views, eyes + z * rays, colors, owner) for z in depths.tolist()]
+            [_starting_color_difference(views, eyes + z * rays, colors, owner) for z in depths.tolist()]
         )  # (D, N)
         mean = torch.where((~errors.isnan()).double().mean(1) > _SEEN, errors.nanmean(1).double(), math.inf)
         if math.isinf(mean[-1]):  # no two images overlap far away
@@ -120,7 +120,7 @@ def _find_fitting_depths(views: ViewSet, generator: torch.Generator, matter: flo
     return depths[chosen], mean[chosen].clamp_max(mean[-1]), 2
 
 
-def _view_color_difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
+def _starting_color_difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
     """(N,) median colour difference to other views at the points; NaN where no view shows them."""
     found = []
     for index in evenly_spaced(len(views), _OTHERS):

@@ -32,9 +32,9 @@ def find_outliers(positions: Tensor) -> Tensor:
     return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)
 
 
-def focus_point(cameras: Sequence[Camera]) -> Tensor:
+def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
     """(3,) float64 point nearest to all optical axes (least squares), pulled weakly to one extent in front."""
-    positions, forward = _optical_axes(cameras)
+    positions, forward = _dataset_optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]
     pull = 1e-4 * len(positions)
@@ -43,14 +43,14 @@ def focus_point(cameras: Sequence[Camera]) -> Tensor:
     return torch.linalg.solve(planes.sum(0) + pull * eye, right)
 
 
-def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
+def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
     """Whether the optical axes determine a point in front of the cameras.
 
     They pass it closer than half the spread of the centres, and 9 of 10 cameras look towards it. Parallel axes, outward
     rings and tripods do not.
     """
-    positions, forward = _optical_axes(cameras)
-    offsets = focus_point(cameras) - positions
+    positions, forward = _dataset_optical_axes(cameras)
+    offsets = dataset_focus_point(cameras) - positions
     depths = (offsets * forward).sum(-1)
     miss = (offsets - depths[:, None] * forward).square().sum(-1).mean()
     spread = (positions - positions.mean(0)).square().sum(-1).mean()
@@ -58,7 +58,7 @@ def optical_axes_meet(cameras: Sequence[Camera]) -> bool:
     return bool((miss < 0.25 * spread) & (turned > 1e-3) & ((depths > 0).double().mean() >= 0.9))
 
 
-def _optical_axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
+def _dataset_optical_axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
     """(N, 3) centres and (N, 3) viewing directions, float64, of all cameras but outliers."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
@@ -69,7 +69,7 @@ def _optical_axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
 FAR = 100.0  # camera extents from the origin, beyond which a scene is moved: float32 holds five digits of it there
 
 
-def choose_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
+def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
     """Choose the scene's place in the world of its file.
 
     If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin,

@@ -23,15 +23,15 @@ from neuprim.core.cameras.intrinsics import (
     refuse_unsupported_keys,
 )
 from neuprim.core.cameras.pinhole import check_viewmat
-from neuprim.core.data.distortion import Distortion, Fisheye, Radial
+from neuprim.core.data.distortion import Distortion, FisheyeDistortion, RadialDistortion
 from neuprim.core.data.image_views import ImageFrame, Mask, find_masks
 from neuprim.core.data.posed_images import (
-    BadViews,
+    BadImageViews,
     FolderSettings,
     MissingFiles,
     exif_hint,
     find_image,
-    missing_files_error,
+    missing_dataset_files_error,
     split_every_nth,
     unique_view_names,
 )
@@ -43,11 +43,11 @@ from neuprim.core.notices import warn_once
 _POSES = ("transform_matrix", "R_opt", "T_opt")
 
 
-def _frame_file_path(record: JsonReader) -> str:
+def _image_frame_path(record: JsonReader) -> str:
     return record.text("file_path")
 
 
-def _frame_viewmat(record: JsonReader) -> Tensor:
+def _image_frame_viewmat(record: JsonReader) -> Tensor:
     return opengl_to_viewmat(record.matrix("transform_matrix"))
 
 
@@ -56,13 +56,15 @@ class TransformsLayout:
     """What differs between formats."""
 
     keys: tuple[str, ...] = ()  # further keys that the loader reads
-    name: Callable[[JsonReader], str] = _frame_file_path  # path of a frame's image, as the file has it
-    image: Callable[[Path, JsonReader], Path | None] = lambda folder, frame: find_image(folder, _frame_file_path(frame))
-    viewmat: Callable[[JsonReader], Tensor] = _frame_viewmat  # (4, 4) world to camera, OpenCV axes
+    name: Callable[[JsonReader], str] = _image_frame_path  # path of a frame's image, as the file has it
+    image: Callable[[Path, JsonReader], Path | None] = lambda folder, frame: find_image(
+        folder, _image_frame_path(frame)
+    )
+    viewmat: Callable[[JsonReader], Tensor] = _image_frame_viewmat  # (4, 4) world to camera, OpenCV axes
     masks: bool = False  # whether a folder ``masks`` beside the images counts where the file names no mask
 
 
-def read_transforms_frames(
+def read_image_frames(
     folder: Path,
     document: JsonReader,
     records: list[JsonReader],
@@ -83,19 +85,19 @@ def read_transforms_frames(
     if absent and (not skip_missing or len(absent) == len(records)):
         offered = hasattr(settings, "skip_missing") and not skip_missing
         hint = "; scene.skip_missing=true leaves such frames out" if offered else ""
-        raise missing_files_error(document.where, absent, hint)
+        raise missing_dataset_files_error(document.where, absent, hint)
     present = [(r, file) for r, file in images if file is not None]
     masks = _find_frame_masks(folder, document, present, layout)
     names = unique_view_names([layout.name(r) for r, _ in present], document.where)
     kept: list[JsonReader] = []
     frames: list[ImageFrame] = []
-    bad = BadViews(document.where, settings.strict)
+    bad = BadImageViews(document.where, settings.strict)
     for (record, file), mask, name in zip(present, masks, names, strict=True):
         fisheye = has_fisheye_lens(record, document)  # first, as other keys mean nothing to a lens that is not known
-        if not _is_pose_damaged(record):
+        if not _is_image_pose_damaged(record):
             layout.viewmat(record)  # a field that is missing or of another kind is no damage, and refused
         info = bad.read(name, image_info, file)
-        viewmat = None if info is None else bad.read(name, _read_checked_pose, record, layout)
+        viewmat = None if info is None else bad.read(name, _read_image_pose, record, layout)
         if info is None or viewmat is None:
             continue
         target = Target(info.width, info.height, str(file), exif_hint(info))
@@ -114,22 +116,22 @@ def read_transforms_frames(
     return kept, frames
 
 
-def _read_checked_pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
+def _read_image_pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
     viewmat = layout.viewmat(record)
     check_viewmat(viewmat, record.where)
     return viewmat
 
 
-def _is_pose_damaged(record: JsonReader) -> bool:
+def _is_image_pose_damaged(record: JsonReader) -> bool:
     """Whether a pose has numbers that are not finite, or only zeros."""
-    poses = [_flatten_numbers(record.values.get(key)) for key in _POSES]
+    poses = [_image_pose_numbers(record.values.get(key)) for key in _POSES]
     return any(not all(map(math.isfinite, numbers)) for numbers in poses) or bool(poses[0] and not any(poses[0]))
 
 
-def _flatten_numbers(value: object) -> list[float]:
+def _image_pose_numbers(value: object) -> list[float]:
     """All numbers in nested lists."""
     if isinstance(value, list):
-        return [n for item in value for n in _flatten_numbers(item)]
+        return [n for item in value for n in _image_pose_numbers(item)]
     if isinstance(value, int) and not isinstance(value, bool):
         return [float(value)] if abs(value) < 2**1000 else [math.inf]
     return [value] if isinstance(value, float) else []
@@ -149,7 +151,7 @@ def _find_frame_masks(
         lost += [name] if name and file is None else []
         masks.append(None if file is None else Mask(file))
     if lost:
-        raise missing_files_error(f"{document.where}: mask_path", lost)
+        raise missing_dataset_files_error(f"{document.where}: mask_path", lost)
     return masks
 
 
@@ -158,11 +160,11 @@ def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) ->
     lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
     if fisheye:
-        return Fisheye(*k)
-    return Radial(*k, *p) if any(k) or any(p) else None
+        return FisheyeDistortion(*k)
+    return RadialDistortion(*k, *p) if any(k) or any(p) else None
 
 
-def read_transforms_splits(
+def read_image_splits(
     folder: Path, train: str, test: str, hold_out: int, read: Callable[[str], list[ImageFrame]]
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """Read (training, test) frames of ``transforms_SPLIT.json``; ``hold_out`` tests every so many views."""
@@ -182,7 +184,7 @@ def read_transforms_splits(
         raise MissingFiles(f"{error}{hint}") from None
 
 
-def split_named_frames(
+def split_named_images(
     document: JsonReader, records: Sequence[JsonReader], frames: Sequence[ImageFrame], every: int
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """Split frames into (training, test) by the lists of names in the file, else every n-th is a test view.
@@ -192,15 +194,15 @@ def split_named_frames(
     list names an unknown image, or training and test lists overlap.
     """
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
-    lists = {key: set(map(_plain_path, document.texts(key))) for key in keys}
+    lists = {key: set(map(_plain_image_path, document.texts(key))) for key in keys}
     if not lists:
         return split_every_nth(frames, every)
-    listed = {_plain_path(r.text("file_path")): f for r, f in zip(records, frames, strict=True)}
-    everything = {_plain_path(r.text("file_path")) for r in document.objects("frames")}
+    listed = {_plain_image_path(r.text("file_path")): f for r, f in zip(records, frames, strict=True)}
+    everything = {_plain_image_path(r.text("file_path")) for r in document.objects("frames")}
     for key, names in lists.items():
         unknown = sorted(names - everything)
         if unknown:
-            raise missing_files_error(f"{document.where}: {key} names images that no frame has", unknown)
+            raise missing_dataset_files_error(f"{document.where}: {key} names images that no frame has", unknown)
     held = [key for key in ("test_filenames", "val_filenames") if key in lists]
     judged = next((key for key in held if lists[key]), held[0] if held else "")
     train_names = lists.get("train_filenames", everything.difference(*(lists[key] for key in held)))
@@ -212,5 +214,5 @@ def split_named_frames(
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 
 
-def _plain_path(text: str) -> str:
+def _plain_image_path(text: str) -> str:
     return text.replace("\\", "/").removeprefix("./")

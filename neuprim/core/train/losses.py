@@ -19,7 +19,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.data import Dataset, PointSamples, ViewSet
-from neuprim.core.data.dataset_check import check_samples
+from neuprim.core.data.dataset_check import check_point_samples
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
 from neuprim.core.task import Loss, Supervision
@@ -157,7 +157,7 @@ def point_loss(
     The loss is the mean square of errors over their scale: the extinction's, plus a small share of each of its
     components, plus ``train.voxel_colour`` times the source's.
     """
-    check_samples(samples, dataset)
+    check_point_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
     where = found.sigma.device

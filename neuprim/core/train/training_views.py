@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Pixels, View
-from neuprim.core.data.image_views import average_pixels, reduce_mask
+from neuprim.core.data.image_views import average_pixels, reduce_image_mask
 
 _MIN_SIDE = 16
 """Pixels along a side that no reduction goes below."""
@@ -74,7 +74,7 @@ def reduce_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
     if factor == 1:
         return view, pixels
     alpha = None if pixels.alpha is None else average_pixels(pixels.alpha[..., None], factor)[..., 0]
-    mask = None if pixels.mask is None else reduce_mask(pixels.mask, factor)
+    mask = None if pixels.mask is None else reduce_image_mask(pixels.mask, factor)
     return replace(view, camera=camera.reduced(factor)), Pixels(average_pixels(pixels.rgb, factor), alpha, mask)
 
 

@@ -23,7 +23,7 @@ from neuprim.core.data.dataset import ViewSubset
 from neuprim.core.data.hull import EmptyHull, hull_surface
 from neuprim.core.data.image_views import ImageFrame
 from neuprim.core.data.initial import (
-    box_points,
+    box_starting_points,
     check_point_count,
     drop_repeated_points,
     farthest_points,
@@ -38,9 +38,9 @@ from neuprim.core.data.posed_images import (
     assemble_dataset,
     find_data_folder,
 )
-from neuprim.core.data.ray_points import ray_points
-from neuprim.core.data.scene_frame import optical_axes_meet
-from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, split_named_frames
+from neuprim.core.data.ray_points import ray_starting_points
+from neuprim.core.data.scene_frame import dataset_axes_meet
+from neuprim.core.data.transforms_json import TransformsLayout, read_image_frames, split_named_images
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
@@ -67,7 +67,7 @@ def load_multiview(settings: Mapping[str, Any], context: SceneContext) -> Datase
         records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
         time_range = _time_range(records, [], options.time_range)
         records, frames = _read_timed_frames(options, document, records, time_range)
-        train, test = split_named_frames(document, records, frames, options.test_every)
+        train, test = split_named_images(document, records, frames, options.test_every)
         details = SceneDetails(start=sample_moving_points)
         return assemble_dataset(str(single), name, train, test, options, context, details)
     if not any(path.is_file() for path in files.values()):
@@ -98,7 +98,7 @@ def _read_timed_frames(
     layout = TransformsLayout(
         keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True
     )
-    records, frames = read_transforms_frames(find_data_folder(options.path), document, records, options, layout)
+    records, frames = read_image_frames(find_data_folder(options.path), document, records, options, layout)
     low, high = time_range
     times = [(r.number("time") - low) / (high - low) for r in records]
     return records, [
@@ -202,8 +202,8 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
     next, overlapping runs supply the rest.
 
     Points lie on the surfaces of these hulls, each with the "time" and the colour of one moment. Cameras without a
-    common target give points along rays (:func:`~neuprim.core.data.ray_points.ray_points`). Without alpha, or if every
-    image has its own time and all hulls are empty, points fill a box in front of the cameras at random times.
+    common target give points along rays (:func:`~neuprim.core.data.ray_points.ray_starting_points`). Without alpha, or
+    if every image has its own time and all hulls are empty, points fill a box in front of the cameras at random times.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -211,14 +211,14 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
     """
     check_point_count(count)
     times = torch.stack([views.view(i).conditions["time"] for i in range(len(views))]).float()
-    if not optical_axes_meet([views.view(i).camera for i in range(len(views))]):
-        rays, owner = ray_points(views, count, generator, _MIN_OPACITY)
+    if not dataset_axes_meet([views.view(i).camera for i in range(len(views))]):
+        rays, owner = ray_starting_points(views, count, generator, _MIN_OPACITY)
         return drop_repeated_points(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
     if views_have_alpha(views):
         points = _hull_points(views, times, count, generator)
         if points is not None:
             return points
-    points = box_points(views, count, generator)
+    points = box_starting_points(views, count, generator)
     drawn = torch.randint(len(times), (len(points.means),), generator=generator)
     return PointCloud(points.means, points.colors, {"time": times[drawn]})
 

@@ -34,9 +34,9 @@ from neuprim.core.data.posed_images import (
     assemble_dataset,
     find_data_folder,
     find_image,
-    frame_in_scene,
+    image_frame_in_scene,
 )
-from neuprim.core.data.transforms_json import TransformsLayout, read_transforms_frames, read_transforms_splits
+from neuprim.core.data.transforms_json import TransformsLayout, read_image_frames, read_image_splits
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.io.json_reader import JsonReader
@@ -69,7 +69,7 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load the OLAT scene in the folder ``settings["path"]``, in linear light over the exposure."""
     options = validate(OlatSettings, settings, "scene")
     folder = find_data_folder(options.path)
-    train, test = read_transforms_splits(
+    train, test = read_image_splits(
         folder,
         options.train_split,
         options.test_split,
@@ -97,7 +97,7 @@ def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[Ima
     layout = TransformsLayout(
         _KEYS, _olat_frame_name, _find_olat_image, lambda record: _olat_viewmat(record, options.ignore_corrections)
     )
-    records, frames = read_transforms_frames(folder, document, list(document.objects("frames")), options, layout)
+    records, frames = read_image_frames(folder, document, list(document.objects("frames")), options, layout)
     lit = []
     for record, frame in zip(records, frames, strict=True):
         light = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
@@ -205,7 +205,7 @@ def _lit_solids_lighting(dataset: Dataset, folder: Path) -> Lighting:
     if _companion_path(test, "nearest.exr", 0).is_file():  # not where training views are held out
         baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_companion_image, test, "nearest.exr")
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))
-    circle = ImageViews([frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
+    circle = ImageViews([image_frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
     return Lighting("inverse_square", partial(read_pixel_classes, test), PARTS, baselines, (film,))
 

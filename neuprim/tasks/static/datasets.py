@@ -28,7 +28,7 @@ from neuprim.core.data.image_views import ImageFrame, find_masks
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,
-    BadViews,
+    BadImageViews,
     EveryNth,
     FolderSettings,
     HoldOut,
@@ -38,15 +38,15 @@ from neuprim.core.data.posed_images import (
     exif_hint,
     find_data_folder,
     find_image,
-    missing_files_error,
+    missing_dataset_files_error,
     split_every_nth,
     unique_view_names,
 )
 from neuprim.core.data.transforms_json import (
     TransformsLayout,
-    read_transforms_frames,
-    read_transforms_splits,
-    split_named_frames,
+    read_image_frames,
+    read_image_splits,
+    split_named_images,
 )
 from neuprim.core.errors import DataError
 from neuprim.core.io.images import ImageInfo, image_info
@@ -76,9 +76,7 @@ def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
     def read(split: str) -> list[ImageFrame]:
         document = JsonReader.open(folder / f"transforms_{split}.json")
-        _, frames = read_transforms_frames(
-            folder, document, list(document.objects("frames")), asked, TransformsLayout()
-        )
+        _, frames = read_image_frames(folder, document, list(document.objects("frames")), asked, TransformsLayout())
         for frame in frames:
             info, first = frame.info, frames[0].info
             if (info.width, info.height) != (first.width, first.height):
@@ -86,7 +84,7 @@ def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
                 raise DataError(f"{frame.path}: image is {info.width}x{info.height}; expected {expected}")
         return frames
 
-    train, test = read_transforms_splits(folder, asked.train_split, asked.test_split, asked.hold_out, read)
+    train, test = read_image_splits(folder, asked.train_split, asked.test_split, asked.hold_out, read)
     details = SceneDetails(up=torch.tensor([0.0, 0.0, 1.0]))
     return assemble_dataset(str(folder), folder.resolve().name, train, test, asked, context, details)
 
@@ -107,13 +105,13 @@ def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Datas
     document = JsonReader.open(path)
     records = sorted(document.objects("frames"), key=lambda r: r.text("file_path"))
     layout = TransformsLayout(keys=("ply_file_path", "train_filenames", "val_filenames", "test_filenames"), masks=True)
-    records, frames = read_transforms_frames(folder, document, records, asked, layout, asked.skip_missing)
-    train, test = split_named_frames(document, records, frames, asked.test_every)
+    records, frames = read_image_frames(folder, document, records, asked, layout, asked.skip_missing)
+    train, test = split_named_images(document, records, frames, asked.test_every)
     points = None
     if document.has("ply_file_path"):  # in the frame of the poses
         cloud = folder / document.text("ply_file_path")
         if not cloud.is_file():
-            raise missing_files_error(f"{document.where}: ply_file_path", [str(cloud)])
+            raise missing_dataset_files_error(f"{document.where}: ply_file_path", [str(cloud)])
         points = read_points(cloud, 3, "srgb")
     return assemble_dataset(str(path), folder.resolve().name, train, test, asked, context, SceneDetails(points=points))
 
@@ -160,13 +158,13 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
     absent = [i.name for i, file in zip(posed, files, strict=True) if file is None]
     if absent and (not asked.skip_missing or len(absent) == len(posed)):
         hint = "" if asked.skip_missing else "; scene.skip_missing=true leaves such images out"
-        raise missing_files_error(str(place), absent, hint)
+        raise missing_dataset_files_error(str(place), absent, hint)
     present = [(i, file) for i, file in zip(posed, files, strict=True) if file is not None]
     _warn_of_unposed_images(place, {file for _, file in present}, model)
     masks = find_masks(folder, [file for _, file in present], place)
     names = unique_view_names([i.name for i, _ in present], str(model))
     frames: list[ImageFrame] = []
-    bad = BadViews(str(model), asked.strict)
+    bad = BadImageViews(str(model), asked.strict)
     for (image, file), mask, name in zip(present, masks, names, strict=True):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
         read = bad.read(name, _read_colmap_image, image, file, where)

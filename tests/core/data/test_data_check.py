@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.data import PointCloud, PointSamples
 from neuprim.core.data.dataset import hold_out_views
-from neuprim.core.data.dataset_check import DatasetError, check_dataset, check_points, check_samples
+from neuprim.core.data.dataset_check import DatasetError, check_dataset_views, check_point_samples, check_points
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
@@ -110,10 +110,10 @@ FAULTS: dict[str, Callable[[Any], None]] = {
 @pytest.mark.parametrize("text", FAULTS)
 def test_a_broken_promise_is_one_line(text: str) -> None:
     data = tiny.two_primitives()
-    check_dataset(data, ())
+    check_dataset_views(data, ())
     FAULTS[text](data)
     with pytest.raises(DatasetError) as caught:
-        check_dataset(data, ())
+        check_dataset_views(data, ())
     assert text in str(caught.value) and "\n" not in str(caught.value)
 
 
@@ -134,7 +134,7 @@ def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
     if value is not None:
         viewed("train", conditions={"time": value})(data)
     with pytest.raises(DatasetError) as caught:
-        check_dataset(data, [TIME])
+        check_dataset_views(data, [TIME])
     assert text in str(caught.value)
 
 
@@ -189,10 +189,10 @@ SAMPLES: dict[str, dict[str, Any]] = {
 @pytest.mark.parametrize("text", SAMPLES)
 def test_points_to_learn_from(text: str) -> None:
     good = PointSamples("f", {}, torch.zeros(4, 3), torch.zeros(4), torch.zeros(4, 3), 1.0)
-    check_samples(good, tiny.two_primitives())
-    check_samples(replace(good, source=None), tiny.two_primitives())
+    check_point_samples(good, tiny.two_primitives())
+    check_point_samples(replace(good, source=None), tiny.two_primitives())
     with pytest.raises(DatasetError) as caught:
-        check_samples(replace(good, **SAMPLES[text]), tiny.two_primitives())
+        check_point_samples(replace(good, **SAMPLES[text]), tiny.two_primitives())
     assert str(caught.value) == f"two: points of f: {text}"
 
 

@@ -12,7 +12,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
 from neuprim.core.data import PointCloud, camera_extent
 from neuprim.core.data.points_file import read_points
-from neuprim.core.data.scene_frame import choose_world, focus_point
+from neuprim.core.data.scene_frame import choose_dataset_world, dataset_focus_point
 from neuprim.core.io.ply import write_ply
 from neuprim.core.notices import NeuprimWarning
 
@@ -25,7 +25,7 @@ def ring(offset: tuple[float, ...], radius: float = 4.0) -> list[Camera]:
 
 @pytest.mark.parametrize("offset", [(0, 0, 0), (1, -2, 400), (-300, 0, 0)])
 def test_what_is_near_stays(offset: tuple[float, ...]) -> None:
-    assert choose_world(ring(offset)).identity
+    assert choose_dataset_world(ring(offset)).identity
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_what_is_near_stays(offset: tuple[float, ...]) -> None:
 def test_what_is_far_moves_by_a_round_number(
     offset: tuple[float, ...], radius: float, origin: tuple[float, ...]
 ) -> None:
-    world = choose_world(ring(offset, radius))
+    world = choose_dataset_world(ring(offset, radius))
     assert world.world_points(torch.zeros(3, dtype=torch.float64)).tolist() == [
         pytest.approx(x, rel=1e-12) for x in origin
     ]
@@ -59,7 +59,7 @@ def test_rotations_of_few_digits_do_not_move_cameras_far_away() -> None:
         view = torch.eye(4, dtype=torch.float64)
         view[:3, :3], view[:3, 3] = turn, -turn @ (camera.position + offset)  # as opengl_to_viewmat makes it
         far.append(replace(camera, viewmat=view))
-    world = choose_world(far)
+    world = choose_dataset_world(far)
     assert world.world_points(torch.zeros(3, dtype=torch.float64)).tolist() == offset.tolist()
     for before, after in zip(near, (world.scene_camera(c) for c in far), strict=True):
         assert torch.allclose(before.position, after.position, atol=2e-3)
@@ -92,6 +92,6 @@ def test_gaussians_turn_and_grow_with_their_places() -> None:
 def test_a_camera_far_from_all_others_says_nothing_about_place_and_scale() -> None:
     lost = replace(ring((0, 0, 0))[0], viewmat=ring((3e6, 0, 0), 4e6)[0].viewmat)
     with pytest.warns(NeuprimWarning, match=r"1 of 7 cameras lie far from all others, the first at 7e\+06"):
-        assert choose_world([*ring((0, 0, 0)), lost]).identity
+        assert choose_dataset_world([*ring((0, 0, 0)), lost]).identity
     assert camera_extent([*ring((0, 0, 0)), lost]) == camera_extent(ring((0, 0, 0)))
-    assert torch.equal(focus_point([*ring((0, 0, 0)), lost]), focus_point(ring((0, 0, 0))))
+    assert torch.equal(dataset_focus_point([*ring((0, 0, 0)), lost]), dataset_focus_point(ring((0, 0, 0))))

@@ -13,9 +13,15 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, PointCloud, View, ViewSet
 from neuprim.core.data.hull import hull_surface
-from neuprim.core.data.initial import box_points, farthest_points, hull_points, initial_points, surrounding_points
+from neuprim.core.data.initial import (
+    box_starting_points,
+    farthest_points,
+    hull_points,
+    initial_points,
+    surrounding_points,
+)
 from neuprim.core.data.ray_points import count_seeing_views
-from neuprim.core.data.scene_frame import focus_point, optical_axes_meet
+from neuprim.core.data.scene_frame import dataset_axes_meet, dataset_focus_point
 from neuprim.core.errors import DataError
 
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)
@@ -185,21 +191,21 @@ def test_photographs_start_in_a_box_where_the_cameras_look() -> None:
     assert offsets.abs().max() <= 2.0 + 1e-5 and offsets.mean(0).abs().max() < 0.15
     assert torch.allclose(points.colors, torch.full((2000, 3), 0.3)) and points.means.unique(dim=0).shape[0] == 2000
     opaque = views_around(lambda c: Pixels(draw(c).rgb, torch.ones(c.height, c.width)))
-    expected = box_points(opaque, 50, rng()).means
+    expected = box_starting_points(opaque, 50, rng()).means
     assert torch.equal(initial_points(opaque, None, 50, rng()).means, expected), "opaque alpha says nothing"
 
 
 def test_focus_point() -> None:
-    assert torch.allclose(focus_point(views_around(sphere(0.1)).cameras), CENTER, atol=1e-3)
+    assert torch.allclose(dataset_focus_point(views_around(sphere(0.1)).cameras), CENTER, atol=1e-3)
     eye = torch.eye(4, dtype=torch.float64)
     row = []
     for x in (-1.0, 0.0, 1.0):  # parallel axes: somewhere in front of the middle camera
         view = eye.clone()
         view[0, 3] = -x
         row.append(Camera(view, 10.0, 10.0, 5.0, 5.0, 10, 10))
-    point = focus_point(row)
+    point = dataset_focus_point(row)
     assert point[:2].abs().max() < 1e-6 and 0.5 < point[2] < 3.0
-    assert torch.isfinite(focus_point(row[:1])).all()
+    assert torch.isfinite(dataset_focus_point(row[:1])).all()
 
 
 SIDES = torch.tensor([1.0, 1.3, 0.8], dtype=torch.float64)  # of rooms: swapped axes would show
@@ -237,7 +243,7 @@ def array(count: int, step: float) -> list[Camera]:
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 def test_outward_cameras_begin_on_the_walls(scale: float) -> None:
     views = TakenViews(turned(24, 0.7 * scale), striped_room(3 * scale))
-    assert not optical_axes_meet(views.cameras)
+    assert not dataset_axes_meet(views.cameras)
     points = initial_points(views, None, 300, rng())
     assert len(points.means) > 250 and int(count_seeing_views(views, points.means).min()) >= 2
     off = ((points.means / (3 * scale * SIDES)).abs().amax(1) - 1).abs()
@@ -257,7 +263,7 @@ def test_an_array_of_parallel_cameras() -> None:
     corner, ahead = torch.tensor([0.5, 3.5, 0.5]), torch.tensor([0.0, 1, 0])
     side = [upright_camera(0.25 * torch.tensor([i, 0.0, j]) - corner, ahead) for i in range(5) for j in range(5)]
     views = TakenViews(side, striped_room(4.0))
-    assert not optical_axes_meet(side)
+    assert not dataset_axes_meet(side)
     off = initial_points(views, None, 300, rng()).means.div(4.0 * SIDES).abs().amax(1) - 1
     assert float(off.abs().median()) < 0.25
 
@@ -271,9 +277,9 @@ def test_cameras_without_a_common_place_ask_for_points() -> None:
 
 def test_which_axes_meet() -> None:
     around = [upright_camera(4 * d / d.norm(), -d) for d in torch.randn((12, 3), generator=rng(), dtype=torch.float64)]
-    assert optical_axes_meet(around)
+    assert dataset_axes_meet(around)
     for cameras in (array(4, 0.3), turned(12, 0.7), turned(12, 0.0, 1e-7), around[:1]):
-        assert not optical_axes_meet(cameras)
+        assert not dataset_axes_meet(cameras)
 
 
 WALL = 4.0  # behind the origin, as the cameras at y < 0 see it

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data.hull import EmptyHull
-from neuprim.core.data.initial import box_points
+from neuprim.core.data.initial import box_starting_points
 from neuprim.core.io.exr import write_exr
 from neuprim.tasks.dynamic.multiview import load_multiview, sample_moving_points
 
@@ -269,7 +269,9 @@ def test_photographs_start_in_a_box_at_random_times(folder: Path, scenes: Any, c
     for file in [*folder.glob("train/*.png"), *folder.glob("test/*.png")]:
         scenes.save(file, np.full((SIZE, SIZE), 0.25))
     points = load_multiview({"path": folder}, context).initial_points(500, rng())
-    assert torch.equal(points.means, box_points(load_multiview({"path": folder}, context).train, 500, rng()).means)
+    assert torch.equal(
+        points.means, box_starting_points(load_multiview({"path": folder}, context).train, 500, rng()).means
+    )
     assert sorted(set(points.conditions["time"].tolist())) == [np.float32(t) for t in TIMES]
 
 

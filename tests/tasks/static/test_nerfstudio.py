@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.cameras import Camera
-from neuprim.core.data.distortion import Radial, undistortion_grid
+from neuprim.core.data.distortion import RadialDistortion, undistortion_grid
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets import load_nerfstudio as load
 
@@ -116,7 +116,7 @@ def test_a_lens_that_folds_over_does_not_mirror_the_middle_into_the_corners(capt
 
 
 def test_what_does_not_fold_over_lies_around_a_principal_point_off_the_middle() -> None:
-    _, valid = undistortion_grid(Camera(torch.eye(4), 40.0, 40.0, 70.0, 20.0, 80, 40), Radial(k1=-1.8))
+    _, valid = undistortion_grid(Camera(torch.eye(4), 40.0, 40.0, 70.0, 20.0, 80, 40), RadialDistortion(k1=-1.8))
     assert valid[20, 70] and not valid[20, 20]
 
 

@@ -22,7 +22,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.compute import device as hardware
-from neuprim.core.data.dataset import GroundTruth
+from neuprim.core.data.dataset import DatasetImages
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
@@ -204,7 +204,7 @@ def _encode_plain(value: Any) -> Any:
 # ---------------------------------------------------------------- rendering all frames
 
 
-class RenderedFrames(GroundTruth):
+class RenderedFrames(DatasetImages):
     """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
 
     A frame's folder appears when all of its files are written. So an interrupted run continues with the missing frames,

@@ -10,11 +10,11 @@ from torch import Tensor
 from neuprim.core.cameras.colmap import find_colmap_model, read_colmap_cameras
 from neuprim.core.cameras.intrinsics import (
     MODELS,
-    Target,
+    CameraTarget,
     has_fisheye_lens,
     read_camera,
     read_lens_coefficients,
-    refuse_unsupported_keys,
+    refuse_unsupported_camera_keys,
 )
 from neuprim.core.cameras.pinhole import (
     FRAME_RATES,
@@ -76,7 +76,7 @@ def _camera_records(document: JsonReader, key: str) -> list[JsonReader]:
     return records
 
 
-def _read_image_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
+def _read_camera_image_size(record: JsonReader, keys: tuple[str, str], size: tuple[int, int] | None) -> tuple[int, int]:
     found = []
     for key, fallback in zip(keys, size or (0, 0), strict=True):
         value = record.count(key) if record.has(key) or size is None else fallback
@@ -86,12 +86,12 @@ def _read_image_size(record: JsonReader, keys: tuple[str, str], size: tuple[int,
     return found[0], found[1]
 
 
-def _camera_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
+def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
     """The times of all cameras, where all have one."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
-def _read_frame_rate(document: JsonReader, count: int) -> float | None:
+def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
     """``fps``, else ``count`` frames over ``seconds``; None without either."""
     for key in ("fps", "seconds"):
         if document.has(key):
@@ -107,15 +107,15 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
     """Read ``{"w", "h", "camera_angle_x" | "fl_x"[, ...], "frames": [{"transform_matrix", ...}]}``."""
     records, found, bent = _camera_records(document, "frames"), [], 0
     notes: dict[str, None] = {}
-    refuse_unsupported_keys(document)
+    refuse_unsupported_camera_keys(document)
     for i, record in enumerate(records):
-        refuse_unsupported_keys(record)
+        refuse_unsupported_camera_keys(record)
         if has_fisheye_lens(record, document, ()):
             what = "the camera is a fisheye (camera_model, is_fisheye)"
             raise DataError(f"{record.where}: {what}; expected one of {', '.join(MODELS)}")
         bent += any(read_lens_coefficients(record, document).values())
         stated = {key: r.values[key] for r in (document, record) for key in ("w", "h") if r.has(key)}
-        target = Target(*_read_image_size(JsonReader(stated, record.where), ("w", "h"), size))
+        target = CameraTarget(*_read_camera_image_size(JsonReader(stated, record.where), ("w", "h"), size))
         own = record.has("transform_matrix") or not document.has("transform_matrix")
         view = None if own else opengl_to_viewmat(document.matrix("transform_matrix"))
         camera = read_camera(record, document, target, view, lambda text: notes.update({text: None}))
@@ -123,7 +123,10 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
     if bent:
         notes[f"the lens distortion of {bent} of {len(found)} cameras is left out"] = None
     return CameraViews(
-        tuple(found), _camera_times(records, "time"), _read_frame_rate(document, len(found)), tuple(notes)
+        tuple(found),
+        _read_camera_file_times(records, "time"),
+        _read_camera_frame_rate(document, len(found)),
+        tuple(notes),
     )
 
 
@@ -132,7 +135,7 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
     if document.values.get("camera_type", "perspective") != "perspective":
         raise document.fail("camera_type", "perspective; others are not drawn")
     records = _camera_records(document, "camera_path")
-    width, height = _read_image_size(document, ("render_width", "render_height"), size)
+    width, height = _read_camera_image_size(document, ("render_width", "render_height"), size)
     found = []
     for i, record in enumerate(records):
         fov = record.number("fov", "a vertical field of view in degrees, between 0 and 180", 0.0, 180.0)
@@ -141,7 +144,10 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
         camera = Camera(view, focal, focal, 0.5 * width, 0.5 * height, width, height)
         found.append((f"camera_{i:03d}", camera.validate(f"{record.where}.camera_to_world")))
     return CameraViews(
-        tuple(found), _camera_times(records, "render_time"), _read_frame_rate(document, len(found)), (_VIEWER_NOTE,)
+        tuple(found),
+        _read_camera_file_times(records, "render_time"),
+        _read_camera_frame_rate(document, len(found)),
+        (_VIEWER_NOTE,),
     )
 
 

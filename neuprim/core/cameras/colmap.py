@@ -33,25 +33,25 @@ def import_pycolmap() -> Any:
     return pycolmap
 
 
-def _model_suffix(folder: Path) -> str | None:
+def _colmap_model_suffix(folder: Path) -> str | None:
     return next((s for s in (".bin", ".txt") if (folder / f"cameras{s}").is_file()), None)
 
 
 def read_colmap_model(folder: Path) -> Any:
     """Read the ``pycolmap.Reconstruction`` in a folder; raises DataError for a missing or damaged file."""
     pycolmap = import_pycolmap()
-    kind = _model_suffix(folder)
+    kind = _colmap_model_suffix(folder)
     if kind is None:
         raise DataError(f"{folder}: no cameras.bin or cameras.txt; expected a COLMAP model (scene.model)")
     absent = [name + kind for name in _PARTS[1:3] if not (folder / (name + kind)).is_file()]
     if absent:
         raise DataError(f"{folder}: {len(absent)} files not found: {', '.join(absent)}")
     if kind == ".bin":
-        check_binary_model(folder, _lens_parameter_count)
+        check_binary_colmap_model(folder, _lens_parameter_count)
     try:
         model = pycolmap.Reconstruction(str(folder))
         if kind == ".txt":
-            _restore_image_names(model, folder / "images.txt")
+            _restore_colmap_image_names(model, folder / "images.txt")
         for image in model.images.values():
             _ = image.name  # UnicodeDecodeError where it is no UTF-8
         return model
@@ -59,7 +59,7 @@ def read_colmap_model(folder: Path) -> Any:
         raise DataError(f"{folder}: not a readable COLMAP model ({type(error).__name__}: {error})") from None
 
 
-def _restore_image_names(model: Any, path: Path) -> None:
+def _restore_colmap_image_names(model: Any, path: Path) -> None:
     """Restore the names of ``images.txt`` that contain blanks, at which COLMAP cuts them off."""
     lines = iter(path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
     for line in lines:
@@ -104,10 +104,12 @@ def colmap_viewmat(image: Any) -> Tensor:
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
     """Return the model with most images in a project's ``sparse`` (or None) and a line for the user."""
     place = project / "sparse"
-    models = sorted((p for p in place.glob("*") if _model_suffix(p) is not None), key=lambda p: (len(p.name), p.name))
+    models = sorted(
+        (p for p in place.glob("*") if _colmap_model_suffix(p) is not None), key=lambda p: (len(p.name), p.name)
+    )
     if not models:
-        return (place if _model_suffix(place) is not None else None), ""
-    counts = [_count_model_images(p) for p in models]
+        return (place if _colmap_model_suffix(place) is not None else None), ""
+    counts = [_count_colmap_images(p) for p in models]
     best = models[counts.index(max(counts))]
     if len(models) == 1:
         return best, ""
@@ -115,7 +117,7 @@ def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
     return best, f"{place}: has models of different images: {found} posed images; takes {best.name}"
 
 
-def _count_model_images(model: Path) -> int:
+def _count_colmap_images(model: Path) -> int:
     """Number of images in a model, from its file alone; 0 if damaged or missing."""
     try:
         if (model / "images.bin").is_file():
@@ -130,14 +132,14 @@ def _count_model_images(model: Path) -> int:
 def find_colmap_model(path: Path) -> Path | None:
     """Return the model folder that a path means: itself, one of its files, or a project; else None."""
     if path.is_dir():
-        return path if _model_suffix(path) is not None else largest_colmap_model(path)[0]
+        return path if _colmap_model_suffix(path) is not None else largest_colmap_model(path)[0]
     is_part = path.suffix in (".txt", ".bin") and path.stem in _PARTS
-    return path.parent if is_part and _model_suffix(path.parent) else None
+    return path.parent if is_part and _colmap_model_suffix(path.parent) else None
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
     """Return (name without suffix, camera) of all posed images, by name, and lines for the user."""
-    reconstruction = _read_model_without_points(folder)
+    reconstruction = _read_colmap_cameras_only(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     if not images:
         raise DataError(f"{folder}: has no images with a pose; expected at least one")
@@ -161,9 +163,9 @@ def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[st
     return found, notes + [several.replace("takes", "the largest is")] * bool(several)
 
 
-def _read_model_without_points(folder: Path) -> Any:
+def _read_colmap_cameras_only(folder: Path) -> Any:
     """Read a model whose points may be missing."""
-    kind = _model_suffix(folder)
+    kind = _colmap_model_suffix(folder)
     if kind is None or (folder / f"points3D{kind}").is_file() or not (folder / f"images{kind}").is_file():
         return read_colmap_model(folder)
     with tempfile.TemporaryDirectory() as name:
@@ -181,7 +183,7 @@ def _read_model_without_points(folder: Path) -> Any:
 _MAX_PARAMS = 64  # of a camera model
 
 
-class _RecordReader:
+class _ColmapRecordReader:
     """Read position in a file; running past its end raises DataError."""
 
     def __init__(self, path: Path) -> None:
@@ -209,21 +211,21 @@ class _RecordReader:
         self.skip((end if end >= 0 else len(self.data)) + 1 - self.at)
 
 
-def check_binary_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
+def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
     """Check all ``.bin`` files of a model record by record; ``parameter_count`` knows a camera model's, or -1."""
     records = (lambda file: _skip_camera(file, parameter_count), _skip_image, _skip_point, _skip_rig, _skip_frame)
     for part, skip_record in zip(_PARTS, records, strict=True):
         path = folder / f"{part}.bin"
         if part in ("rigs", "frames") and not path.is_file():
             continue
-        file = _RecordReader(path)
+        file = _ColmapRecordReader(path)
         for _ in range(file.number("Q")):
             skip_record(file)
         if file.at != len(file.data):
             raise DataError(f"{file.path}: corrupt: its records end at byte {file.at}, the file at {len(file.data)}")
 
 
-def _skip_camera(file: _RecordReader, parameter_count: Callable[[int], int]) -> None:
+def _skip_camera(file: _ColmapRecordReader, parameter_count: Callable[[int], int]) -> None:
     file.skip(4)
     model = file.number("i")
     count = parameter_count(model)
@@ -232,18 +234,18 @@ def _skip_camera(file: _RecordReader, parameter_count: Callable[[int], int]) -> 
     file.skip(16 + 8 * count)
 
 
-def _skip_image(file: _RecordReader) -> None:
+def _skip_image(file: _ColmapRecordReader) -> None:
     file.skip(4 + 7 * 8 + 4)  # id, pose, camera
     file.name()
     file.skip(24 * file.number("Q"))
 
 
-def _skip_point(file: _RecordReader) -> None:
+def _skip_point(file: _ColmapRecordReader) -> None:
     file.skip(8 + 3 * 8 + 3 + 8)  # id, position, colour, error
     file.skip(8 * file.number("Q"))
 
 
-def _skip_rig(file: _RecordReader) -> None:
+def _skip_rig(file: _ColmapRecordReader) -> None:
     file.skip(4)
     for sensor in range(file.number("I")):
         file.skip(8)  # kind and number
@@ -251,6 +253,6 @@ def _skip_rig(file: _RecordReader) -> None:
             file.skip(7 * 8)
 
 
-def _skip_frame(file: _RecordReader) -> None:
+def _skip_frame(file: _ColmapRecordReader) -> None:
     file.skip(4 + 4 + 7 * 8)  # id, rig, pose
     file.skip(16 * file.number("I"))

@@ -37,7 +37,7 @@ Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
-class Target:
+class CameraTarget:
     """The pixels that a camera is for: of an image file, or of a picture to draw."""
 
     width: int
@@ -51,7 +51,7 @@ class Target:
 
 
 @dataclass(frozen=True)
-class _KeySource:
+class _IntrinsicsSource:
     """Fields of a frame or file, and the size in pixels that its lengths belong to."""
 
     record: JsonReader
@@ -60,45 +60,49 @@ class _KeySource:
     def has(self, group: tuple[str, ...]) -> bool:
         return any(self.record.has(key) for key in group)
 
-    def scales(self, keys: str, target: Target) -> tuple[float, float]:
+    def scales(self, keys: str, target: CameraTarget) -> tuple[float, float]:
         """Target pixels per pixel of this size, horizontally and vertically."""
-        if not is_resized_copy(self.size, target.size):
-            own, other = _format_image_size(self.size), _format_image_size(target.size)
+        if not is_resized_camera_size(self.size, target.size):
+            own, other = _format_camera_image_size(self.size), _format_camera_image_size(target.size)
             found = f"{keys} belong to w, h {own}, and the image is {other}"
             expected = f"them in the frame, beside its own w, h{target.hint}"
             raise DataError(f"{self.record.where}: {found}; expected {expected}")
         return target.width / self.size[0], target.height / self.size[1]
 
 
-def _format_image_size(size: tuple[int, int]) -> str:
+def _format_camera_image_size(size: tuple[int, int]) -> str:
     return f"{size[0]}x{size[1]}"
 
 
-def is_resized_copy(size: tuple[int, int], other: tuple[int, int]) -> bool:
+def is_resized_camera_size(size: tuple[int, int], other: tuple[int, int]) -> bool:
     """Whether one size is a resized copy of the other, up to rounding to whole pixels."""
     scale = max(other[0] / size[0], other[1] / size[1])
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
 
-def _record_with_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
+def _record_with_camera_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
     """The record that provides a whole group of keys."""
     return frame if any(frame.has(key) for key in group) else file
 
 
 def read_camera(
-    frame: JsonReader, file: JsonReader, target: Target, viewmat: Tensor | None = None, say: Say = lambda text: None
+    frame: JsonReader,
+    file: JsonReader,
+    target: CameraTarget,
+    viewmat: Tensor | None = None,
+    say: Say = lambda text: None,
 ) -> Camera:
     """Read the pinhole of a frame; the ``file`` provides what the frame leaves out.
 
     ``viewmat`` (4, 4) is world to camera, OpenCV axes; None reads ``transform_matrix``. ``say`` receives lines for the
     user. Raises DataError for missing or wrong fields, or fields that contradict each other or the image.
     """
-    of_file = _KeySource(file, _stated_image_size(file, target.size))
-    of_frame = _KeySource(frame, _stated_image_size(frame, of_file.size))
+    of_file = _IntrinsicsSource(file, _stated_image_size(file, target.size))
+    of_frame = _IntrinsicsSource(frame, _stated_image_size(frame, of_file.size))
     if target.image and of_frame.size != target.size:
-        stated, image = _format_image_size(of_frame.size), _format_image_size(target.size)
-        if not is_resized_copy(of_frame.size, target.size):
-            where = _record_with_keys(SIZE, frame, file).where
+        stated, image = _format_camera_image_size(of_frame.size), _format_camera_image_size(target.size)
+        if not is_resized_camera_size(of_frame.size, target.size):
+            where = _record_with_camera_keys(SIZE, frame, file).where
             expected = f"{stated} (w, h in {where}) or a reduction of it"
             raise DataError(f"{target.image}: image is {image}; expected {expected}{target.hint}")
         say(f"{file.where}: w, h are {stated} and the image {image}; cameras are scaled to the images")
@@ -120,9 +124,11 @@ def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[in
 # ---------------------------------------------------------------- focal lengths
 
 
-def _read_focal_lengths(frame: JsonReader, level: _KeySource, target: Target, say: Say) -> tuple[float, float]:
+def _read_focal_lengths(
+    frame: JsonReader, level: _IntrinsicsSource, target: CameraTarget, say: Say
+) -> tuple[float, float]:
     """fx, fy in pixels of the target."""
-    x, y = _stated_focal_lengths(level, 0, target), _stated_focal_lengths(level, 1, target)
+    x, y = _stated_camera_focal_lengths(level, 0, target), _stated_camera_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
         raise DataError(f"{frame.where}: no focal length: expected {keys}, in the frame or in the file")
@@ -130,12 +136,12 @@ def _read_focal_lengths(frame: JsonReader, level: _KeySource, target: Target, sa
     fx, fy = fx or fy, fy or fx
     where, lengths = level.record.where, f"{fx:.5g} and {fy:.5g}"
     if min(fx / target.width, fy / target.height) < _SHORTEST:
-        stated = f"focal lengths of {lengths} pixels on {_format_image_size(target.size)}"
+        stated = f"focal lengths of {lengths} pixels on {_format_camera_image_size(target.size)}"
         raise DataError(
             f"{where}: {', '.join((*x, *y))} mean {stated}, a field of view of more than 170 degrees; "
             "expected a pinhole, and lengths in pixels, not in shares of the image"
         )
-    if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _lengths_agree(fx, fy):
+    if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _focal_lengths_agree(fx, fy):
         keys = f"{next(iter(x))} and {next(iter(y))}"
         expected = "square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: leave it out)"
         raise DataError(
@@ -145,14 +151,17 @@ def _read_focal_lengths(frame: JsonReader, level: _KeySource, target: Target, sa
     for found, other in ((x, y), (y, x)):
         first, value = next(iter(found.items()), ("", 0.0))
         for key in found:
-            if _lengths_agree(found[key], value):
+            if _focal_lengths_agree(found[key], value):
                 continue
             text = f"{where}: {first} means a focal length of {value:.5g} pixels, and {key} {found[key]:.5g}"
             # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the
             # image's longer side, and angle_y has nothing to do with the image
-            explained = key == "camera_angle_x" and _lengths_agree(found[key] * portrait, value)
+            explained = key == "camera_angle_x" and _focal_lengths_agree(found[key] * portrait, value)
             explained |= (
-                key == "camera_angle_y" and first == "fl_y" and _lengths_agree(fx, fy) and "camera_angle_x" in other
+                key == "camera_angle_y"
+                and first == "fl_y"
+                and _focal_lengths_agree(fx, fy)
+                and "camera_angle_x" in other
             )
             if not explained:
                 remedy = "take out the wrong one, or give w, h of the images they are for"
@@ -161,7 +170,7 @@ def _read_focal_lengths(frame: JsonReader, level: _KeySource, target: Target, sa
     return fx, fy
 
 
-def _stated_focal_lengths(level: _KeySource, axis: int, target: Target) -> dict[str, float]:
+def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: CameraTarget) -> dict[str, float]:
     """Every focal length along an axis that a record states, in target pixels, by key; lengths in pixels first."""
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
@@ -189,7 +198,7 @@ def _read_camera_intrinsics(record: JsonReader) -> list[float]:
     return values
 
 
-def _lengths_agree(a: float, b: float) -> bool:
+def _focal_lengths_agree(a: float, b: float) -> bool:
     return abs(a - b) <= _TOLERANCE * max(abs(a), abs(b))
 
 
@@ -197,7 +206,7 @@ def _lengths_agree(a: float, b: float) -> bool:
 
 
 def _read_principal_point(
-    frame: _KeySource, file: _KeySource, focal: _KeySource, target: Target
+    frame: _IntrinsicsSource, file: _IntrinsicsSource, focal: _IntrinsicsSource, target: CameraTarget
 ) -> tuple[float, float]:
     """cx, cy in pixels of the target."""
     array = focal.record.has("camera_intrinsics")
@@ -223,7 +232,9 @@ def _read_principal_point(
     return cx, cy
 
 
-def _check_principal_point(where: str, keys: str, point: tuple[float, float], stated: bool, target: Target) -> None:
+def _check_principal_point(
+    where: str, keys: str, point: tuple[float, float], stated: bool, target: CameraTarget
+) -> None:
     """Refuse a principal point outside of the image, or in the middle of an image of another size."""
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
@@ -243,7 +254,7 @@ def _check_principal_point(where: str, keys: str, point: tuple[float, float], st
 # ---------------------------------------------------------------- lenses
 
 
-def _check_one_lens(frame: _KeySource, file: _KeySource, target: Target) -> None:
+def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: CameraTarget) -> None:
     """Refuse a frame with its own focal length that takes principal point or distortion from the file."""
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
@@ -256,23 +267,26 @@ def _check_one_lens(frame: _KeySource, file: _KeySource, target: Target) -> None
     if not left:
         return
     own, other = (
-        [*_stated_focal_lengths(level, 0, target).values(), *_stated_focal_lengths(level, 1, target).values()][0]
+        [
+            *_stated_camera_focal_lengths(level, 0, target).values(),
+            *_stated_camera_focal_lengths(level, 1, target).values(),
+        ][0]
         for level in (frame, file)
     )
-    if not _lengths_agree(own, other):
+    if not _focal_lengths_agree(own, other):
         found = f"has a focal length of its own, and {', '.join(left)} of the file belong to another one"
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
 
 
 def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, float]:
     """Read the distortion coefficients by name; 0 where none is given."""
-    record = _record_with_keys(COEFFICIENTS, frame, file)
+    record = _record_with_camera_keys(COEFFICIENTS, frame, file)
     return {key: record.number_or(key, 0.0) for key in COEFFICIENTS}
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Whether the lens is OpenCV's fisheye; refuses models that are no pinhole, offering ``others`` too."""
-    record = _record_with_keys(("camera_model", "is_fisheye"), frame, file)
+    record = _record_with_camera_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
     if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:
         return True
@@ -332,10 +346,10 @@ _ELSEWHERE = {"time": "task=dynamic scene=multiview reads it", "pl_pos": "task=r
 _LISTED = 8
 
 
-def refuse_unsupported_keys(record: JsonReader) -> None:
+def refuse_unsupported_camera_keys(record: JsonReader) -> None:
     """Raise DataError for a key that changes the picture and is not supported."""
     for key, states in _REFUSED.items():
-        if key in record.values and _is_set(record.values[key]):
+        if key in record.values and _is_camera_key_set(record.values[key]):
             raise DataError(f"{record.where}: {key} states {states}")
     pinholes = ("perspective", "persp", "none", *(m.lower() for m in MODELS))
     for key in _KINDS:
@@ -346,12 +360,12 @@ def refuse_unsupported_keys(record: JsonReader) -> None:
         raise record.fail("n_frames", f"{len(frames)}, as there are frames; take out those that should not count")
 
 
-def _is_set(value: Any) -> bool:
+def _is_camera_key_set(value: Any) -> bool:
     """Whether a value is more than zeros, false or nothing."""
-    return any(map(_is_set, value)) if isinstance(value, list) else bool(value)
+    return any(map(_is_camera_key_set, value)) if isinstance(value, list) else bool(value)
 
 
-def describe_unknown_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
+def describe_unknown_camera_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
     """Return a line that names keys that are neither read nor known to be harmless; "" for none."""
     known = _READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)

@@ -58,7 +58,7 @@ class RayCamera:
 
         Pixels beyond 180 degrees off the axis have no ray. Raises DataError for an impossible size or field of view.
         """
-        _check_image_size("fisheye", width, height)
+        _check_ray_camera_size("fisheye", width, height)
         if not 0.0 < fov_degrees <= 360.0:
             raise DataError(f"RayCamera.fisheye: fov_degrees={fov_degrees!r}; expected a number in (0, 360]")
         per_pixel = math.radians(fov_degrees) / min(width, height)
@@ -73,7 +73,7 @@ class RayCamera:
     @classmethod
     def equirectangular(cls, width: int, height: int, viewmat: Tensor) -> RayCamera:
         """Make a full panorama: columns are longitudes -180..180 degrees, rows latitudes from 90 (up, -y) to -90."""
-        _check_image_size("equirectangular", width, height)
+        _check_ray_camera_size("equirectangular", width, height)
         y, x = _pixel_centre_grid(width, height)
         longitude, latitude = (x / width - 0.5) * (2 * math.pi), (0.5 - y / height) * math.pi
         flat = latitude.cos()
@@ -84,7 +84,7 @@ AnyCamera = Camera | RayCamera
 """What the renderer and the colour fields accept; both have ``viewmat``, ``position``, ``width`` and ``height``."""
 
 
-def _check_image_size(name: str, width: int, height: int) -> None:
+def _check_ray_camera_size(name: str, width: int, height: int) -> None:
     if width <= 0 or height <= 0:
         raise DataError(f"RayCamera.{name}: image size {width}x{height}; expected positive")
 

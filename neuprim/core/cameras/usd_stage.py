@@ -13,7 +13,7 @@ from typing import Any
 MEMORY = 4 << 30  # of the process: what a file may claim
 
 
-def main(path: str, wanted: str, most: int) -> dict[str, Any]:
+def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
     """``{"frames": [...], ...}``; see :mod:`neuprim.core.cameras.usd`, which reads it."""
     from pxr import Tf, Usd, UsdGeom
 
@@ -34,18 +34,18 @@ def main(path: str, wanted: str, most: int) -> dict[str, Any]:
     if not wanted and len(paths) > 1:
         raise SystemExit(f"has {len(paths)} cameras; expected #PATH after the file's name, with one of {listed}")
     camera = UsdGeom.Camera(cameras[paths.index(wanted) if wanted else 0])
-    moments = times(stage, camera, most, Usd, UsdGeom)
+    moments = usd_camera_times(stage, camera, most, Usd, UsdGeom)
     return {
         "path": str(camera.GetPath()),
-        "frames": [frame(camera, moment) for moment in moments],
+        "frames": [usd_camera_frame(camera, moment) for moment in moments],
         "fps": stage.GetTimeCodesPerSecond(),
         "up": str(UsdGeom.GetStageUpAxis(stage)),
         "meters": UsdGeom.GetStageMetersPerUnit(stage),
-        "resolution": resolution(stage),
+        "resolution": usd_camera_resolution(stage),
     }
 
 
-def times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
+def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
     """Every whole time code from start to end where anything of the camera moves; else the default, or the start."""
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
@@ -65,7 +65,7 @@ def times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[An
     return [Usd.TimeCode(first + i) for i in range(int(last - first + 1e-9) + 1)]
 
 
-def frame(camera: Any, moment: Any) -> dict[str, Any]:
+def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
     """Pose (camera to world, column vectors), focal length and aperture, all three in one unit, at a time."""
     found = camera.GetCamera(moment)
     matrix = found.transform
@@ -78,7 +78,7 @@ def frame(camera: Any, moment: Any) -> dict[str, Any]:
     }
 
 
-def resolution(stage: Any) -> list[int] | None:
+def usd_camera_resolution(stage: Any) -> list[int] | None:
     """Of the stage's render settings, if it names any."""
     from pxr import UsdRender
 
@@ -87,7 +87,7 @@ def resolution(stage: Any) -> list[int] | None:
     return None if value is None else [int(value[0]), int(value[1])]
 
 
-def limit_memory() -> None:
+def limit_usd_memory() -> None:
     """At most :data:`MEMORY`, where the system knows such a thing."""
     try:
         import resource
@@ -99,5 +99,5 @@ def limit_memory() -> None:
 
 
 if __name__ == "__main__":
-    limit_memory()
-    print(json.dumps(main(sys.argv[1], sys.argv[2], int(sys.argv[3]))))
+    limit_usd_memory()
+    print(json.dumps(read_usd_camera(sys.argv[1], sys.argv[2], int(sys.argv[3]))))

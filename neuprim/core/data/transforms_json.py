@@ -15,12 +15,12 @@ from torch import Tensor
 
 from neuprim.core.cameras import opengl_to_viewmat
 from neuprim.core.cameras.intrinsics import (
-    Target,
-    describe_unknown_keys,
+    CameraTarget,
+    describe_unknown_camera_keys,
     has_fisheye_lens,
     read_camera,
     read_lens_coefficients,
-    refuse_unsupported_keys,
+    refuse_unsupported_camera_keys,
 )
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.data.distortion import Distortion, FisheyeDistortion, RadialDistortion
@@ -79,7 +79,7 @@ def read_image_frames(
     contradictory or unsupported fields, most views bad, or any bad view with ``settings.strict``.
     """
     for record in (document, *records):
-        refuse_unsupported_keys(record)
+        refuse_unsupported_camera_keys(record)
     images = [(r, layout.image(folder, r)) for r in records]
     absent = [f"{layout.name(r)}{r.values.get('file_ext') or ''}" for r, file in images if file is None]
     if absent and (not skip_missing or len(absent) == len(records)):
@@ -100,7 +100,7 @@ def read_image_frames(
         viewmat = None if info is None else bad.read(name, _read_image_pose, record, layout)
         if info is None or viewmat is None:
             continue
-        target = Target(info.width, info.height, str(file), exif_hint(info))
+        target = CameraTarget(info.width, info.height, str(file), exif_hint(info))
         camera = read_camera(record, document, target, viewmat, warn_once).validate(record.where)
         # a stated size says which way up pixels are
         sized = (record.has("w") or document.has("w")) and info.width != info.height
@@ -110,7 +110,7 @@ def read_image_frames(
         kept.append(record)
         frames.append(ImageFrame(name, file, camera, info, mask, _read_distortion(record, document, fisheye)))
     bad.settle(len(present))
-    unknown = describe_unknown_keys(document, records, layout.keys)
+    unknown = describe_unknown_camera_keys(document, records, layout.keys)
     if unknown:
         warn_once(unknown)
     return kept, frames

@@ -20,7 +20,7 @@ from neuprim.core.cameras.colmap import (
     pinhole_parameters,
     read_colmap_model,
 )
-from neuprim.core.cameras.intrinsics import is_resized_copy
+from neuprim.core.cameras.intrinsics import is_resized_camera_size
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.distortion import Distortion
@@ -199,7 +199,7 @@ def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: Im
     size = f"{lens.width}x{lens.height}"
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
         raise DataError(f"{where}: size {size}, parameters {lens.params}; expected a positive size, finite numbers")
-    if not is_resized_copy((lens.width, lens.height), (info.width, info.height)):
+    if not is_resized_camera_size((lens.width, lens.height), (info.width, info.height)):
         expected = f"{size} ({where}) or a reduction of it{exif_hint(info)}"
         raise DataError(f"{file}: image is {info.width}x{info.height}; expected {expected}")
     fx, fy, cx, cy = pinhole_parameters(lens, where)

@@ -8,24 +8,26 @@ from typing import Any
 import pytest
 
 from neuprim.core.cameras.intrinsics import (
-    Target,
-    describe_unknown_keys,
+    CameraTarget,
+    describe_unknown_camera_keys,
     has_fisheye_lens,
     read_camera,
     read_lens_coefficients,
-    refuse_unsupported_keys,
+    refuse_unsupported_camera_keys,
 )
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 
 POSE = [[1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1.0, 3.0]]
-IMAGE = Target(64, 48, "a.png")
-PORTRAIT = Target(48, 72, "a.png")
+IMAGE = CameraTarget(64, 48, "a.png")
+PORTRAIT = CameraTarget(48, 72, "a.png")
 ANGLE = 2 * math.atan(32 / 50)
 """Of 50 pixels on an image 64 wide."""
 
 
-def camera(frame: dict[str, Any], file: dict[str, Any], target: Target = IMAGE) -> tuple[tuple[float, ...], list[str]]:
+def camera(
+    frame: dict[str, Any], file: dict[str, Any], target: CameraTarget = IMAGE
+) -> tuple[tuple[float, ...], list[str]]:
     """fx, fy, cx, cy and what was said."""
     said: list[str] = []
     own = JsonReader({"transform_matrix": POSE, **frame}, "t.json: frames[0]")
@@ -125,7 +127,7 @@ REFUSED |= {"driver_parameters": {"LightX": 1}}
 @pytest.mark.parametrize("key", REFUSED)
 def test_keys_that_change_the_picture_are_refused_by_name(key: str) -> None:
     with pytest.raises(DataError, match=f"t.json: {key} "):
-        refuse_unsupported_keys(JsonReader({key: REFUSED[key]}, "t.json"))
+        refuse_unsupported_camera_keys(JsonReader({key: REFUSED[key]}, "t.json"))
 
 
 def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
@@ -133,6 +135,6 @@ def test_unknown_keys_are_named_once_and_those_of_real_files_are_not() -> None:
     file = JsonReader({**known, "is_fisheye": False, "exposures": 1}, "t.json")
     frame = {"file_path": "a", "colmap_im_id": 1, "sharpness": 3.0, "time": 0.1, "depth_file_path": "d"}
     frames = [JsonReader(frame, "f")] * 3
-    line = describe_unknown_keys(file, frames, ())
+    line = describe_unknown_camera_keys(file, frames, ())
     assert line.startswith("t.json: keys that are not read: exposures, frames[].time; task=dynamic")
-    assert describe_unknown_keys(file, frames, ("time", "exposures")) == ""
+    assert describe_unknown_camera_keys(file, frames, ("time", "exposures")) == ""

@@ -12,7 +12,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.cameras.camera_files import read_camera_file
-from neuprim.core.cameras.colmap import check_binary_model
+from neuprim.core.cameras.colmap import check_binary_colmap_model
 from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets import load_colmap as load
 
@@ -177,7 +177,7 @@ def test_models_with_rigs_of_two_cameras(tmp_path: Path, pycolmap: Any) -> None:
             rig.add_sensor(sensor, pycolmap.Rigid3d())
     reconstruction.add_rig(rig)
     reconstruction.write(str(tmp_path))
-    check_binary_model(tmp_path, lambda model: 4)
+    check_binary_colmap_model(tmp_path, lambda model: 4)
 
 
 @pytest.mark.parametrize(

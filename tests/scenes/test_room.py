@@ -42,7 +42,7 @@ from neuprim.scenes.room_interior import (
     speckled,
 )
 from neuprim.scenes.shapes import ball, build_solids, chamfered_box, parse_srgb
-from neuprim.tasks.static.datasets import load_room
+from neuprim.tasks.static.datasets import load_room_dataset
 
 SMALL = {"size": 40, "train_views": 6, "test_views": 3, "supersampling": 1, "points": 300}
 
@@ -59,7 +59,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def dataset(cache: Path) -> Dataset:
-    return load_room(SMALL, SceneContext(seed=0, cache_dir=cache))
+    return load_room_dataset(SMALL, SceneContext(seed=0, cache_dir=cache))
 
 
 @pytest.fixture(scope="module")
@@ -174,7 +174,7 @@ def test_the_loaders_undistorted_image_is_what_a_pinhole_sees(tmp_path: Path) ->
         return float(-10 * np.log10(((one.astype(float) - other.astype(float)) ** 2).mean() / 255**2))
 
     settings = RoomSettings(size=128, train_views=2, test_views=1, supersampling=2, points=10)
-    loaded = load_room(asdict(settings), SceneContext(seed=0, cache_dir=tmp_path))
+    loaded = load_room_dataset(asdict(settings), SceneContext(seed=0, cache_dir=tmp_path))
     camera, found = loaded.test.view(0).camera, loaded.test.pixels(0)
     lens, pose = room_lens(settings), room_camera_poses(2, 1)["test"][0]
     pinhole = photograph_room(build_room(settings), Lens(128, RadialDistortion()), pose, 2)

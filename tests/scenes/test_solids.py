@@ -19,7 +19,7 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, daylight_radiance
 from neuprim.scenes.shapes import Solid, ball, build_solids, chamfered_box, parse_srgb, uniform_colour
 from neuprim.scenes.solids import SolidsSettings, generate_solids
-from neuprim.tasks.static.datasets import load_solids
+from neuprim.tasks.static.datasets import load_solids_dataset
 
 SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
 
@@ -119,7 +119,7 @@ def test_layout_and_alpha(tmp_path: Path) -> None:
 
 
 def test_silhouette_lies_where_the_loaders_cameras_project_it(scene: Scene, tmp_path: Path) -> None:
-    dataset = load_solids({**SMALL, "size": 96}, SceneContext(seed=0, cache_dir=tmp_path))
+    dataset = load_solids_dataset({**SMALL, "size": 96}, SceneContext(seed=0, cache_dir=tmp_path))
     vertices, points = np.concatenate([s.mesh.vertices for s in scene.solids]), surface_points(scene, 4000)
     for views in (dataset.train, dataset.test):
         for index in range(len(views)):

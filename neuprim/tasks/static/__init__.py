@@ -85,7 +85,7 @@ def _build_static_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[De
     return density, SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
 
 
-def _check_static_model(model: Mapping[str, Any]) -> None:
+def _check_static_task_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
@@ -94,12 +94,12 @@ def _check_static_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["colour"], "model.colour", {})
 
 
-def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
+def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:
     cosine = model["density"].get("form", "cosine") == "cosine"
     return {**(DENSITY_TRADE if cosine else {}), "model.sh_degree": (0, 1, 2, 3)}
 
 
-def _load_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Import a loader when it is used, as each pulls in a library of its own, and call it."""
     loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
     return loader(settings, context)
@@ -110,10 +110,10 @@ def _load_mesh_scene(settings: Mapping[str, Any], context: SceneContext) -> Data
         import trimesh  # noqa: F401
     except ImportError as error:
         raise BackendUnavailable(f"scene=mesh needs the package trimesh ({error}): pip install trimesh") from error
-    return _load_scene("mesh", "load_mesh", settings, context)
+    return _load_static_scene("mesh", "load_mesh", settings, context)
 
 
-def _generated_scene_facts(dataset: Dataset) -> Mapping[str, Any]:
+def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
     """Of generated data, which file they show and where its points are."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
@@ -127,12 +127,12 @@ TASK = TaskSpec(
         SceneSpec(
             "solids",
             "built in: sharp edges, thin rods, a curved handle; generated in seconds",
-            partial(_load_scene, "datasets", "load_solids"),
+            partial(_load_static_scene, "datasets", "load_solids_dataset"),
         ),
         SceneSpec(
             "room",
             "built in: the solids in a textured room, taken like photographs: lens, exposures, points",
-            partial(_load_scene, "datasets", "load_room"),
+            partial(_load_static_scene, "datasets", "load_room_dataset"),
         ),
         SceneSpec(
             "mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _load_mesh_scene
@@ -140,25 +140,25 @@ TASK = TaskSpec(
         SceneSpec(
             "blender",
             "NeRF-synthetic layout: transforms_train.json, RGBA images",
-            partial(_load_scene, "datasets", "load_blender"),
+            partial(_load_static_scene, "datasets", "load_blender"),
         ),
         SceneSpec(
             "nerfstudio",
             "instant-ngp / nerfstudio transforms.json",
-            partial(_load_scene, "datasets", "load_nerfstudio"),
+            partial(_load_static_scene, "datasets", "load_nerfstudio"),
         ),
         SceneSpec(
             "colmap",
             "COLMAP sparse/0 and images (needs neuprim[colmap])",
-            partial(_load_scene, "datasets", "load_colmap"),
+            partial(_load_static_scene, "datasets", "load_colmap"),
         ),
     ),
     build=_build_static_fields,
     loss=photometric,
-    check=_check_static_model,
-    tunable_settings=_tunable_settings,
-    facts=_generated_scene_facts,
-    diagnose=lambda dataset, model: _generated_scene_facts(dataset),
+    check=_check_static_task_model,
+    tunable_settings=_tunable_static_settings,
+    facts=_static_dataset_facts,
+    diagnose=lambda dataset, model: _static_dataset_facts(dataset),
     fields={
         "CosineDensity": CosineDensity,
         "GaussianDensity": GaussianDensity,

@@ -142,7 +142,7 @@ def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     frames = _read_colmap_frames(model, folder, reconstruction, asked)
     train, test = split_every_nth(frames, asked.test_every)
     prefix = "" if asked.images == "images" else asked.images
-    points = _read_colmap_points(reconstruction, model)
+    points = _read_colmap_dataset_points(reconstruction, model)
     details = SceneDetails(points=points, prefix=prefix, home=folder)
     return assemble_dataset(str(model), folder.resolve().name, train, test, asked, context, details)
 
@@ -167,13 +167,13 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
     bad = BadImageViews(str(model), asked.strict)
     for (image, file), mask, name in zip(present, masks, names, strict=True):
         where = f"{model}: camera {image.camera_id} of image {image.name}"
-        read = bad.read(name, _read_colmap_image, image, file, where)
+        read = bad.read(name, _read_colmap_dataset_image, image, file, where)
         if read is None:
             continue
         info, viewmat = read
-        camera = _colmap_camera(where, image, viewmat, file, info)
+        camera = _colmap_dataset_camera(where, image, viewmat, file, info)
         lens = reconstruction.cameras[image.camera_id]
-        distortion = None if lens.model_name in PINHOLES else _ColmapLens.of(lens, info)
+        distortion = None if lens.model_name in PINHOLES else _ColmapDatasetLens.of(lens, info)
         frames.append(ImageFrame(name, file, camera.validate(where), info, mask, distortion))
     bad.settle(len(present))
     return frames
@@ -188,13 +188,13 @@ def _warn_of_unposed_images(place: Path, posed: set[Path], model: Path) -> None:
         warn_once(f"{place}: {found}; left out")
 
 
-def _read_colmap_image(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
+def _read_colmap_dataset_image(image: Any, file: Path, where: str) -> tuple[ImageInfo, Tensor]:
     info, viewmat = image_info(file), colmap_viewmat(image)
     check_viewmat(viewmat, where)
     return info, viewmat
 
 
-def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
+def _colmap_dataset_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: ImageInfo) -> Camera:
     lens = image.camera
     size = f"{lens.width}x{lens.height}"
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
@@ -207,7 +207,7 @@ def _colmap_camera(where: str, image: Any, viewmat: Tensor, file: Path, info: Im
 
 
 @dataclass(frozen=True)
-class _ColmapLens(Distortion):
+class _ColmapDatasetLens(Distortion):
     """Any COLMAP camera model, scaled to the files' size; the projection is COLMAP's own."""
 
     model: str
@@ -217,9 +217,11 @@ class _ColmapLens(Distortion):
     scale: tuple[float, float]
 
     @staticmethod
-    def of(lens: Any, info: ImageInfo) -> _ColmapLens:
+    def of(lens: Any, info: ImageInfo) -> _ColmapDatasetLens:
         scale = (info.width / lens.width, info.height / lens.height)
-        return _ColmapLens(lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale)
+        return _ColmapDatasetLens(
+            lens.model_name, int(lens.width), int(lens.height), tuple(map(float, lens.params)), scale
+        )
 
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
         size = {"width": self.width, "height": self.height}
@@ -228,7 +230,7 @@ class _ColmapLens(Distortion):
         return np.asarray(lens.img_from_cam(rays), dtype=np.float64) * self.scale
 
 
-def _read_colmap_points(reconstruction: Any, model: Path) -> PointCloud | None:
+def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud | None:
     """The model's points, in order of their numbers; None where it has none."""
     points = [p for _, p in sorted(reconstruction.points3D.items())]
     if not points:
@@ -242,13 +244,13 @@ def _read_colmap_points(reconstruction: Any, model: Path) -> PointCloud | None:
     return PointCloud(torch.from_numpy(means), torch.from_numpy(colors).float())
 
 
-def load_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_solids_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
     folder = generate_solids(validate(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
-def load_room(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_room_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=room``: drawn on first use, read from ``context.cache_dir`` afterwards."""
     folder = generate_room(validate(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
     dataset = load_nerfstudio({"path": str(folder)}, context)

@@ -19,9 +19,9 @@ from neuprim.core.task import SceneContext
 from neuprim.scenes.shading import encode_srgb
 from neuprim.tasks.static import mesh as generator
 from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images, load_mesh
-from neuprim.tasks.static.mesh.model import ModelFolder
+from neuprim.tasks.static.mesh.model import MeshFolder
 from neuprim.tasks.static.mesh.obj import read_obj
-from neuprim.tasks.static.mesh.surface import FARTHEST, Surface, Texture, read_surfaces
+from neuprim.tasks.static.mesh.surface import FARTHEST, MeshSurface, MeshTexture, read_surfaces
 from tests.models import BLUE, GREEN, RED, YELLOW, quarters, textured, write_glb, write_obj
 
 SMALL = {"size": 48, "train_views": 4, "test_views": 2, "supersampling": 2}
@@ -31,13 +31,13 @@ def read(path: Path, cache: Path, **settings: object) -> Dataset:
     return load_mesh({"path": path, **SMALL, **settings}, SceneContext(seed=0, cache_dir=cache))
 
 
-def surface(path: Path, upward: str | None = None) -> Surface:
+def surface(path: Path, upward: str | None = None) -> MeshSurface:
     """The model as rays meet it, sharp."""
-    model = generator.MODEL_READERS[path.suffix](ModelFolder(path))
-    return Surface(model, read_surfaces(model), upward or model.upward, 1e-6)
+    model = generator.MODEL_READERS[path.suffix](MeshFolder(path))
+    return MeshSurface(model, read_surfaces(model), upward or model.upward, 1e-6)
 
 
-def colours(scene: Surface, points: list[list[float]], directions: list[list[float]]) -> np.ndarray:
+def colours(scene: MeshSurface, points: list[list[float]], directions: list[list[float]]) -> np.ndarray:
     """(N, 3) display colours 0..255 of what rays meet; every ray must meet something."""
     hits = scene.intersect(np.array(points, np.float32), np.array(directions, np.float32))
     assert hits.hit.all()
@@ -96,7 +96,7 @@ def test_names_of_textures_in_libraries(tmp_path: Path, options: str, name: str)
     quarters().save(tmp_path / name.replace("\\", "/"))
     (tmp_path / "m.mtl").write_text(f"newmtl m\nmap_Kd {options}{name}\n")
     (tmp_path / "m.obj").write_text("mtllib m.mtl\nv 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl m\nf 1 2 3\n")
-    model = read_obj(ModelFolder(tmp_path / "m.obj"))
+    model = read_obj(MeshFolder(tmp_path / "m.obj"))
     assert list(model.images) == [name] and model.materials["m"].texture == name
 
 
@@ -133,20 +133,20 @@ def test_where_the_texture_is_clear_there_is_a_hole(tmp_path: Path, mode: str, a
 
 def test_texels_are_mixed_in_linear_light_about_their_middles() -> None:
     pixels = np.array([[[0, 0, 0, 255], [255, 255, 255, 255]]], np.uint8)
-    texture = Texture(pixels, ("clamp", "clamp"))
+    texture = MeshTexture(pixels, ("clamp", "clamp"))
     sharp = np.zeros(3, np.float32)
     found = texture.look_up(np.array([[0.25, 0.5], [0.5, 0.5], [0.75, 0.5]], np.float32), sharp)
     np.testing.assert_allclose(found[:, 0], [0, 0.5, 1], atol=1e-6)
     np.testing.assert_allclose(texture.look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0)
     np.testing.assert_allclose(
-        Texture(pixels).look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0.5
+        MeshTexture(pixels).look_up(np.array([[0.0, 0.5]], np.float32), sharp[:1])[0, 0], 0.5
     )  # wraps around
 
 
 def test_a_ray_that_covers_many_texels_sees_their_mean() -> None:
     pixels = np.zeros((33, 64, 4), np.uint8)
     pixels[:, ::2] = 255
-    texture = Texture(pixels)
+    texture = MeshTexture(pixels)
     uv = np.random.default_rng(1).random((50, 2)).astype(np.float32)
     assert np.ptp(texture.look_up(uv, np.zeros(50, np.float32))[:, 0]) > 0.5
     np.testing.assert_allclose(texture.look_up(uv, np.full(50, 16, np.float32)), 0.5, atol=1e-3)

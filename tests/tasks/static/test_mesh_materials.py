@@ -17,8 +17,8 @@ from neuprim.core import notices
 from neuprim.core.errors import DataError
 from neuprim.scenes.shading import daylight_radiance, encode_srgb
 from neuprim.tasks.static import mesh as generator
-from neuprim.tasks.static.mesh.model import ModelFolder
-from neuprim.tasks.static.mesh.surface import GREY, Surface, SurfacePart, read_surfaces
+from neuprim.tasks.static.mesh.model import MeshFolder
+from neuprim.tasks.static.mesh.surface import GREY, MeshSurface, SurfacePart, read_surfaces
 from tests.models import BLUE, GREEN, RED, YELLOW, cube, quarters
 
 DOWN = [[0.0, 0.0, -1.0]]
@@ -30,12 +30,12 @@ def every_note(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def parts_of(path: Path) -> list[SurfacePart]:
-    return read_surfaces(generator.MODEL_READERS[path.suffix](ModelFolder(path)))
+    return read_surfaces(generator.MODEL_READERS[path.suffix](MeshFolder(path)))
 
 
-def surface(path: Path, upward: str = "z") -> Surface:
-    model = generator.MODEL_READERS[path.suffix](ModelFolder(path))
-    return Surface(model, read_surfaces(model), upward, 1e-6)  # type: ignore[arg-type]
+def surface(path: Path, upward: str = "z") -> MeshSurface:
+    model = generator.MODEL_READERS[path.suffix](MeshFolder(path))
+    return MeshSurface(model, read_surfaces(model), upward, 1e-6)  # type: ignore[arg-type]
 
 
 class Document:
@@ -89,7 +89,9 @@ def shown(path: Path, lit: bool = False) -> list[int]:
     scene = surface(path)
     at = np.array([[-0.5, 0.5, 3.0]], np.float32)
     image, hit = (
-        daylight_radiance(scene, at, DOWN) if lit else generator.unlit_radiance(scene, at, np.array(DOWN, np.float32))
+        daylight_radiance(scene, at, DOWN)
+        if lit
+        else generator.unlit_mesh_radiance(scene, at, np.array(DOWN, np.float32))
     )
     assert hit.all()
     return np.round(encode_srgb(image[0]) * 255).astype(int).tolist()

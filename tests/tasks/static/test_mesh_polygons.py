@@ -11,7 +11,7 @@ import pytest
 from neuprim.core.errors import DataError
 from neuprim.tasks.static import mesh as generator
 from neuprim.tasks.static.mesh import polygons
-from neuprim.tasks.static.mesh.model import ModelFolder
+from neuprim.tasks.static.mesh.model import MeshFolder
 from neuprim.tasks.static.mesh.polygons import triangulate_polygons
 from neuprim.tasks.static.mesh.surface import read_surfaces
 
@@ -96,7 +96,7 @@ def prism(relative: bool, texture: bool) -> str:
 def test_an_obj_with_concave_faces_and_relative_indices(tmp_path: Path, relative: bool, texture: bool) -> None:
     text = prism(relative, texture).replace("f ", "f \\\n ", 1).replace("v 0 0 3", "v 0 0 3 # a corner")
     (tmp_path / "a.obj").write_text(text.replace("\n", "\r\n") if relative else text)
-    parts = read_surfaces(generator.MODEL_READERS[".obj"](ModelFolder(tmp_path / "a.obj")))
+    parts = read_surfaces(generator.MODEL_READERS[".obj"](MeshFolder(tmp_path / "a.obj")))
     assert sum(area(part.corners) for part in parts) == pytest.approx(2 * 7 + 3 * 16)
 
 
@@ -121,7 +121,7 @@ def test_a_ply_with_concave_faces(tmp_path: Path, order: str, mixed: bool) -> No
         body = "".join(f"{x} {y} 0\n" for x, y in U).encode()
         body += "".join(f"255 0 {51 * i} {len(f)} {' '.join(map(str, f))}\n" for i, f in enumerate(faces)).encode()
     (tmp_path / "a.ply").write_bytes(head.encode() + body)
-    (part,) = read_surfaces(generator.MODEL_READERS[".ply"](ModelFolder(tmp_path / "a.ply")))
+    (part,) = read_surfaces(generator.MODEL_READERS[".ply"](MeshFolder(tmp_path / "a.ply")))
     first = part.colour[:, 0, 2] == 0
     assert area(part.corners[first]) == pytest.approx(7) and (part.colour[..., 0] == 1).all()
     if mixed:

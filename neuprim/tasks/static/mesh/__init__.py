@@ -23,15 +23,15 @@ from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, Daylight, daylight_radiance
 from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, describe_solids_images
 from neuprim.tasks.static.mesh.gltf import read_gltf
-from neuprim.tasks.static.mesh.model import Model, ModelFolder, Up, find_model_file
+from neuprim.tasks.static.mesh.model import MeshFolder, Model, Up, find_model_file
 from neuprim.tasks.static.mesh.obj import read_obj
 from neuprim.tasks.static.mesh.ply_stl import read_ply_mesh, read_stl
-from neuprim.tasks.static.mesh.surface import Surface, read_surfaces
+from neuprim.tasks.static.mesh.surface import MeshSurface, read_surfaces
 
 # Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at.
 GENERATOR_VERSION = 2
 
-MODEL_READERS: dict[str, Callable[[ModelFolder], Model]] = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
+MODEL_READERS: dict[str, Callable[[MeshFolder], Model]] = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
 MODEL_READERS |= {".ply": read_ply_mesh, ".stl": read_stl}
 
 
@@ -72,22 +72,22 @@ def generate_mesh_images(
     """Write the data set unless it is complete; return its folder ``cache_dir/mesh-KEY``."""
     path = find_model_file(settings.path)
     progress(f"mesh: reading {path.name}", 0.0)
-    model = MODEL_READERS[path.suffix.lower()](ModelFolder(path, settings.skip_missing))
+    model = MODEL_READERS[path.suffix.lower()](MeshFolder(path, settings.skip_missing))
     upward: Up = model.upward if settings.up == "auto" else settings.up
     key = hash_settings(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
     spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
 
     def build() -> Scene:
-        return Surface(model, read_surfaces(model), upward, spacing)
+        return MeshSurface(model, read_surfaces(model), upward, spacing)
 
-    def facts(scene: Surface) -> dict[str, Any]:
+    def facts(scene: MeshSurface) -> dict[str, Any]:
         return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}
 
-    seen: Radiance = partial(daylight_radiance, light=LIGHT) if settings.shading == "daylight" else unlit_radiance
+    seen: Radiance = partial(daylight_radiance, light=LIGHT) if settings.shading == "daylight" else unlit_mesh_radiance
     return describe_solids_images("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
 
 
-def unlit_radiance(
+def unlit_mesh_radiance(
     scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """Unlit colours of N rays: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""

@@ -17,10 +17,10 @@ from neuprim.core.notices import warn_once
 from neuprim.tasks.static.mesh.gltf_document import (
     DRACO,
     GltfDocument,
-    finite_number,
-    parse_uri,
+    finite_gltf_number,
+    parse_gltf_uri,
     refuse_damaged_gltf,
-    to_index,
+    to_gltf_index,
 )
 from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
@@ -28,9 +28,9 @@ from neuprim.tasks.static.mesh.model import (
     MAX_VERTICES,
     Faces,
     Material,
+    MeshFolder,
     Model,
-    ModelFolder,
-    check_limits,
+    check_mesh_limits,
     check_vertices,
 )
 
@@ -53,7 +53,7 @@ class _GltfPrimitive(NamedTuple):
     glow_uv: NDArray[np.float32] | None
 
 
-def read_gltf(folder: ModelFolder) -> Model:
+def read_gltf(folder: MeshFolder) -> Model:
     """Read a .gltf or .glb file; raises DataError if damaged, compressed, or with references that lead nowhere."""
 
     def read() -> Model:
@@ -77,7 +77,7 @@ class _GltfReader:
     def read_faces(self, materials: Mapping[str, Material]) -> tuple[list[Faces], int]:
         """Read all triangles of the scene that is shown, in place, and count their vertices."""
         nodes = self.document.entries("nodes")
-        check_limits(self.path, {"nodes": (len(nodes), MAX_PARTS)})
+        check_mesh_limits(self.path, {"nodes": (len(nodes), MAX_PARTS)})
         matrices = self._node_matrices(nodes)
         found: list[Faces] = []
         plain: dict[int, list[_GltfPrimitive]] = {}
@@ -85,9 +85,9 @@ class _GltfReader:
             node = nodes[i]
             if "mesh" not in node:
                 continue
-            number, places = to_index(node["mesh"]), [np.eye(4)]
+            number, places = to_gltf_index(node["mesh"]), [np.eye(4)]
             if "skin" in node:  # the surface is where its joints are, wherever its node is
-                pose = self._joint_matrices(self.document.content["skins"][to_index(node["skin"])], matrices)
+                pose = self._joint_matrices(self.document.content["skins"][to_gltf_index(node["skin"])], matrices)
                 primitives = self._read_gltf_mesh(number, node, materials, pose)
             else:
                 places = self._instance_matrices(node, matrix)
@@ -112,14 +112,14 @@ class _GltfReader:
         self.triangles += len(primitive.faces)
         self.parts += 1
         vertices, faces, parts = (self.vertices, MAX_VERTICES), (self.triangles, MAX_FACES), (self.parts, MAX_PARTS)
-        check_limits(self.path, {"vertices": vertices, "faces": faces, "parts": parts})
+        check_mesh_limits(self.path, {"vertices": vertices, "faces": faces, "parts": parts})
 
     def _read_gltf_mesh(
         self, number: int, node: Mapping[str, Any], materials: Mapping[str, Material], pose: NDArray | None = None
     ) -> list[_GltfPrimitive]:
         """Read the triangles of a node's mesh, with (J, 4, 4) transforms of the joints of a skin."""
         mesh = self.document.content["meshes"][number]
-        weights = [finite_number(w) for w in node.get("weights", mesh.get("weights", []))]
+        weights = [finite_gltf_number(w) for w in node.get("weights", mesh.get("weights", []))]
         found = []
         for primitive in mesh["primitives"]:
             mode = primitive.get("mode", _TRIANGLES)
@@ -128,7 +128,7 @@ class _GltfReader:
                 continue
             if mode not in (_TRIANGLES, _STRIP, _FAN):
                 raise ValueError(f"a primitive of mode {mode}")
-            position = self.document.content["accessors"][to_index(primitive["attributes"]["POSITION"])]
+            position = self.document.content["accessors"][to_gltf_index(primitive["attributes"]["POSITION"])]
             if DRACO in primitive.get("extensions", {}) and "bufferView" not in position:
                 raise self.document.unsupported(DRACO)
             found.append(self._read_primitive(primitive, materials, weights, pose))
@@ -147,10 +147,10 @@ class _GltfReader:
         index = np.arange(count)
         if "indices" in primitive:
             index = self.document.array(primitive["indices"], ["SCALAR"])[:, 0]
-        check_limits(self.path, {"vertices": (count, MAX_VERTICES), "faces": (len(index) // 3, MAX_FACES)})
+        check_mesh_limits(self.path, {"vertices": (count, MAX_VERTICES), "faces": (len(index) // 3, MAX_FACES)})
         if index.dtype.kind == "f" or (len(index) and index.max() >= count):
             raise ValueError(f"an index of {index.max()}, with {count} vertices")
-        name = str(to_index(primitive["material"])) if "material" in primitive else "none"
+        name = str(to_gltf_index(primitive["material"])) if "material" in primitive else "none"
         material = materials[name]
         normals, colour, uv, glow_uv = None, None, None, None
         if "NORMAL" in attributes:
@@ -170,15 +170,13 @@ class _GltfReader:
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
         """(V, 2) coordinates, v upward, of the set that a texture of a material reads."""
         material = self.document.content["materials"][int(name)]
-        texture = {**_base_colour_properties(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(
-            key, {}
-        )
+        texture = {**_gltf_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
-        attribute = f"TEXCOORD_{to_index(moved.get('texCoord', texture.get('texCoord', 0)))}"
+        attribute = f"TEXCOORD_{to_gltf_index(moved.get('texCoord', texture.get('texCoord', 0)))}"
         attributes = primitive["attributes"]
         if attribute not in attributes:
             return None
-        count = to_index(self.document.content["accessors"][attributes["POSITION"]]["count"])
+        count = to_gltf_index(self.document.content["accessors"][attributes["POSITION"]]["count"])
         uv = self.document.array(attributes[attribute], ["VEC2"], count).astype(np.float32)
         uv[:, 1] = 1 - uv[:, 1]
         return uv
@@ -224,11 +222,11 @@ class _GltfReader:
 
     def _node_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
         """(4, 4) scene from node, of the nodes of the scene that is shown."""
-        children = [[to_index(child) for child in node.get("children", [])] for node in nodes]
+        children = [[to_gltf_index(child) for child in node.get("children", [])] for node in nodes]
         scenes = self.document.entries("scenes")
         if scenes:
-            shown = scenes[to_index(self.document.content.get("scene", 0))]
-            roots = [to_index(node) for node in shown.get("nodes", [])]
+            shown = scenes[to_gltf_index(self.document.content.get("scene", 0))]
+            roots = [to_gltf_index(node) for node in shown.get("nodes", [])]
         else:
             roots = sorted(set(range(len(nodes))) - {child for below in children for child in below})
         found: dict[int, NDArray[np.float64]] = {}
@@ -257,13 +255,13 @@ class _GltfReader:
         if len(lengths) != 1:
             raise ValueError(f"instances have {sorted(lengths) or 'no'} places")
         count = lengths.pop()
-        check_limits(self.path, {"instances": (count, MAX_PARTS)})
+        check_mesh_limits(self.path, {"instances": (count, MAX_PARTS)})
         places = [{name: values[k] for name, values in columns.items()} for k in range(count)]
         return [matrix @ _node_matrix(place, "an instance") for place in places]
 
     def _joint_matrices(self, skin: Mapping[str, Any], matrices: Mapping[int, NDArray]) -> NDArray[np.float64]:
         """(J, 4, 4) from the place where a vertex was bound to each joint to where the joint is."""
-        joints = [to_index(joint) for joint in skin["joints"]]
+        joints = [to_gltf_index(joint) for joint in skin["joints"]]
         outside = [joint for joint in joints if joint not in matrices]
         if outside:
             raise ValueError(f"joint {outside[0]} is outside of the scene")
@@ -275,13 +273,15 @@ class _GltfReader:
 
     def read_material(self, material: Mapping[str, Any]) -> Material:
         """Read a material and its textures."""
-        base, extensions = _base_colour_properties(material), material.get("extensions", {})
-        factor = [finite_number(x) for x in base.get("baseColorFactor", (1.0, 1.0, 1.0))]
+        base, extensions = _gltf_base_colour(material), material.get("extensions", {})
+        factor = [finite_gltf_number(x) for x in base.get("baseColorFactor", (1.0, 1.0, 1.0))]
         mode = material.get("alphaMode", "OPAQUE")
-        cutoff = finite_number(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
+        cutoff = finite_gltf_number(material.get("alphaCutoff", 0.5)) if mode == "MASK" else 0.5
         opacity = factor[3] if len(factor) > 3 and mode != "OPAQUE" else 1.0
-        strength = finite_number(extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0))
-        light = [strength * finite_number(x) for x in material.get("emissiveFactor", (0.0, 0.0, 0.0))]
+        strength = finite_gltf_number(
+            extensions.get("KHR_materials_emissive_strength", {}).get("emissiveStrength", 1.0)
+        )
+        light = [strength * finite_gltf_number(x) for x in material.get("emissiveFactor", (0.0, 0.0, 0.0))]
         glow = self._textured_material(light, material.get("emissiveTexture")) if any(light) else None
         found = self._textured_material(factor, base.get("baseColorTexture"))
         unlit = "KHR_materials_unlit" in extensions
@@ -293,18 +293,18 @@ class _GltfReader:
         colour = (factor[0], factor[1], factor[2])
         if texture_info is None:
             return Material(colour)
-        texture = self.document.content["textures"][to_index(texture_info["index"])]
+        texture = self.document.content["textures"][to_gltf_index(texture_info["index"])]
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         if source is None:
             found = ", ".join(texture.get("extensions", {})) or "no image"
             raise DataError(f"{self.path}: a texture has {found[:60]}, which is not read; expected PNG, JPEG or WebP")
         sampler: Mapping[str, int] = {}
         if "sampler" in texture:
-            sampler = self.document.content["samplers"][to_index(texture["sampler"])]
+            sampler = self.document.content["samplers"][to_gltf_index(texture["sampler"])]
         wrap = _WRAPS.get(sampler.get("wrapS", 0), "repeat"), _WRAPS.get(sampler.get("wrapT", 0), "repeat")
         moved = texture_info.get("extensions", {}).get("KHR_texture_transform")
         transform = None if moved is None else _texture_transform(moved)
-        return Material(colour, self._read_gltf_image(to_index(source)), wrap, transform)
+        return Material(colour, self._read_gltf_image(to_gltf_index(source)), wrap, transform)
 
     def _read_gltf_image(self, index: int) -> str | None:
         """Read an image and return its key in :attr:`images`; None where it is missing and that is allowed."""
@@ -312,7 +312,7 @@ class _GltfReader:
         if name not in self.images:
             image = self.document.content["images"][index]
             if "uri" in image:
-                data = self.document.folder.read_optional([parse_uri(image["uri"])], "texture")
+                data = self.document.folder.read_optional([parse_gltf_uri(image["uri"])], "texture")
             else:
                 data = self.document.view(image["bufferView"])[0]
             if data is None:
@@ -321,7 +321,7 @@ class _GltfReader:
         return name
 
 
-def _base_colour_properties(material: Mapping[str, Any]) -> Mapping[str, Any]:
+def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
     """Base colour and its texture in either notation; where a material has both, specular-glossiness wins."""
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:
@@ -334,7 +334,7 @@ def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
     """(4, 4) parent from node, of a matrix or of translation, rotation and scale."""
     matrix = np.eye(4)
     lengths = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
-    numbers = {key: [finite_number(x) for x in place[key]] for key in lengths if key in place}
+    numbers = {key: [finite_gltf_number(x) for x in place[key]] for key in lengths if key in place}
     if any(len(values) != lengths[key] for key, values in numbers.items()):
         raise ValueError(f"{where} has a transform of another length")
     if "matrix" in numbers:
@@ -366,4 +366,4 @@ def _texture_transform(transform: Mapping[str, Any]) -> tuple[tuple[float, ...],
     (x, y), (u, v) = transform.get("offset", (0.0, 0.0)), transform.get("scale", (1.0, 1.0))
     c, s = math.cos(transform.get("rotation", 0.0)), math.sin(transform.get("rotation", 0.0))
     rows = ((c * u, s * v, x), (-s * u, c * v, y))
-    return tuple(tuple(finite_number(value) for value in row) for row in rows)
+    return tuple(tuple(finite_gltf_number(value) for value in row) for row in rows)

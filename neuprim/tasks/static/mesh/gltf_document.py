@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from neuprim.core.errors import DataError
 from neuprim.core.io.plain import load_json
 from neuprim.core.notices import warn_once
-from neuprim.tasks.static.mesh.model import ModelFolder
+from neuprim.tasks.static.mesh.model import MeshFolder
 
 _GLB, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942
 _COMPONENT_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -72,7 +72,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 class GltfDocument:
     """A document whose version and extensions are checked, and its arrays."""
 
-    def __init__(self, folder: ModelFolder) -> None:
+    def __init__(self, folder: MeshFolder) -> None:
         data = folder.read_model()
         text, binary = _split_glb(data) if folder.file.suffix.lower() == ".glb" else (data, None)
         document = load_json(text.decode("utf-8-sig"), infinite=True)  # refused later, with the name of the value
@@ -108,7 +108,7 @@ class GltfDocument:
 
     def _read_buffer(self, index: int, entry: Mapping[str, Any], binary: bytes | None) -> bytes:
         if "uri" in entry:
-            data = self.folder.read_required(parse_uri(entry["uri"]), "buffer")
+            data = self.folder.read_required(parse_gltf_uri(entry["uri"]), "buffer")
         elif binary is not None and index == 0:
             data = binary
         elif entry.get("extensions"):
@@ -121,18 +121,18 @@ class GltfDocument:
 
     def view(self, index: int) -> tuple[bytes, int]:
         """Return bytes and stride (0: packed) of a buffer view."""
-        view = self.content["bufferViews"][to_index(index)]
-        data = self._buffers[to_index(view["buffer"])]
-        start, size = to_index(view.get("byteOffset", 0)), to_index(view["byteLength"])
+        view = self.content["bufferViews"][to_gltf_index(index)]
+        data = self._buffers[to_gltf_index(view["buffer"])]
+        start, size = to_gltf_index(view.get("byteOffset", 0)), to_gltf_index(view["byteLength"])
         if start + size > len(data):
             raise ValueError(f"bufferViews[{index}] ends at byte {start + size} of {len(data)}")
-        return data[start : start + size], to_index(view.get("byteStride", 0))
+        return data[start : start + size], to_gltf_index(view.get("byteStride", 0))
 
     def array(self, index: int, kinds: Sequence[str], length: int | None = None) -> NDArray:
         """Return (N, C) values of an accessor of one of the types ``kinds``; normalized integers as floats 0..1 or
         -1..1."""
-        accessor = self.content["accessors"][to_index(index)]
-        where, count, kind = f"accessors[{index}]", to_index(accessor["count"]), accessor["type"]
+        accessor = self.content["accessors"][to_gltf_index(index)]
+        where, count, kind = f"accessors[{index}]", to_gltf_index(accessor["count"]), accessor["type"]
         if kind not in kinds:
             raise ValueError(f"{where} is {str(kind)[:20]}, not {' or '.join(kinds)}")
         if length is not None and count != length:
@@ -141,7 +141,7 @@ class GltfDocument:
             raise DataError(f"{self.path}: {where} is sparse or compressed, which is not read; expected a plain export")
         data, stride = self.view(accessor["bufferView"])
         dtype, width = np.dtype(_COMPONENT_TYPES[accessor["componentType"]]), _WIDTHS[kind]
-        start, row = to_index(accessor.get("byteOffset", 0)), dtype.itemsize * width
+        start, row = to_gltf_index(accessor.get("byteOffset", 0)), dtype.itemsize * width
         stride = stride or row
         if stride < row:
             raise ValueError(f"{where} has a stride of {stride} bytes")
@@ -155,21 +155,21 @@ class GltfDocument:
         return values
 
 
-def parse_uri(uri: Any) -> str:
+def parse_gltf_uri(uri: Any) -> str:
     """Return a data URI as it is, and the name of a file unquoted."""
     if not isinstance(uri, str) or not uri or "\0" in uri:
         raise ValueError("a uri is no text")
     return uri if uri.startswith("data:") else unquote(uri)
 
 
-def to_index(value: Any) -> int:
+def to_gltf_index(value: Any) -> int:
     """Return an index or count; refuse -1, with which Python would take the last entry of a list."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"an index is {str(value)[:20]}")
     return value
 
 
-def finite_number(value: Any) -> float:
+def finite_gltf_number(value: Any) -> float:
     """Return a number; refuse NaN and infinity."""
     number = float(value)
     if not math.isfinite(number):

@@ -92,7 +92,7 @@ def find_model_file(path: Path) -> Path:
     return file
 
 
-class ModelFolder:
+class MeshFolder:
     """Reads a mesh file and the files below its folder, up to a total size, and hashes all that it reads."""
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
@@ -179,7 +179,7 @@ class ModelFolder:
         return data
 
 
-def check_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None:
+def check_mesh_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None:
     """Raise DataError for the first count above its limit, given as name -> (count, limit)."""
     for name, (count, limit) in counts.items():
         if count > limit:

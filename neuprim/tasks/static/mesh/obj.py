@@ -21,9 +21,9 @@ from neuprim.tasks.static.mesh.model import (
     MAX_VERTICES,
     Faces,
     Material,
+    MeshFolder,
     Model,
-    ModelFolder,
-    check_limits,
+    check_mesh_limits,
     check_vertices,
 )
 from neuprim.tasks.static.mesh.polygons import triangulate_polygons
@@ -38,11 +38,11 @@ _WIDTHS = {"v": (3, 8), "vt": (1, 3), "vn": (3, 3)}
 _NONE = -1  # the index of texture coordinates or a normal that a corner does without
 
 
-def read_obj(folder: ModelFolder) -> Model:
-    """Read an .obj file and its material libraries; raises DataError as :class:`ModelFolder`."""
+def read_obj(folder: MeshFolder) -> Model:
+    """Read an .obj file and its material libraries; raises DataError as :class:`MeshFolder`."""
     text = folder.read_model().decode("utf-8", "replace")
     found = {"vertices": (text.count("\nv "), MAX_VERTICES), "faces": (text.count("\nf "), MAX_FACES)}
-    check_limits(folder.file, {**found, "changes of material": (text.count("usemtl "), MAX_PARTS)})
+    check_mesh_limits(folder.file, {**found, "changes of material": (text.count("usemtl "), MAX_PARTS)})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     libraries: dict[str, None] = {}
@@ -106,14 +106,14 @@ def _read_obj_faces(path: Path, text: str) -> tuple[list[Faces], int]:
     for name, index in names.items():
         mine = used[faces[owner == index]]
         if len(mine):
-            normals = _look_up_corners(vn, mine[..., 2], 0.0) if len(vn) else None
-            uv = _look_up_corners(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
+            normals = _look_up_obj_corners(vn, mine[..., 2], 0.0) if len(vn) else None
+            uv = _look_up_obj_corners(vt[:, :2], mine[..., 1], np.nan) if (mine[..., 1] != _NONE).any() else None
             colour = None if colours is None else colours[mine[..., 0]]
             parts.append(Faces(v[mine[..., 0], :3], name, normals, colour, uv, uv))
     return parts, len(v)
 
 
-def _look_up_corners(table: NDArray[np.float64], index: NDArray[np.int64], missing: float) -> NDArray[np.float64]:
+def _look_up_obj_corners(table: NDArray[np.float64], index: NDArray[np.int64], missing: float) -> NDArray[np.float64]:
     return np.where((index == _NONE)[..., None], missing, table[index])
 
 
@@ -141,7 +141,7 @@ def _obj_vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float3
     return np.clip(found / scale, 0, 1).astype(np.float32)
 
 
-def _read_mtl_library(text: str, folder: ModelFolder, images: dict[str, bytes]) -> dict[str, Material]:
+def _read_mtl_library(text: str, folder: MeshFolder, images: dict[str, bytes]) -> dict[str, Material]:
     found: dict[str, Material] = {}
     name = ""
     with_d = set[str]()  # materials whose d is known, which wins over Tr
@@ -170,7 +170,7 @@ def _read_mtl_library(text: str, folder: ModelFolder, images: dict[str, bytes]) 
             value = _mtl_opacity(words[-1], folder, name)
             with_d |= {name} if key == "d" else set()
             found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
-        elif key == "map_d" and _texture_file_name(words, rest)[0] != old.texture:
+        elif key == "map_d" and _mtl_texture_file_name(words, rest)[0] != old.texture:
             what = f"map_d of material {name[:40]!r} is not read"
             warn_once(f"{folder.file}: {what}; drawn as opaque as d and the alpha of map_Kd say")
     return {name: _finish_mtl_material(material) for name, material in found.items()}
@@ -187,9 +187,9 @@ def _finish_mtl_material(material: Material) -> Material:
     return replace(material, colour=white if material.texture is not None else material.colour, glow=glow)
 
 
-def _read_mtl_texture(words: list[str], rest: str, folder: ModelFolder, images: dict[str, bytes]) -> Material | None:
+def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: dict[str, bytes]) -> Material | None:
     """The texture that a line names, with its place; None where it is missing and that is allowed."""
-    image, options = _texture_file_name(words, rest)
+    image, options = _mtl_texture_file_name(words, rest)
     spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
     if image not in images:
         data = folder.read_optional(spellings[:1] if spellings[0] == spellings[1] else spellings, "texture")
@@ -203,7 +203,7 @@ def _read_mtl_texture(words: list[str], rest: str, folder: ModelFolder, images: 
     return Material(texture=image, wrap=wrap, transform=((su, 0.0, ou), (0.0, sv, 1 - sv - ov)) if moved else None)
 
 
-def _texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
+def _mtl_texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
     """A texture's name, which may hold blanks, without the options before it; and those of them that move it."""
     place, last = 0, len(words) - 1
     options: dict[str, tuple[float, float]] = {}
@@ -227,14 +227,14 @@ def _is_mtl_number(word: str) -> bool:
     return re.fullmatch(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d{1,3})?", word) is not None
 
 
-def _mtl_opacity(word: str, folder: ModelFolder, name: str) -> float:
+def _mtl_opacity(word: str, folder: MeshFolder, name: str) -> float:
     if not _is_mtl_number(word):
         found = f"material {name[:40]!r} has the opacity {word[:20]!r}"
         raise DataError(f"{folder.file}: {found}; expected a number from 0 to 1")
     return min(max(float(word), 0.0), 1.0)
 
 
-def _mtl_colour(words: list[str], folder: ModelFolder, name: str) -> tuple[float, float, float]:
+def _mtl_colour(words: list[str], folder: MeshFolder, name: str) -> tuple[float, float, float]:
     try:
         values = torch.tensor([float(word) for word in words[:3]])
         if not values.isfinite().all():

@@ -19,9 +19,9 @@ from neuprim.tasks.static.mesh.model import (
     MAX_VERTICES,
     Faces,
     Material,
+    MeshFolder,
     Model,
-    ModelFolder,
-    check_limits,
+    check_mesh_limits,
     check_vertices,
 )
 from neuprim.tasks.static.mesh.polygons import triangulate_polygons
@@ -32,7 +32,7 @@ _UV = (("texture_u", "texture_v"), ("u", "v"), ("s", "t"))
 _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 
 
-def read_ply_mesh(folder: ModelFolder) -> Model:
+def read_ply_mesh(folder: MeshFolder) -> Model:
     """Read a .ply file with its faces, and the texture that a comment ``TextureFile`` names."""
     data = folder.read_model()
     end = data.find(b"end_header", 0, _HEADER)
@@ -43,7 +43,7 @@ def read_ply_mesh(folder: ModelFolder) -> Model:
     header = data[:end].decode("utf-8", "replace")
     counts = {name: int(count) for name, count in re.findall(r"(?m)^element[ \t]+(\S+)[ \t]+(\d{1,18})\s*$", header)}
     vertices, faces = (counts.get("vertex", 0), MAX_VERTICES), (counts.get("face", 0), MAX_FACES)
-    check_limits(folder.file, {"vertices": vertices, "faces": faces})
+    check_mesh_limits(folder.file, {"vertices": vertices, "faces": faces})
     materials: dict[str, Material] = {}
     images: dict[str, bytes] = {}
     texture = re.search(r"(?mi)^comment[ \t]+TextureFile[ \t]+(.+?)\s*$", header)
@@ -52,10 +52,10 @@ def read_ply_mesh(folder: ModelFolder) -> Model:
         if image is not None:
             images[texture[1]] = image
             materials[""] = Material((1.0, 1.0, 1.0), texture[1], cutoff=0.5, blend=True)
-    return Model(folder.file, partial(_read_ply_faces, folder.file, data), folder.digest, materials, images)
+    return Model(folder.file, partial(_read_ply_mesh_faces, folder.file, data), folder.digest, materials, images)
 
 
-def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
+def _read_ply_mesh_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     """Read all triangles and count the vertices."""
     elements = read_ply_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
     vertices = elements["vertex"]
@@ -77,9 +77,9 @@ def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     triangles, polygon = triangulate_polygons(path, xyz[index], corners.sizes)
     used = index[triangles]
     normals = vertices.columns(("nx", "ny", "nz"))[used] if {"nx", "ny", "nz"} <= set(vertices.names) else None
-    colour = _ply_colours(vertices, path)
+    colour = _ply_mesh_colours(vertices, path)
     colour = None if colour is None else colour[used]
-    if colour is None and (of_faces := _ply_colours(face, path)) is not None:
+    if colour is None and (of_faces := _ply_mesh_colours(face, path)) is not None:
         colour = np.repeat(of_faces[polygon][:, None], 3, axis=1)
     uv: NDArray[np.float64] | None = None
     coordinates = lists.get("texcoord")
@@ -92,7 +92,7 @@ def _read_ply_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
     return [Faces(xyz[used], "", normals, colour, uv)], count
 
 
-def _ply_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
+def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
     """(N, 3) 0..1 of vertices or faces; None without."""
     if not set(_RGB) <= set(element.names):
         return None
@@ -103,7 +103,7 @@ def _ply_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
     return np.clip(np.nan_to_num(element.columns(_RGB) / most), 0, 1).astype(np.float32)
 
 
-def read_stl(folder: ModelFolder) -> Model:
+def read_stl(folder: MeshFolder) -> Model:
     """Read an .stl file: binary where its length is what byte 80 announces, whatever it starts with, else text."""
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
@@ -112,9 +112,9 @@ def read_stl(folder: ModelFolder) -> Model:
         if data[:5].lower() != b"solid" or b"facet" not in data[:_HEADER]:
             expected = f"{84 + 50 * count} bytes for them, found {len(data)}"
             raise DataError(f"{folder.file}: {count} faces announced; expected {expected}")
-        check_limits(folder.file, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
+        check_mesh_limits(folder.file, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
         count = data.lower().count(b"endfacet")
-    check_limits(folder.file, {"faces": (count, MAX_FACES)})
+    check_mesh_limits(folder.file, {"faces": (count, MAX_FACES)})
     read_faces = _read_stl_text if text else _read_stl_binary
     return Model(folder.file, partial(read_faces, folder.file, data), folder.digest)
 

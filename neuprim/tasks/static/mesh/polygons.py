@@ -42,7 +42,7 @@ def triangulate_polygons(
             normal = np.where(length > _FLAT, normal / length, 0.0)
         left = np.arange(len(rows))
         for start in range(min(size, _FANS)):
-            fan = _triangle_fan(size, start)
+            fan = _polygon_triangle_fan(size, start)
             a, b, c = (points[left][:, fan[:, i]] for i in range(3))
             across = np.cross(b - a, c - a)
             areas = np.einsum("mtc,mc->mt", across, normal[left])  # twice; negative where triangles turn the other way
@@ -75,7 +75,7 @@ def triangulate_polygons(
     return np.concatenate(found)[order], owner[order]
 
 
-def _triangle_fan(size: int, start: int) -> NDArray[np.intp]:
+def _polygon_triangle_fan(size: int, start: int) -> NDArray[np.intp]:
     """(size - 2, 3) corners of the triangles around the corner ``start``."""
     around = (start + np.arange(1, size)) % size
     return np.stack([np.full(size - 2, start), around[:-1], around[1:]], axis=1)
@@ -102,12 +102,12 @@ def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64
             return None, tests
         i = place % len(left)
         a, b, c = left[i - 1], left[i], left[(i + 1) % len(left)]
-        area = _cross_product(points[b] - points[a], points[c] - points[a])
+        area = _polygon_cross_product(points[b] - points[a], points[c] - points[a])
         ear = bool(area > _FLAT)
         if ear:
             others = points[left]
             weights = np.stack(
-                [_cross_product(points[q] - points[p], others - points[p]) for p, q in ((a, b), (b, c), (c, a))]
+                [_polygon_cross_product(points[q] - points[p], others - points[p]) for p, q in ((a, b), (b, c), (c, a))]
             )
             own = np.any([(np.abs(others - points[p]) <= _FLAT).all(axis=1) for p in (a, b, c)], axis=0)
             ear = not bool(np.any((weights >= -_FLAT if strict else weights > _FLAT).all(axis=0) & ~own))
@@ -122,6 +122,6 @@ def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64
     return np.array(found, np.int64).reshape(-1, 3), tests
 
 
-def _cross_product(p: NDArray, q: NDArray) -> NDArray[np.float64]:
+def _polygon_cross_product(p: NDArray, q: NDArray) -> NDArray[np.float64]:
     product: NDArray[np.float64] = p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
     return product

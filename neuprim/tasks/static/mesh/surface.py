@@ -30,7 +30,7 @@ from neuprim.tasks.static.mesh.model import (
     Material,
     Model,
     Up,
-    check_limits,
+    check_mesh_limits,
 )
 
 GREY = parse_srgb("#b4b4b4")  # of what the file says no colour of
@@ -59,7 +59,7 @@ def read_surfaces(model: Model) -> list[SurfacePart]:
         found = f"{vertices} points and no faces" if vertices else "no faces"
         raise DataError(f"{model.path}: has {found}; expected a mesh with triangles")
     parts = (len(faces), MAX_PARTS)
-    check_limits(model.path, {"faces": (count, MAX_FACES), "vertices": (vertices, MAX_VERTICES), "parts": parts})
+    check_mesh_limits(model.path, {"faces": (count, MAX_FACES), "vertices": (vertices, MAX_VERTICES), "parts": parts})
     surfaces = [_make_surface_part(model, part) for part in faces]
     bare = sum(len(part.colour) for part in surfaces if part.bare)
     if bare:
@@ -120,7 +120,7 @@ _LINEAR: NDArray[np.float32] = srgb_to_linear(torch.arange(256) / 255.0).numpy()
 _ROWS = 256
 
 
-class Texture:
+class MeshTexture:
     """An image, (H, W, 4) uint8 sRGB with straight alpha, with its copies of half, a quarter, ... of the size."""
 
     def __init__(self, pixels: NDArray[np.uint8], wrap: tuple[str, str] = ("repeat", "repeat")) -> None:
@@ -151,15 +151,15 @@ class Texture:
         x, y = uv[:, 0].astype(np.float64) * width - 0.5, (1.0 - uv[:, 1].astype(np.float64)) * height - 0.5
         left, top = np.floor(x), np.floor(y)
         across, down = (x - left).astype(np.float32)[:, None], (y - top).astype(np.float32)[:, None]
-        x0, x1 = (_wrap_texels(left + i, width, self.wrap[0]) for i in (0, 1))
-        y0, y1 = (_wrap_texels(top + i, height, self.wrap[1]) for i in (0, 1))
+        x0, x1 = (_wrap_mesh_texels(left + i, width, self.wrap[0]) for i in (0, 1))
+        y0, y1 = (_wrap_mesh_texels(top + i, height, self.wrap[1]) for i in (0, 1))
         upper = (1 - across) * _linear_texels(image[y0, x0]) + across * _linear_texels(image[y0, x1])
         lower = (1 - across) * _linear_texels(image[y1, x0]) + across * _linear_texels(image[y1, x1])
         mixed: NDArray[np.float32] = (1 - down) * upper + down * lower
         return mixed
 
 
-def _wrap_texels(index: NDArray[np.float64], size: int, wrap: str) -> NDArray[np.intp]:
+def _wrap_mesh_texels(index: NDArray[np.float64], size: int, wrap: str) -> NDArray[np.intp]:
     if wrap == "clamp":
         return np.clip(index, 0, size - 1).astype(np.intp)
     if wrap == "mirror":
@@ -223,12 +223,12 @@ _LEAST_AREA = 1e-12  # of a face, in square scene units: below that it has no no
 _MAX_HOLES = 64  # of holes that a ray passes at most
 _MOST_AROUND = 64  # faces around a vertex that are smoothed over; work and memory grow with their square
 
-_Pool = dict[tuple[str, tuple[str, str]], Texture]
+_Pool = dict[tuple[str, tuple[str, str]], MeshTexture]
 
 _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
-def scene_from_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
+def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
     """(4, 4) transform that turns z up and scales the box into [-1, 1]^3 and into view; None without size."""
     turn = _Z_FROM_Y if upward == "y" else np.eye(3)
     lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
@@ -244,13 +244,13 @@ def scene_from_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.floa
     return matrix
 
 
-class Surface(Scene):
+class MeshSurface(Scene):
     """The parts of a model, ready for ray queries; neighbouring rays are ``spacing`` apart at distance 1."""
 
     def __init__(
         self, model: Model, parts: Sequence[SurfacePart], upward: Up, spacing: float, engine: Engine = "auto"
     ) -> None:
-        matrix = scene_from_file(parts, upward)
+        matrix = scene_from_mesh_file(parts, upward)
         if matrix is None:
             found = "the mesh is a point, or too large for numbers"
             raise DataError(f"{model.path}: {found}; expected a size from 1e-150 to 1e150")
@@ -279,10 +279,10 @@ class Surface(Scene):
         super().__init__([Solid("mesh", mesh, uniform_colour("#ffffff"), 0.0, normals=normals)], engine)
         pool: _Pool = {}
         area = double / spacing**2
-        self._base = _ColourLayer(model, parts, kept, area, pool)
+        self._base = _MeshColourLayer(model, parts, kept, area, pool)
         _warn_of_translucent_faces(model, parts, pool)
         glows = [p.glow or replace(p, colour=np.zeros_like(p.colour), uv=None, alpha=None) for p in parts]
-        self._glow = _ColourLayer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
+        self._glow = _MeshColourLayer(model, glows, kept, area, pool) if any(p.glow for p in parts) else None
         cutoffs = [np.nan if p.uv is None and p.alpha is None else p.material.cutoff for p in parts]
         self._cutoff = np.repeat(np.array(cutoffs, np.float32), [len(part.colour) for part in parts])[kept]
         self._holes = bool((self._cutoff > 0).any())
@@ -336,7 +336,7 @@ class Surface(Scene):
         return through
 
 
-class _ColourLayer:
+class _MeshColourLayer:
     """Colours of the faces ``kept`` (F,): corner values times textures; ``area`` (F,) is twice a face's, in rays."""
 
     def __init__(
@@ -349,7 +349,7 @@ class _ColourLayer:
                 continue
             if (name, wrap) not in pool:
                 left = MAX_TEXELS - sum(texture.texels for texture in pool.values())
-                pool[name, wrap] = Texture(decode_texture(model.path, name, model.images[name], left), wrap)
+                pool[name, wrap] = MeshTexture(decode_texture(model.path, name, model.images[name], left), wrap)
             owner[i] = list(pool).index((name, wrap))
         self._textures = list(pool.values())
         self._texture = np.repeat(owner, [len(part.colour) for part in parts])[kept]

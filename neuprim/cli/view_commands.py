@@ -165,7 +165,7 @@ def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _inspect(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import print_notes
-    from neuprim.inspect import ViewOptions, parse_box
+    from neuprim.inspect import ViewOptions, parse_inspection_box
     from neuprim.runs.inspect import InspectRequest, inspect_run
 
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
@@ -175,7 +175,7 @@ def _inspect(arguments: argparse.Namespace) -> int:
         names or ["volume"],
         arguments.conditions,
         arguments.grid,
-        None if arguments.box is None else parse_box(arguments.box),
+        None if arguments.box is None else parse_inspection_box(arguments.box),
         options=ViewOptions(tuple(arguments.level), arguments.primitive),
         against=arguments.against,
         out=arguments.out,

@@ -164,8 +164,8 @@ class Inspector:
     """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
 
     Attributes:
-        layers: a :class:`~neuprim.inspect.field.FieldFrame` -> a list of layers of :mod:`neuprim.inspect.layers`, which
-            a window, a picture, a film and a page draw; called once per frame and panel.
+        layers: a :class:`~neuprim.inspect.field.InspectionFrame` -> a list of layers of :mod:`neuprim.inspect.layers`,
+            which a window, a picture, a film and a page draw; called once per frame and panel.
         shows: "sigma" for the extinction on the frame's grid, shown a second time for the ground truth if there is
             one; "model" for the primitives; "primitive" for a single one, with a camera of its own; "both" for what
             needs the ground truth.

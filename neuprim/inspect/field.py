@@ -39,7 +39,7 @@ class ViewOptions:
 
 
 @dataclass(frozen=True)
-class FieldFrame:
+class InspectionFrame:
     """One frame. The extinction on its grid is computed at first use.
 
     Attributes:
@@ -74,7 +74,7 @@ class FieldFrame:
     side: str = "model"
     _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
-    def of_side(self, side: str) -> FieldFrame:
+    def of_side(self, side: str) -> InspectionFrame:
         """Return the same frame showing its "model" or its "truth"; the grids are shared."""
         return replace(self, side=side)
 
@@ -211,7 +211,7 @@ class _GivenConditions(dict[str, Tensor]):
         raise ConfigError(f"this needs the {name}; give {flag(name)}")
 
 
-def read_condition_frames(
+def read_inspected_conditions(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = lambda text: None
 ) -> list[Conditions]:
     """Read the conditions of each frame with :func:`~neuprim.core.conditions.read_conditions`.
@@ -233,7 +233,7 @@ def read_condition_frames(
     ]
 
 
-def describe_conditions(conditions: Conditions) -> str:
+def describe_inspected_conditions(conditions: Conditions) -> str:
     """Describe conditions in words, e.g. "time 0.5"."""
     parts = []
     for name, value in conditions.items():
@@ -242,7 +242,7 @@ def describe_conditions(conditions: Conditions) -> str:
     return ", ".join(parts)
 
 
-def parse_box(numbers: Sequence[float]) -> np.ndarray:
+def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
     """Return the (2, 3) box of ``--box``; raise ConfigError unless it has six numbers and a volume."""
     if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
         given = ",".join(f"{x:g}" for x in numbers)
@@ -250,7 +250,7 @@ def parse_box(numbers: Sequence[float]) -> np.ndarray:
     return np.array(numbers, np.float64).reshape(2, 3)
 
 
-def find_matter_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
+def find_inspection_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
     """Return a (2, 3) float64 box around nearly all that the model absorbs in some of the frames.
 
     Raises:
@@ -258,20 +258,20 @@ def find_matter_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarr
     """
     lows, highs = [], []
     for conditions in frames[:: max(1, len(frames) // 5)]:
-        frame = FieldFrame(model, conditions, "", torch.eye(4, dtype=torch.float64), (1, 1, 1), 1.0, 1.0)
+        frame = InspectionFrame(model, conditions, "", torch.eye(4, dtype=torch.float64), (1, 1, 1), 1.0, 1.0)
         geometry, weights = frame.geometry, np.nan_to_num(frame.masses, posinf=0.0)
         if not weights.sum() > 0:
             continue
         reach = (geometry.rotations * geometry.scales[:, None, :]).norm(dim=2).double().numpy()
         means = geometry.means.double().numpy()
-        lows.append([_weighted_quantile(means[:, a] - reach[:, a], weights, _OUTSIDE) for a in range(3)])
-        highs.append([_weighted_quantile(means[:, a] + reach[:, a], weights, 1 - _OUTSIDE) for a in range(3)])
+        lows.append([_inspection_box_quantile(means[:, a] - reach[:, a], weights, _OUTSIDE) for a in range(3)])
+        highs.append([_inspection_box_quantile(means[:, a] + reach[:, a], weights, 1 - _OUTSIDE) for a in range(3)])
     if not lows:
         raise DataError("the model absorbs nothing in any of these frames; there is nothing to look at")
     return np.stack([np.min(lows, 0), np.max(highs, 0)])
 
 
-def _weighted_quantile(values: np.ndarray, weights: np.ndarray, part: float) -> float:
+def _inspection_box_quantile(values: np.ndarray, weights: np.ndarray, part: float) -> float:
     order = values.argsort()
     total = weights[order].cumsum()
     return float(values[order[min(int(np.searchsorted(total, part * total[-1])), len(order) - 1)]])

@@ -19,10 +19,10 @@ import numpy as np
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Inspector
 from neuprim.core.io.files import write_text
-from neuprim.inspect.field import FieldFrame
+from neuprim.inspect.field import InspectionFrame
 from neuprim.inspect.layers import (
     Ellipsoids,
-    Grid,
+    InspectionGrid,
     Isosurfaces,
     Layer,
     Lines,
@@ -35,14 +35,14 @@ from neuprim.inspect.layers import (
     colormap_bytes,
     layer_colours,
 )
-from neuprim.inspect.views import DIFFERENCE, ISOSURFACE, SLICES, VOLUME, find_viewpoint, unit_sphere
+from neuprim.inspect.views import DIFFERENCE, ISOSURFACE, SLICES, VOLUME, find_inspection_viewpoint, unit_sphere
 
 ELLIPSOIDS_LIMIT = 4000  # of a layer, the first ones
 _ALWAYS = (VOLUME, ISOSURFACE, SLICES, DIFFERENCE)  # they show grids that the page has anyway
 _SIZE_LIMIT = 2**29  # bytes of a page; browsers refuse longer strings
 
 
-class Frames(Protocol):
+class InspectionFrames(Protocol):
     """What a page is made of: frames on one grid."""
 
     name: str
@@ -50,10 +50,10 @@ class Frames(Protocol):
 
     def __len__(self) -> int: ...
 
-    def frame(self, index: int) -> FieldFrame: ...
+    def frame(self, index: int) -> InspectionFrame: ...
 
 
-def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> None:
+def write_inspection_page(path: Path, frames: InspectionFrames, inspectors: Sequence[Inspector]) -> None:
     """Write the page, whole or not at all. It opens with the first inspector and offers the built-in views, too.
 
     Raises:
@@ -65,8 +65,8 @@ def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> N
     stored: list[dict[str, Any]] = []
     size = 0
     for i in range(len(frames)):
-        packed = PackedFrameArrays()
-        stored.append(_frame_data(frames.frame(i), views, frames.up, packed))
+        packed = InspectionFrameArrays()
+        stored.append(_inspection_frame_data(frames.frame(i), views, frames.up, packed))
         size += packed.size
         if size > _SIZE_LIMIT:
             raise ConfigError(
@@ -80,7 +80,7 @@ def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> N
         "box": first.box.tolist(),
         "views": kinds,
         "first": inspectors[0].name,
-        "maps": {name: colormap_bytes(name).ravel().tolist() for name in sorted(set(_used_colormaps(stored)))},
+        "maps": {name: colormap_bytes(name).ravel().tolist() for name in sorted(set(_inspection_colormaps(stored)))},
         "ball": {"points": points.ravel().round(6).tolist(), "faces": faces.ravel().tolist()},
         "frames": stored,
     }
@@ -90,14 +90,16 @@ def write_page(path: Path, frames: Frames, inspectors: Sequence[Inspector]) -> N
     write_text(path, template.replace("__TITLE__", title).replace("__DATA__", text))
 
 
-def _frame_data(frame: FieldFrame, views: Sequence[Inspector], up: str, packed: PackedFrameArrays) -> dict[str, Any]:
+def _inspection_frame_data(
+    frame: InspectionFrame, views: Sequence[Inspector], up: str, packed: InspectionFrameArrays
+) -> dict[str, Any]:
     layers: dict[str, Any] = {}
     viewpoints: dict[str, Any] = {}
     for view in views:
         sides = ("model", "truth") if view.shows == "sigma" and frame.truth is not None else ("model",)
         layers[view.name] = {side: packed.pack_layers(view.layers(frame.of_side(side))) for side in sides}
         if view.shows == "primitive":
-            point = find_viewpoint(view, frame, up)
+            point = find_inspection_viewpoint(view, frame, up)
             place = {"focus": point.focus.tolist(), "radius": point.radius, "away": point.direction.tolist()}
             viewpoints[view.name] = place
     numbers = None if frame.numbers is None else dict(frame.numbers)
@@ -105,14 +107,14 @@ def _frame_data(frame: FieldFrame, views: Sequence[Inspector], up: str, packed: 
     return {**words, "stands": viewpoints, "layers": layers, "arrays": packed.arrays}
 
 
-def _used_colormaps(frames: Sequence[dict[str, Any]]) -> Iterator[str]:
+def _inspection_colormaps(frames: Sequence[dict[str, Any]]) -> Iterator[str]:
     for frame in frames:
         for sides in frame["layers"].values():
             for layers in sides.values():
                 yield from (layer["scale"]["colours"] for layer in layers if layer.get("scale"))
 
 
-def encode_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
+def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
     """Encode numbers as uint8, and name the code. Roots spend most steps near 0, where thin matter is.
 
     ========  ==========================  ==================================================
@@ -136,7 +138,7 @@ def encode_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
     return np.asarray(np.rint(byte).astype(np.uint8)), code
 
 
-class PackedFrameArrays:
+class InspectionFrameArrays:
     """The arrays of one frame, compressed, in the order in which layers use them."""
 
     def __init__(self) -> None:
@@ -156,9 +158,9 @@ class PackedFrameArrays:
     def _pack(self, layer: Layer) -> dict[str, Any]:
         if isinstance(layer, Text):
             return {"kind": "text", "text": layer.text, "corner": layer.corner}
-        if isinstance(layer, Grid):
+        if isinstance(layer, InspectionGrid):
             return self._pack_grid(layer)
-        scale = None if layer.values is None or layer.scale is None else _scale_data(layer.scale)
+        scale = None if layer.values is None or layer.scale is None else _inspection_scale_data(layer.scale)
         found: dict[str, Any] = {"opacity": float(layer.opacity), "scale": scale}
         if isinstance(layer, Ellipsoids):
             count = min(len(layer.centres), ELLIPSOIDS_LIMIT)
@@ -177,15 +179,19 @@ class PackedFrameArrays:
         assert isinstance(layer, Lines)
         return {**found, "kind": "lines", "rows": self._store(layer.pairs, "<u4")}
 
-    def _pack_grid(self, layer: Grid) -> dict[str, Any]:
+    def _pack_grid(self, layer: InspectionGrid) -> dict[str, Any]:
         scale, box = layer.scale, layer.box
         key = (id(layer.values), float(scale.low), float(scale.high))
         if key not in self._grids:
-            stored, code = encode_values(layer.values.astype(np.float32, copy=False), scale)
+            stored, code = encode_inspected_values(layer.values.astype(np.float32, copy=False), scale)
             self._grids[key] = (layer.values, self._store(stored.ravel(order="F"), "u1"), code)
         _, index, code = self._grids[key]
         found = {"grid": index, "code": code, "shape": layer.values.shape, "low": box[0].tolist()}
-        found |= {"size": (box[1] - box[0]).tolist(), "step": float(layer.steps.min()), "scale": _scale_data(scale)}
+        found |= {
+            "size": (box[1] - box[0]).tolist(),
+            "step": float(layer.steps.min()),
+            "scale": _inspection_scale_data(scale),
+        }
         if isinstance(layer, Volume):
             return {**found, "kind": "volume", "depth": float(layer.depth)}
         if isinstance(layer, Isosurfaces):
@@ -199,5 +205,5 @@ class PackedFrameArrays:
         return len(self.arrays) - 1
 
 
-def _scale_data(scale: Scale) -> dict[str, Any]:
+def _inspection_scale_data(scale: Scale) -> dict[str, Any]:
     return {"low": float(scale.low), "high": float(scale.high), "colours": scale.colours, "words": scale.label}

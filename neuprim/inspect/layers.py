@@ -38,7 +38,7 @@ class Scale:
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class InspectionGrid:
     """Numbers at the points of a regular grid along the scene's axes; drawn as one of the three kinds below.
 
     Attributes:
@@ -65,7 +65,7 @@ class Grid:
 
 
 @dataclass(frozen=True, eq=False)
-class Volume(Grid):
+class Volume(InspectionGrid):
     """A cloud: over a length h it hides 1 - exp(-|value| depth h) of what is behind.
 
     Attributes:
@@ -76,7 +76,7 @@ class Volume(Grid):
 
 
 @dataclass(frozen=True, eq=False)
-class Slices(Grid):
+class Slices(InspectionGrid):
     """Three planes across the axes.
 
     Attributes:
@@ -87,7 +87,7 @@ class Slices(Grid):
 
 
 @dataclass(frozen=True, eq=False)
-class Isosurfaces(Grid):
+class Isosurfaces(InspectionGrid):
     """Surfaces of equal value, closed as if values were 0 outside the grid.
 
     Attributes:
@@ -207,7 +207,7 @@ class _InvalidLayer(Exception):
     """A layer that cannot be drawn; the text says which member is what, and what was expected."""
 
 
-def validate_layers(found: Any) -> str | None:
+def validate_inspection_layers(found: Any) -> str | None:
     """Find the first thing in an inspector's result that cannot be drawn. VTK would end the process on a wrong index.
 
     Returns:
@@ -220,85 +220,91 @@ def validate_layers(found: Any) -> str | None:
         if not isinstance(layer, get_args(Layer)):
             return f"returned a {type(layer).__name__} as layer {i}; expected one {expected}"
         try:
-            (_check_text if isinstance(layer, Text) else _check_grid if isinstance(layer, Grid) else _check_shape)(
-                layer
-            )
+            (
+                _check_inspection_text
+                if isinstance(layer, Text)
+                else _check_inspection_grid
+                if isinstance(layer, InspectionGrid)
+                else _check_inspection_shape
+            )(layer)
         except _InvalidLayer as problem:
             return f"returned layer {i}, a {type(layer).__name__}, whose {problem}"
     return None
 
 
-def _require(ok: object, name: str, found: object, expected: str) -> None:
+def _require_inspectable(ok: object, name: str, found: object, expected: str) -> None:
     if not ok:
         raise _InvalidLayer(f"{name} is {found}; expected {expected}")
 
 
-def _check_text(layer: Text) -> None:
-    _require(isinstance(layer.text, str), "text", repr(layer.text), "text")
-    _require(layer.corner in _CORNERS, "corner", repr(layer.corner), " or ".join(_CORNERS))
+def _check_inspection_text(layer: Text) -> None:
+    _require_inspectable(isinstance(layer.text, str), "text", repr(layer.text), "text")
+    _require_inspectable(layer.corner in _CORNERS, "corner", repr(layer.corner), " or ".join(_CORNERS))
 
 
-def _check_grid(layer: Any) -> None:
-    values = _check_array(layer, "values", (None, None, None))
-    _require(min(values.shape), "values", f"of shape {values.shape}", "at least one point along each axis")
-    _check_array(layer, "origin", (3,))
-    _check_scale(layer.scale)
+def _check_inspection_grid(layer: Any) -> None:
+    values = _check_inspection_array(layer, "values", (None, None, None))
+    _require_inspectable(min(values.shape), "values", f"of shape {values.shape}", "at least one point along each axis")
+    _check_inspection_array(layer, "origin", (3,))
+    _check_inspection_scale(layer.scale)
     several = isinstance(layer.spacing, tuple | list | np.ndarray) and len(layer.spacing) == 3
     positive = all(_is_number(step, 0) and step for step in (layer.spacing if several else [layer.spacing]))
-    _require(positive, "spacing", repr(layer.spacing), "a positive number of scene units, or three")
+    _require_inspectable(positive, "spacing", repr(layer.spacing), "a positive number of scene units, or three")
     if isinstance(layer, Volume):
-        _require(_is_number(layer.depth, 0), "depth", repr(layer.depth), "a number from 0")
+        _require_inspectable(_is_number(layer.depth, 0), "depth", repr(layer.depth), "a number from 0")
     if isinstance(layer, Slices) and layer.through is not None:
-        _check_array(layer, "through", (3,))
+        _check_inspection_array(layer, "through", (3,))
     if isinstance(layer, Isosurfaces):
         fine = isinstance(layer.levels, tuple | list) and layer.levels and all(map(_is_number, layer.levels))
-        _require(fine, "levels", repr(layer.levels), "a tuple of at least one number")
+        _require_inspectable(fine, "levels", repr(layer.levels), "a tuple of at least one number")
 
 
-def _check_shape(layer: Any) -> None:
-    points = _check_array(layer, "vertices" if isinstance(layer, Mesh | Lines) else "centres", (None, 3))
+def _check_inspection_shape(layer: Any) -> None:
+    points = _check_inspection_array(layer, "vertices" if isinstance(layer, Mesh | Lines) else "centres", (None, 3))
     count = len(points)
     if isinstance(layer, Ellipsoids):
-        _check_array(layer, "axes", (count, 3, 3))
+        _check_inspection_array(layer, "axes", (count, 3, 3))
     if isinstance(layer, Mesh | Lines):
         name, corners = ("faces", 3) if isinstance(layer, Mesh) else ("pairs", 2)
-        rows = _check_array(layer, name, (None, corners))
-        _require(rows.dtype.kind in "iu", name, f"of type {rows.dtype}", "integers")
+        rows = _check_inspection_array(layer, name, (None, corners))
+        _require_inspectable(rows.dtype.kind in "iu", name, f"of type {rows.dtype}", "integers")
         inside = not rows.size or 0 <= int(rows.min()) <= int(rows.max()) < count
-        _require(inside, name, "an index beyond the vertices", f"rows 0 to {count - 1} of them")
+        _require_inspectable(inside, name, "an index beyond the vertices", f"rows 0 to {count - 1} of them")
     if isinstance(layer, Points | Lines):
         name = "size" if isinstance(layer, Points) else "width"
         pixels = getattr(layer, name)
-        _require(_is_number(pixels, 0) and pixels, name, repr(pixels), "a positive number of pixels")
-    _require(_is_number(layer.opacity, 0, 1), "opacity", repr(layer.opacity), "a number from 0 to 1")
+        _require_inspectable(_is_number(pixels, 0) and pixels, name, repr(pixels), "a positive number of pixels")
+    _require_inspectable(_is_number(layer.opacity, 0, 1), "opacity", repr(layer.opacity), "a number from 0 to 1")
     if layer.values is not None:
-        _require(layer.colours is None, "colours", "given beside values", "one of them")
-        _check_array(layer, "values", (count,))
-        _check_scale(layer.scale)
+        _require_inspectable(layer.colours is None, "colours", "given beside values", "one of them")
+        _check_inspection_array(layer, "values", (count,))
+        _check_inspection_scale(layer.scale)
     elif layer.colours is not None:
-        colours = _check_array(layer, "colours", (3,) if np.ndim(layer.colours) == 1 else (count, 3))
+        colours = _check_inspection_array(layer, "colours", (3,) if np.ndim(layer.colours) == 1 else (count, 3))
         inside = not colours.size or bool(0 <= colours.min() <= colours.max() <= 1)
-        _require(inside, "colours", "beyond 0 or 1", "numbers from 0 to 1")
+        _require_inspectable(inside, "colours", "beyond 0 or 1", "numbers from 0 to 1")
 
 
-def _check_scale(scale: Any) -> None:
-    _require(isinstance(scale, Scale), "scale", f"a {type(scale).__name__}", "a Scale")
+def _check_inspection_scale(scale: Any) -> None:
+    _require_inspectable(isinstance(scale, Scale), "scale", f"a {type(scale).__name__}", "a Scale")
     ends = _is_number(scale.low) and _is_number(scale.high) and scale.low < scale.high
-    _require(ends, "scale", f"from {scale.low!r} to {scale.high!r}", "a lower and a higher number")
+    _require_inspectable(ends, "scale", f"from {scale.low!r} to {scale.high!r}", "a lower and a higher number")
     texts = isinstance(scale.title, str) and isinstance(scale.unit, str)
-    _require(texts, "scale", f"of title {scale.title!r} and unit {scale.unit!r}", "texts")
+    _require_inspectable(texts, "scale", f"of title {scale.title!r} and unit {scale.unit!r}", "texts")
     known = isinstance(scale.colours, str) and scale.colours in matplotlib.colormaps
-    _require(known, "scale", f"of colours {scale.colours!r}", "a colour map of matplotlib, as 'inferno'")
+    _require_inspectable(known, "scale", f"of colours {scale.colours!r}", "a colour map of matplotlib, as 'inferno'")
 
 
-def _check_array(layer: Any, name: str, shape: tuple[int | None, ...]) -> Any:
+def _check_inspection_array(layer: Any, name: str, shape: tuple[int | None, ...]) -> Any:
     value = getattr(layer, name)
-    _require(isinstance(value, np.ndarray), name, f"a {type(value).__name__}", "a numpy array")
+    _require_inspectable(isinstance(value, np.ndarray), name, f"a {type(value).__name__}", "a numpy array")
     fits = len(value.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, value.shape, strict=True))
-    _require(fits, name, f"of shape {value.shape}", f"({', '.join('N' if n is None else str(n) for n in shape)})")
-    _require(value.dtype.kind in "fiub", name, f"of type {value.dtype}", "real numbers")
+    _require_inspectable(
+        fits, name, f"of shape {value.shape}", f"({', '.join('N' if n is None else str(n) for n in shape)})"
+    )
+    _require_inspectable(value.dtype.kind in "fiub", name, f"of type {value.dtype}", "real numbers")
     finite = not value.size or bool(-_LARGEST <= value.min() <= value.max() <= _LARGEST)  # False for NaN, too
-    _require(finite, name, "not finite in float32", "finite numbers")
+    _require_inspectable(finite, name, "not finite in float32", "finite numbers")
     return value
 
 

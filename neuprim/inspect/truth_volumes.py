@@ -16,13 +16,15 @@ from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, vdb_sequ
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.density_grid import voxels_in_box
 from neuprim.core.volumes.density_truth import DensityTruth, TruthFrame, VolumeSource
-from neuprim.inspect.field import FieldFrame
+from neuprim.inspect.field import InspectionFrame
 
 _GRID, _MARK, _CONDITION = "extinction", "neuprim_units", "neuprim_condition_"
 _USUAL = (_GRID, "density", "sigma")
 
 
-def open_ground_truth(path: str, volume: Callable[[], VolumeSource | None], world: World) -> tuple[DensityTruth, str]:
+def open_inspection_truth(
+    path: str, volume: Callable[[], VolumeSource | None], world: World
+) -> tuple[DensityTruth, str]:
     """Open the ground truth that the user named, and say in a line how it was read.
 
     Args:
@@ -43,17 +45,19 @@ def open_ground_truth(path: str, volume: Callable[[], VolumeSource | None], worl
         raise DataError(f"--against {path}: no such file or folder; expected .vdb files, or scene for the scene's own")
     frames = list(vdb_sequence(place).frames) if place.is_dir() else [VdbFrame(0, place)]
     if _written_by_neuprim(frames[0].path):
-        return VdbGroundTruth(frames, world), f"ground truth: {path}, written by neuprim in scene units"
+        return InspectionGroundTruth(frames, world), f"ground truth: {path}, written by neuprim in scene units"
     scene = volume()
     if scene is not None:
         return scene.open_files(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
     place = "the scene" if world.identity else f"that of the run's data, of {world.scale:g} scene units"
-    return VdbGroundTruth(
+    return InspectionGroundTruth(
         frames, world
     ), f"ground truth: {path}, taken as extinction in 1/scene unit, its world as {place}"
 
 
-def pair_frames(frames: Sequence[Conditions], truth: DensityTruth, given: bool) -> list[tuple[Conditions, int]]:
+def pair_inspected_frames(
+    frames: Sequence[Conditions], truth: DensityTruth, given: bool
+) -> list[tuple[Conditions, int]]:
     """Pair each frame to show with the nearest frame of the truth: (conditions, truth's frame), each frame once.
 
     The conditions are those of the truth's frame. A truth of one frame is shown under the user's conditions if these
@@ -65,18 +69,18 @@ def pair_frames(frames: Sequence[Conditions], truth: DensityTruth, given: bool) 
         return [(type(frames[0])({**frames[0], **truth.frames[0].conditions}), 0)]  # type: ignore[call-arg]
     pairs: dict[int, Conditions] = {}
     for i, conditions in enumerate(frames):
-        distances = [_condition_distance(conditions, frame.conditions) for frame in truth.frames]
+        distances = [_inspected_condition_distance(conditions, frame.conditions) for frame in truth.frames]
         known = all(frame.conditions for frame in truth.frames)
         nearest = int(np.argmin(distances)) if known else min(i, len(truth.frames) - 1)
         pairs.setdefault(nearest, type(conditions)({**conditions, **truth.frames[nearest].conditions}))  # type: ignore[call-arg]
     return [(conditions, number) for number, conditions in pairs.items()]
 
 
-def _condition_distance(a: Conditions, b: Conditions) -> float:
+def _inspected_condition_distance(a: Conditions, b: Conditions) -> float:
     return sum(float((a[name] - b[name]).abs().sum()) for name in b if name in a)
 
 
-class VdbGroundTruth(DensityTruth):
+class InspectionGroundTruth(DensityTruth):
     """OpenVDB files of extinction, 1/scene unit, in the world of a model; trilinear between voxels, 0 outside.
 
     Raises:
@@ -142,7 +146,7 @@ def _written_by_neuprim(path: Path) -> bool:
     return names == [_GRID] and read_grid(path, _GRID).metadata.get(_MARK) == "scene"
 
 
-def write_density_vdb(path: Path, frame: FieldFrame, world: World) -> None:
+def write_inspection_vdb(path: Path, frame: InspectionFrame, world: World) -> None:
     """Write the frame's extinction, 1/scene unit, as OpenVDB in the world of its model, one voxel per grid point."""
     scalars = {_CONDITION + name: float(value) for name, value in frame.conditions.items() if value.numel() == 1}
     meaning = {_MARK: "scene", "neuprim_value": "extinction, 1/scene unit; each primitive clamped at 0 from below"}

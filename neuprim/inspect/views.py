@@ -9,7 +9,7 @@ import torch
 
 from neuprim.core.extensions import Inspector
 from neuprim.core.task import API_VERSION
-from neuprim.inspect.field import FieldFrame
+from neuprim.inspect.field import InspectionFrame
 from neuprim.inspect.layers import Ellipsoids, Isosurfaces, Layer, Mesh, Scale, Slices, Text, Volume
 
 _SURFACE_COLOURS = "plasma"  # brighter at its lower end, where the outermost surface is
@@ -18,27 +18,27 @@ _MIN_OPACITY = 1.0 / 255.0  # of an ellipsoid that is drawn
 _MAX_ELLIPSOIDS = 20_000
 
 
-def _show_volume(frame: FieldFrame) -> list[Layer]:
+def _inspect_volume(frame: InspectionFrame) -> list[Layer]:
     return [Volume(frame.sigma, frame.origin, frame.step, frame.scale, depth=frame.gain)]
 
 
-def _show_difference(frame: FieldFrame) -> list[Layer]:
+def _inspect_difference(frame: InspectionFrame) -> list[Layer]:
     reach = frame.top / 2  # errors are smaller than the values
     scale = Scale(-reach, reach, _SIGNED_COLOURS, "model - truth", frame.scale.unit)
     return [Volume(frame.difference, frame.origin, frame.step, scale, depth=frame.gain)]
 
 
-def _show_isosurface(frame: FieldFrame) -> list[Layer]:
+def _inspect_isosurface(frame: InspectionFrame) -> list[Layer]:
     levels = frame.options.levels or tuple(part * frame.top for part in (0.1, 1 / 3, 2 / 3))
     scale = Scale(0.0, frame.top, _SURFACE_COLOURS, frame.scale.title, frame.scale.unit)
     return [Isosurfaces(frame.sigma, frame.origin, frame.step, scale, levels=levels)]
 
 
-def _show_slices(frame: FieldFrame) -> list[Layer]:
+def _inspect_slices(frame: InspectionFrame) -> list[Layer]:
     return [Slices(frame.sigma, frame.origin, frame.step, frame.scale, through=np.array(frame.focus))]
 
 
-def _visible_primitives(frame: FieldFrame) -> np.ndarray:
+def _inspected_primitives(frame: InspectionFrame) -> np.ndarray:
     """Return positions in ``frame.rows`` of the ellipsoids to draw, by what they absorb.
 
     Their opacity is that of a ray along the mean radius through the mean extinction.
@@ -49,8 +49,8 @@ def _visible_primitives(frame: FieldFrame) -> np.ndarray:
     return np.asarray(order[visible[order]][:_MAX_ELLIPSOIDS])
 
 
-def _show_primitives(frame: FieldFrame) -> list[Layer]:
-    chosen = _visible_primitives(frame)
+def _inspect_primitives(frame: InspectionFrame) -> list[Layer]:
+    chosen = _inspected_primitives(frame)
     geometry = frame.geometry[torch.from_numpy(chosen)]
     axes = (geometry.rotations * geometry.scales[:, None, :]).transpose(1, 2).detach().numpy()
     text = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
@@ -58,8 +58,8 @@ def _show_primitives(frame: FieldFrame) -> list[Layer]:
     return [Ellipsoids(geometry.means.detach().numpy(), axes, colours=colours), Text(text)]
 
 
-def _show_primitive(frame: FieldFrame) -> list[Layer]:
-    position, (unit, faces) = frame.chosen_position(), make_cut_ball()
+def _inspect_primitive(frame: InspectionFrame) -> list[Layer]:
+    position, (unit, faces) = frame.chosen_position(), make_inspection_ball()
     geometry = frame.geometry[position : position + 1]
     axes = (geometry.rotations * geometry.scales[:, None, :])[0].double()
     points = geometry.means[0].double() + torch.from_numpy(unit) @ axes.T
@@ -77,16 +77,16 @@ def _show_primitive(frame: FieldFrame) -> list[Layer]:
     return [mesh, Text(f"{text}extinction {low:.3g} to {high:.3g}, unclamped", "upper_right")]
 
 
-VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _show_volume)
-ISOSURFACE = Inspector(API_VERSION, "isosurface", "surfaces of equal extinction", _show_isosurface)
-SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the matter", _show_slices)
+VOLUME = Inspector(API_VERSION, "volume", "the extinction as a cloud", _inspect_volume)
+ISOSURFACE = Inspector(API_VERSION, "isosurface", "surfaces of equal extinction", _inspect_isosurface)
+SLICES = Inspector(API_VERSION, "slices", "three planes through the middle of the matter", _inspect_slices)
 PRIMITIVES = Inspector(
-    API_VERSION, "primitives", "the ellipsoids in their own colours", _show_primitives, shows="model"
+    API_VERSION, "primitives", "the ellipsoids in their own colours", _inspect_primitives, shows="model"
 )
 PRIMITIVE = Inspector(
-    API_VERSION, "primitive", "the density inside one primitive, cut open", _show_primitive, shows="primitive"
+    API_VERSION, "primitive", "the density inside one primitive, cut open", _inspect_primitive, shows="primitive"
 )
-DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _show_difference, shows="both")
+DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _inspect_difference, shows="both")
 
 
 # ---------------------------------------------------------------- viewpoints
@@ -112,7 +112,7 @@ class Viewpoint:
     up: np.ndarray
 
 
-def find_viewpoint(inspector: Inspector, frame: FieldFrame, up: str) -> Viewpoint:
+def find_inspection_viewpoint(inspector: Inspector, frame: InspectionFrame, up: str) -> Viewpoint:
     """Choose where a view of a frame starts: before the whole box, or before a single primitive.
 
     Args:
@@ -143,7 +143,7 @@ def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
     return np.asarray(ball.vertices), np.asarray(ball.faces, np.int64)
 
 
-def make_cut_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
+def make_inspection_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
     """Make the unit ball without the quarter x > 0 > y.
 
     The sphere and the two planes of the cut share no points on their edges, so that these stay sharp.
@@ -159,11 +159,15 @@ def make_cut_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
     edges = np.concatenate([solid[-1, 0], solid[-1, -1]])  # copies for the planes where they meet the sphere
     first, last = index[:, 0].copy(), index[:, -1].copy()
     first[-1], last[-1] = r.size + np.arange(rings), r.size + rings + np.arange(rings)
-    faces = [_sheet_triangles(index[-1].T), _sheet_triangles(first.T), _sheet_triangles(last)]
+    faces = [
+        _inspection_ball_triangles(index[-1].T),
+        _inspection_ball_triangles(first.T),
+        _inspection_ball_triangles(last),
+    ]
     return np.concatenate([solid.reshape(-1, 3), edges]), np.concatenate(faces)
 
 
-def _sheet_triangles(index: np.ndarray) -> np.ndarray:
+def _inspection_ball_triangles(index: np.ndarray) -> np.ndarray:
     """Return (2 (A - 1) (B - 1), 3) triangles of an (A, B) sheet of points."""
     a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
     return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])

@@ -14,10 +14,10 @@ import numpy as np
 
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.extensions import Inspector
-from neuprim.inspect.field import FieldFrame
+from neuprim.inspect.field import InspectionFrame
 from neuprim.inspect.layers import (
     Ellipsoids,
-    Grid,
+    InspectionGrid,
     Isosurfaces,
     Layer,
     Lines,
@@ -30,13 +30,13 @@ from neuprim.inspect.layers import (
     Volume,
     layer_colours,
 )
-from neuprim.inspect.views import find_viewpoint, unit_sphere
+from neuprim.inspect.views import find_inspection_viewpoint, unit_sphere
 
 Panel = tuple[Inspector, str]
 _PANEL = (720, 640)
 
 
-def list_panels(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
+def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
     """List (inspector, side) of each panel. Views of the extinction are shown twice if there is a ground truth."""
     return [
         (i, side)
@@ -70,7 +70,7 @@ class Window:
     def _select_panel(self, panel: int) -> None:
         self.plotter.subplot(*divmod(panel, self.shape[1]))
 
-    def draw(self, frame: FieldFrame) -> None:
+    def draw(self, frame: InspectionFrame) -> None:
         """Draw a frame in all panels."""
         for title in list(self.plotter.scalar_bars.keys()):
             self.plotter.remove_scalar_bar(title, render=False)
@@ -78,20 +78,20 @@ class Window:
             self._select_panel(panel)
             self.plotter.renderer.clear_actors()
             part = frame.of_side(side)
-            _add_layers(self.plotter, inspector.layers(part), panel)
+            _add_pyvista_layers(self.plotter, inspector.layers(part), panel)
             if inspector.shows != "primitive":
-                _add_box(self.plotter, part.box)
+                _add_pyvista_box(self.plotter, part.box)
             look = {"position": "upper_left", "font_size": 10, "color": "white", "name": "caption"}
-            self.plotter.add_text(_panel_caption(inspector, part), **look)
+            self.plotter.add_text(_inspection_caption(inspector, part), **look)
             self.plotter.add_axes(color="white", line_width=2)
         if not self._cameras_placed:
             self._place_cameras(frame)
 
-    def _place_cameras(self, frame: FieldFrame) -> None:
+    def _place_cameras(self, frame: InspectionFrame) -> None:
         linked = [i for i, (inspector, _) in enumerate(self.panels) if inspector.shows != "primitive"]
         for panel, (inspector, _) in enumerate(self.panels):
             self._select_panel(panel)
-            point, camera = find_viewpoint(inspector, frame, self._up), self.plotter.camera
+            point, camera = find_inspection_viewpoint(inspector, frame, self._up), self.plotter.camera
             camera.focal_point, camera.up = point.focus, point.up
             camera.position = point.focus + point.direction * point.radius / np.sin(np.radians(camera.view_angle) / 2)
             self.plotter.renderer.reset_camera_clipping_range()
@@ -104,13 +104,13 @@ class Window:
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))[..., :3]
 
-    def interact(self, count: int, frame: Callable[[int], FieldFrame]) -> None:
+    def interact(self, count: int, frame: Callable[[int], InspectionFrame]) -> None:
         """Show the window until the user closes it, with a slider for more than one frame."""
         self.add_slider(count, frame)
         self.draw(frame(0))
         self.plotter.show()
 
-    def add_slider(self, count: int, frame: Callable[[int], FieldFrame]) -> None:
+    def add_slider(self, count: int, frame: Callable[[int], InspectionFrame]) -> None:
         """Add a slider over ``count`` frames. A frame is drawn when the slider reaches it."""
         if count < 2:
             return
@@ -132,7 +132,7 @@ class Window:
         self.plotter.close()
 
 
-def _panel_caption(inspector: Inspector, frame: FieldFrame) -> str:
+def _inspection_caption(inspector: Inspector, frame: InspectionFrame) -> str:
     first = frame.truth_name or "ground truth" if frame.side == "truth" else frame.title or "model"
     lines = [f"{inspector.name}: {'ground truth, ' if frame.side == 'truth' else ''}{first}"]
     if frame.numbers and frame.side == "model" and inspector.shows in ("sigma", "both"):
@@ -146,7 +146,7 @@ _OPACITY_STEPS = 256
 _FINE_ELLIPSOIDS = 4000  # ellipsoids up to which each gets many triangles
 
 
-def _add_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> None:
+def _add_pyvista_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> None:
     """Draw valid layers and a bar for each of their scales into the plotter's current panel, number ``panel``."""
     scales: dict[Scale, None] = {}
     for layer in layers:
@@ -154,21 +154,21 @@ def _add_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> None:
             plotter.add_text(layer.text, position=layer.corner, font_size=8, color="white")
             continue
         _ADD[type(layer)](plotter, layer)
-        scale = layer.scale if isinstance(layer, Grid) or layer.values is not None else None
+        scale = layer.scale if isinstance(layer, InspectionGrid) or layer.values is not None else None
         if scale is not None and scale.title:
             scales[scale] = None
     for place, scale in enumerate(scales):
-        _add_bar(plotter, scale, panel, place)
+        _add_pyvista_bar(plotter, scale, panel, place)
 
 
-def _add_box(plotter: Any, box: np.ndarray) -> None:
+def _add_pyvista_box(plotter: Any, box: np.ndarray) -> None:
     """Draw the edges of a (2, 3) box."""
     import pyvista
 
     plotter.add_mesh(pyvista.Box(box.T.ravel()).outline(), color="#8894a0", line_width=1, lighting=False)
 
 
-def _add_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
+def _add_pyvista_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
     """Draw a scalar bar that does not depend on what is drawn. The first one is lowest."""
     import pyvista
 
@@ -180,7 +180,7 @@ def _add_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
     plotter.add_scalar_bar(title, mapper=mapper, render=False, **size, **look)
 
 
-def _make_image(layer: Grid, values: np.ndarray, around: int = 0) -> Any:
+def _make_pyvista_image(layer: InspectionGrid, values: np.ndarray, around: int = 0) -> Any:
     """Make ``pyvista.ImageData`` of values at the layer's points, with some layers of zeros around."""
     import pyvista
 
@@ -190,11 +190,11 @@ def _make_image(layer: Grid, values: np.ndarray, around: int = 0) -> Any:
     return found
 
 
-def _add_volume(plotter: Any, layer: Volume) -> None:
+def _add_pyvista_volume(plotter: Any, layer: Volume) -> None:
     scale, step = layer.scale, float(layer.steps.min())
     ramp = np.linspace(scale.low, scale.high, _OPACITY_STEPS)
     plotter.add_volume(
-        _make_image(layer, np.clip(layer.values, scale.low, scale.high)),
+        _make_pyvista_image(layer, np.clip(layer.values, scale.low, scale.high)),
         scalars="values",
         cmap=scale.colours,
         clim=(scale.low, scale.high),
@@ -206,84 +206,90 @@ def _add_volume(plotter: Any, layer: Volume) -> None:
     )
 
 
-def _add_isosurfaces(plotter: Any, layer: Isosurfaces) -> None:
-    data, levels = _make_image(layer, layer.values, around=1), sorted(layer.levels)
+def _add_pyvista_isosurfaces(plotter: Any, layer: Isosurfaces) -> None:
+    data, levels = _make_pyvista_image(layer, layer.values, around=1), sorted(layer.levels)
     for i, level in enumerate(levels):
         surface = data.contour([level], scalars="values")
         if surface.n_points:
             opacity = 0.95 if i == len(levels) - 1 else min(0.22 + 0.2 * i, 0.95)
             plotter.add_mesh(
-                surface, opacity=opacity, smooth_shading=True, specular=0.25, **_scale_arguments(layer.scale)
+                surface, opacity=opacity, smooth_shading=True, specular=0.25, **_pyvista_scale_arguments(layer.scale)
             )
 
 
-def _add_slices(plotter: Any, layer: Slices) -> None:
+def _add_pyvista_slices(plotter: Any, layer: Slices) -> None:
     x, y, z = layer.box.mean(0) if layer.through is None else layer.through
-    cut = _make_image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
+    cut = _make_pyvista_image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
     if any(part.n_points for part in cut):
-        plotter.add_mesh(cut, lighting=False, **_scale_arguments(layer.scale))
+        plotter.add_mesh(cut, lighting=False, **_pyvista_scale_arguments(layer.scale))
 
 
-def _add_ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
+def _add_pyvista_ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
     count = len(layer.centres)
-    points, faces = _ellipsoid_triangles(layer.centres, layer.axes, 2 if count <= _FINE_ELLIPSOIDS else 1)
+    points, faces = _pyvista_ellipsoid_triangles(layer.centres, layer.axes, 2 if count <= _FINE_ELLIPSOIDS else 1)
     if count:
-        data = _make_polydata(points, faces=_prefix_counts(faces))
+        data = _make_pyvista_polydata(points, faces=_pyvista_cells(faces))
         colours = np.repeat(layer_colours(layer, count), len(points) // count, 0)
         look = {"smooth_shading": True, "ambient": 0.3, "diffuse": 0.8, "specular": 0.15, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_colour_bytes(data, colours))
+        plotter.add_mesh(data, **look, **_pyvista_colour_bytes(data, colours))
 
 
-def _add_mesh(plotter: Any, layer: Mesh) -> None:
+def _add_pyvista_mesh(plotter: Any, layer: Mesh) -> None:
     if len(layer.faces):
-        data = _make_polydata(layer.vertices, faces=_prefix_counts(layer.faces))
+        data = _make_pyvista_polydata(layer.vertices, faces=_pyvista_cells(layer.faces))
         look = {"smooth_shading": True, "ambient": 0.5, "diffuse": 0.6, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_colour_arguments(layer, data))
+        plotter.add_mesh(data, **look, **_pyvista_colour_arguments(layer, data))
 
 
-def _add_points(plotter: Any, layer: Points) -> None:
+def _add_pyvista_points(plotter: Any, layer: Points) -> None:
     if len(layer.centres):
-        data = _make_polydata(layer.centres)
+        data = _make_pyvista_polydata(layer.centres)
         look = {"render_points_as_spheres": True, "point_size": layer.size, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_colour_arguments(layer, data))
+        plotter.add_mesh(data, **look, **_pyvista_colour_arguments(layer, data))
 
 
-def _add_lines(plotter: Any, layer: Lines) -> None:
+def _add_pyvista_lines(plotter: Any, layer: Lines) -> None:
     if len(layer.pairs):
-        data = _make_polydata(layer.vertices, lines=_prefix_counts(layer.pairs))
+        data = _make_pyvista_polydata(layer.vertices, lines=_pyvista_cells(layer.pairs))
         plotter.add_mesh(
-            data, line_width=layer.width, lighting=False, opacity=layer.opacity, **_colour_arguments(layer, data)
+            data,
+            line_width=layer.width,
+            lighting=False,
+            opacity=layer.opacity,
+            **_pyvista_colour_arguments(layer, data),
         )
 
 
-def _make_polydata(points: np.ndarray, **cells: np.ndarray) -> Any:
+def _make_pyvista_polydata(points: np.ndarray, **cells: np.ndarray) -> Any:
     import pyvista
 
     return pyvista.PolyData(np.ascontiguousarray(points, np.float32), **cells)  # type: ignore[arg-type]
 
 
-def _prefix_counts(rows: np.ndarray) -> np.ndarray:
+def _pyvista_cells(rows: np.ndarray) -> np.ndarray:
     return np.c_[np.full(len(rows), rows.shape[1]), rows].ravel()
 
 
-def _colour_arguments(layer: Painted, data: Any) -> dict[str, Any]:
+def _pyvista_colour_arguments(layer: Painted, data: Any) -> dict[str, Any]:
     """Return arguments of ``add_mesh`` that colour a layer's vertices; numbers are interpolated before colouring."""
     if layer.values is not None and layer.scale is not None:
         data.point_data["values"] = layer.values.astype(np.float32)
-        return _scale_arguments(layer.scale)
-    return _colour_bytes(data, layer_colours(layer, data.n_points))
+        return _pyvista_scale_arguments(layer.scale)
+    return _pyvista_colour_bytes(data, layer_colours(layer, data.n_points))
 
 
-def _colour_bytes(data: Any, colours: np.ndarray) -> dict[str, Any]:
+def _pyvista_colour_bytes(data: Any, colours: np.ndarray) -> dict[str, Any]:
     data.point_data["colours"] = colours
     return {"scalars": "colours", "rgb": True, "show_scalar_bar": False}
 
 
-def _scale_arguments(scale: Scale) -> dict[str, Any]:
+def _pyvista_scale_arguments(scale: Scale) -> dict[str, Any]:
     return {"scalars": "values", "cmap": scale.colours, "clim": (scale.low, scale.high), "show_scalar_bar": False}
 
 
-def _ellipsoid_triangles(centres: np.ndarray, axes: np.ndarray, subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
+def _pyvista_ellipsoid_triangles(
+    centres: np.ndarray, axes: np.ndarray, subdivisions: int
+) -> tuple[np.ndarray, np.ndarray]:
     """Return (N V, 3) float32 points and (N F, 3) int64 triangles of N ellipsoids, one after the other."""
     points, faces = unit_sphere(subdivisions)
     placed = centres.astype(np.float64)[:, None, :] + np.einsum("nka,vk->nva", axes.astype(np.float64), points)
@@ -292,13 +298,13 @@ def _ellipsoid_triangles(centres: np.ndarray, axes: np.ndarray, subdivisions: in
 
 
 _ADD: dict[type, Any] = {
-    Volume: _add_volume,
-    Isosurfaces: _add_isosurfaces,
-    Slices: _add_slices,
-    Ellipsoids: _add_ellipsoids,
-    Mesh: _add_mesh,
-    Points: _add_points,
-    Lines: _add_lines,
+    Volume: _add_pyvista_volume,
+    Isosurfaces: _add_pyvista_isosurfaces,
+    Slices: _add_pyvista_slices,
+    Ellipsoids: _add_pyvista_ellipsoids,
+    Mesh: _add_pyvista_mesh,
+    Points: _add_pyvista_points,
+    Lines: _add_pyvista_lines,
 }
 
 
@@ -343,7 +349,7 @@ def prepare_headless() -> None:
     failures = []
     for way in ways:
         environment = {**os.environ, **({_VARIABLE: way} if way else {})}
-        failure = _probe_drawing(environment)
+        failure = _probe_pyvista_drawing(environment)
         if failure is None:
             os.environ.update(environment)
             return
@@ -354,7 +360,7 @@ def prepare_headless() -> None:
     )
 
 
-def _probe_drawing(environment: dict[str, str]) -> str | None:
+def _probe_pyvista_drawing(environment: dict[str, str]) -> str | None:
     """Draw in another process; return why it does not work, or None."""
     command = [sys.executable, "-c", _PROBE]
     try:

@@ -21,11 +21,17 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.density_grid import POINTS_LIMIT, box_lattice, density_grid
 from neuprim.core.volumes.density_truth import DensityTruth, measure_density_errors
-from neuprim.inspect.field import FieldFrame, ViewOptions, describe_conditions, find_matter_box, read_condition_frames
-from neuprim.inspect.html_page import write_page
-from neuprim.inspect.layers import Layer, validate_layers
-from neuprim.inspect.truth_volumes import open_ground_truth, pair_frames, write_density_vdb
-from neuprim.inspect.window import Window, has_display, list_panels, prepare_headless, require_pyvista
+from neuprim.inspect.field import (
+    InspectionFrame,
+    ViewOptions,
+    describe_inspected_conditions,
+    find_inspection_box,
+    read_inspected_conditions,
+)
+from neuprim.inspect.html_page import write_inspection_page
+from neuprim.inspect.layers import Layer, validate_inspection_layers
+from neuprim.inspect.truth_volumes import open_inspection_truth, pair_inspected_frames, write_inspection_vdb
+from neuprim.inspect.window import Window, has_display, list_inspection_panels, prepare_headless, require_pyvista
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import INSPECTORS, PluginError
 from neuprim.runs.fit import Events, Note, ignore_run_event
@@ -96,11 +102,11 @@ def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> l
     if film.channels.hides_channels and any(i.shows == "model" for i in inspectors):
         events(Note(f"shown: {film.channels.display_text}"))
     if request.out is not None and kind == ".html":
-        write_page(request.out, film, inspectors)
+        write_inspection_page(request.out, film, inspectors)
         return [request.out]
     if request.out is not None and kind == ".vdb":
-        return _write_run_frames(request.out, film, lambda path, frame: write_density_vdb(path, frame, film.world))
-    window = Window(list_panels(inspectors, request.against is not None), film.up, bool(kind), request.size)
+        return _write_run_frames(request.out, film, lambda path, frame: write_inspection_vdb(path, frame, film.world))
+    window = Window(list_inspection_panels(inspectors, request.against is not None), film.up, bool(kind), request.size)
     try:
         if request.out is not None:
             return _write_run_pictures(request.out, film, window)
@@ -116,10 +122,10 @@ def _load_run_inspector(name: str) -> Inspector:
     if source.built_in:
         return inspector
 
-    def layers(frame: FieldFrame) -> Sequence[Layer]:
+    def layers(frame: InspectionFrame) -> Sequence[Layer]:
         with attribute_errors(source):
             found = inspector.layers(frame)
-        problem = validate_layers(found)
+        problem = validate_inspection_layers(found)
         if problem is not None:
             raise PluginError(f"{source.label}: {problem}")
         return found
@@ -136,7 +142,7 @@ def _output_paths(out: Path, count: int) -> list[Path]:
 
 
 def _write_run_pictures(out: Path, film: _RunFrames, window: Window) -> list[Path]:
-    def draw(frame: FieldFrame) -> Tensor:
+    def draw(frame: InspectionFrame) -> Tensor:
         window.draw(frame)
         return torch.from_numpy(window.picture().copy()).float() / 255.0
 
@@ -147,7 +153,7 @@ def _write_run_pictures(out: Path, film: _RunFrames, window: Window) -> list[Pat
     return [out]
 
 
-def _write_run_frames(out: Path, film: _RunFrames, write: Callable[[Path, FieldFrame], Any]) -> list[Path]:
+def _write_run_frames(out: Path, film: _RunFrames, write: Callable[[Path, InspectionFrame], Any]) -> list[Path]:
     out.parent.mkdir(parents=True, exist_ok=True)
     paths = _output_paths(out, len(film))
     for i, path in enumerate(paths):
@@ -166,12 +172,12 @@ class _RunFrames:
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
         self.options, self.name = request.options, run.directory.resolve().name
-        wanted = read_condition_frames(run.task.conditions, request.conditions, lambda text: events(Note(text)))
+        wanted = read_inspected_conditions(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
-            self.truth, words = open_ground_truth(request.against, run.volume, run.world)
+            self.truth, words = open_inspection_truth(request.against, run.volume, run.world)
             events(Note(words))
-            pairs = pair_frames(wanted, self.truth, bool(request.conditions))
+            pairs = pair_inspected_frames(wanted, self.truth, bool(request.conditions))
         self.pairs = pairs
         for path in [] if request.out is None else _output_paths(request.out, len(pairs)):
             refuse_existing(path, request.overwrite)
@@ -196,7 +202,7 @@ class _RunFrames:
     def _default_box(self) -> np.ndarray:
         if self.truth is not None:
             return np.asarray(self.truth.bounds.numpy())
-        return find_matter_box(self.model, [conditions for conditions, _ in self.pairs])
+        return find_inspection_box(self.model, [conditions for conditions, _ in self.pairs])
 
     def _compare_frame(self, index: int, events: Events) -> dict[str, float] | None:
         """Return the frame's errors against the truth, on the truth's own points."""
@@ -205,7 +211,7 @@ class _RunFrames:
         conditions, number = self.pairs[index]
         numbers = measure_density_errors(self.model, conditions, self.truth, number, where=self.device)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
-        events(Note(f"{self.truth.frames[number].name}  {describe_conditions(conditions)}  {words}"))
+        events(Note(f"{self.truth.frames[number].name}  {describe_inspected_conditions(conditions)}  {words}"))
         return numbers
 
     def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
@@ -228,14 +234,14 @@ class _RunFrames:
         focus = matrix[:3, :3].numpy() @ np.array(index) + matrix[:3, 3].numpy()
         return _round_scale_of_run_frames(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
-    def frame(self, index: int) -> FieldFrame:
+    def frame(self, index: int) -> InspectionFrame:
         """Make a frame; its grids are computed once per frame object."""
         conditions, number = self.pairs[index]
         truth = self.truth
-        return FieldFrame(
+        return InspectionFrame(
             self.model,
             conditions,
-            describe_conditions(conditions),
+            describe_inspected_conditions(conditions),
             self.matrix,
             self.shape,
             self.top,

@@ -18,8 +18,13 @@ from neuprim.core.io.vdb import read_grid
 from neuprim.core.volumes.density_grid import box_lattice, density_at, density_grid
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.inspect import ViewOptions, window
-from neuprim.inspect.field import FieldFrame, describe_conditions, find_matter_box, read_condition_frames
-from neuprim.inspect.html_page import encode_values
+from neuprim.inspect.field import (
+    InspectionFrame,
+    describe_inspected_conditions,
+    find_inspection_box,
+    read_inspected_conditions,
+)
+from neuprim.inspect.html_page import encode_inspected_values
 from neuprim.inspect.layers import Scale
 from neuprim.plugins.registry import load_task
 from neuprim.runs.fit import Event, Note
@@ -56,7 +61,7 @@ def test_a_condition_is_one_frame_a_range_a_list_or_the_middle() -> None:
 
     def times(text: str | None) -> list[float]:
         return [
-            round(float(c["time"]), 3) for c in read_condition_frames(specs, {} if text is None else {"time": text})
+            round(float(c["time"]), 3) for c in read_inspected_conditions(specs, {} if text is None else {"time": text})
         ]
 
     assert (
@@ -65,30 +70,30 @@ def test_a_condition_is_one_frame_a_range_a_list_or_the_middle() -> None:
         and times("0.1,0.9") == [0.1, 0.9]
         and times(None) == [0.5]
     )
-    lights = read_condition_frames(load_task("relight").conditions, {})
+    lights = read_inspected_conditions(load_task("relight").conditions, {})
     assert lights == [{}], "a light has no middle"
     with pytest.raises(ConfigError, match="give --light"):
         lights[0]["light"]
     assert (
-        describe_conditions({"time": torch.tensor(0.5), "light": torch.tensor([1.0, 2.0, 3.0])})
+        describe_inspected_conditions({"time": torch.tensor(0.5), "light": torch.tensor([1.0, 2.0, 3.0])})
         == "time 0.5, light (1, 2, 3)"
     )
 
 
 def test_the_box_holds_the_matter_and_forgets_a_stray() -> None:
     model, frame = runs.model(), {"time": torch.tensor(0.5)}
-    low, high = find_matter_box(model, [frame])
+    low, high = find_inspection_box(model, [frame])
     assert low == pytest.approx([-0.3, -0.3, -0.3], abs=0.02) and high == pytest.approx([0.3, 0.3, 0.6], abs=0.02)
     model.params["means"][1], model.params["b2"][1], model.params["w2"][1] = torch.tensor([0.0, 0.0, 50.0]), 1e-4, 0.0
-    assert find_matter_box(model, [frame])[1] == pytest.approx([0.3, 0.3, 0.3], abs=0.02)
+    assert find_inspection_box(model, [frame])[1] == pytest.approx([0.3, 0.3, 0.3], abs=0.02)
     model.params["b2"][:], model.params["w2"][:] = -1.0, 0.0
     with pytest.raises(DataError, match="absorbs nothing"):
-        find_matter_box(model, [frame])
+        find_inspection_box(model, [frame])
 
 
-def frame_of(time: float = 1.0, **options: Any) -> FieldFrame:
+def frame_of(time: float = 1.0, **options: Any) -> InspectionFrame:
     matrix, shape = box_lattice(np.array([[-0.5, -0.5, -0.4], [0.6, 0.5, 0.7]]), 24)
-    return FieldFrame(
+    return InspectionFrame(
         runs.model(), {"time": torch.tensor(time)}, "", matrix, shape, 8.0, 1.0, options=ViewOptions(**options)
     )
 
@@ -206,13 +211,13 @@ def test_a_page_holds_the_grids(run_dir: Path, tmp_path: Path) -> None:
 
 def test_eight_bits_keep_thin_matter_and_zero() -> None:
     sigma = np.array([0.0, 0.001, 0.5, 1.0, 7.0], np.float32)
-    stored, code = encode_values(sigma, Scale(0.0, 1.0))
+    stored, code = encode_inspected_values(sigma, Scale(0.0, 1.0))
     assert (stored.tolist(), code) == ([0, 8, 180, 255, 255], "root")
-    stored, code = encode_values(np.array([-3.0, -1.0, -0.01, 0.0, 0.01, 0.25, 2.0]), Scale(-1.0, 1.0))
+    stored, code = encode_inspected_values(np.array([-3.0, -1.0, -0.01, 0.0, 0.01, 0.25, 2.0]), Scale(-1.0, 1.0))
     assert (stored.tolist(), code) == ([1, 1, 115, 128, 141, 192, 255], "signed")
     assert (
-        encode_values(np.array([2.0, 3.0, 4.0]), Scale(2.0, 4.0))[0].tolist(),
-        encode_values(sigma, Scale(-2.0, 0.0))[1],
+        encode_inspected_values(np.array([2.0, 3.0, 4.0]), Scale(2.0, 4.0))[0].tolist(),
+        encode_inspected_values(sigma, Scale(-2.0, 0.0))[1],
     ) == (
         [0, 128, 255],
         "linear",

@@ -13,7 +13,7 @@ from PIL import Image, ImageSequence
 
 from neuprim.cli import main
 from neuprim.core.errors import BackendUnavailable
-from neuprim.inspect.html_page import ELLIPSOIDS_LIMIT, PackedFrameArrays
+from neuprim.inspect.html_page import ELLIPSOIDS_LIMIT, InspectionFrameArrays
 from neuprim.inspect.layers import (
     Ellipsoids,
     Isosurfaces,
@@ -24,9 +24,9 @@ from neuprim.inspect.layers import (
     Slices,
     Text,
     Volume,
-    validate_layers,
+    validate_inspection_layers,
 )
-from neuprim.inspect.views import make_cut_ball
+from neuprim.inspect.views import make_inspection_ball
 from neuprim.inspect.window import prepare_headless
 from neuprim.runs.inspect import InspectRequest, inspect_run
 from tests.inspect.pages import array, layers_of
@@ -203,7 +203,7 @@ WRONG: list[tuple[Any, str]] = [
 
 @pytest.mark.parametrize(("found", "text"), WRONG, ids=[text for _, text in WRONG])
 def test_what_cannot_be_drawn_is_named(found: Any, text: str) -> None:
-    assert text in (validate_layers(found) or "valid") and "\n" not in str(validate_layers(found))
+    assert text in (validate_inspection_layers(found) or "valid") and "\n" not in str(validate_inspection_layers(found))
 
 
 def test_the_line_names_the_package(
@@ -236,7 +236,7 @@ def test_layers_of_nothing_are_drawn(site: Path, run_dir: Path, tmp_path: Path) 
 
 def test_a_page_says_how_many_ellipsoids_it_left_out() -> None:
     count = ELLIPSOIDS_LIMIT + 5
-    packed = PackedFrameArrays()
+    packed = InspectionFrameArrays()
     (found,) = packed.pack_layers(
         [Ellipsoids(np.arange(3.0 * count).reshape(-1, 3), np.broadcast_to(np.eye(3), (count, 3, 3)))]
     )
@@ -246,7 +246,7 @@ def test_a_page_says_how_many_ellipsoids_it_left_out() -> None:
 
 
 def test_the_cut_ball_is_closed_and_its_faces_point_outward() -> None:
-    points, faces = make_cut_ball(16)
+    points, faces = make_inspection_ball(16)
     a, b, c = (points[faces[:, k]] for k in range(3))
     volume = np.einsum("fa,fa->f", (a + b + c) / 3, np.cross(b - a, c - a)).sum() / 6
     assert volume == pytest.approx(0.75 * 4 / 3 * np.pi, rel=0.03)

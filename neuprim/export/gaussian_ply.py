@@ -36,7 +36,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
-from neuprim.export.shared import Harmonics, choose_comparison_views, find_rgb_channels, fit_harmonics
+from neuprim.export.shared import ExportHarmonics, choose_export_views, find_export_rgb_channels, fit_export_harmonics
 
 SIZES = ("moments", "footprint", "profile")
 """What the size of a Gaussian may be fitted to."""
@@ -68,19 +68,19 @@ _MAX_ROUNDING = 1e-4  # of centres in float32, as a share of the size of their c
 def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
     (conditions,) = job.frames()
-    channels, rgb = job.run.channels, find_rgb_channels(job.run)
+    channels, rgb = job.run.channels, find_export_rgb_channels(job.run)
     job.progress("fitting Gaussians", 0.0)
     fits = {name: fit_gaussians(job.run, conditions, name) for name in SIZES if size in ("auto", name)}
     if not all(len(g.means) for g in fits.values()):
         reason = "no primitive absorbs anything under these conditions; nothing to export"
         raise ConfigError(f"{job.run.directory}: {reason}")
-    colours = fit_harmonics(job.run, conditions).select_channels(rgb)
-    images, seen = _draw_model_images(job, which, conditions, rgb)
-    background = _background_colour(job)[list(rgb)]
+    colours = fit_export_harmonics(job.run, conditions).select_channels(rgb)
+    images, seen = _draw_export_images(job, which, conditions, rgb)
+    background = _export_background(job)[list(rgb)]
     scores = {name: _measure_gaussian_psnrs(job, fit, colours, images, background) for name, fit in fits.items()}
     size = max(scores, key=lambda name: float(np.mean(scores[name])))
     gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
-    rows = _vertex_rows(gaussians, colours, job.run.world)
+    rows = _gaussian_ply_rows(gaussians, colours, job.run.world)
     space = channels.color_space
     comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
     comments += [LINEAR] * (space == "linear")
@@ -113,7 +113,7 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
     return ExportReport((job.out,), False, errors, tuple(notes))
 
 
-def _vertex_rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.ndarray:
+def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: World) -> np.ndarray:
     """Return the vertices in the world of the user's files; centres are doubles if floats would lose digits."""
     gaussians, colours = gaussians.to_scene(world.inverse), colours.rotate(world.inverse.rotation)
     scales, quats = gaussians.axes()
@@ -131,13 +131,13 @@ def _vertex_rows(gaussians: Gaussians, colours: Harmonics, world: World) -> np.n
     return rows
 
 
-def _draw_model_images(
+def _draw_export_images(
     job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]
 ) -> tuple[list[tuple[View, Tensor]], str]:
     """Draw the model from the comparison views, red, green and blue, and say which views these are."""
     run = job.run
-    views, what = choose_comparison_views(job, which, conditions)
-    background, images = _background_colour(job), []
+    views, what = choose_export_views(job, which, conditions)
+    background, images = _export_background(job), []
     for i, view in enumerate(views):
         job.progress("drawing the model", i / len(views))
         with torch.no_grad():
@@ -147,16 +147,20 @@ def _draw_model_images(
 
 
 def _measure_gaussian_psnrs(
-    job: ExportJob, gaussians: Gaussians, colours: Harmonics, images: list[tuple[View, Tensor]], background: Tensor
+    job: ExportJob,
+    gaussians: Gaussians,
+    colours: ExportHarmonics,
+    images: list[tuple[View, Tensor]],
+    background: Tensor,
 ) -> list[float]:
     found = []
     for i, (view, truth) in enumerate(images):
         job.progress("drawing the Gaussians", i / len(images))
-        found.append(psnr(draw_gaussians(gaussians, colours, view.camera, background), truth))
+        found.append(psnr(draw_exported_gaussians(gaussians, colours, view.camera, background), truth))
     return found
 
 
-def _background_colour(job: ExportJob) -> Tensor:
+def _export_background(job: ExportJob) -> Tensor:
     return torch.tensor([float(x) for x in job.run.header.get("background", [0.0] * job.run.model.colour.channels)])
 
 
@@ -252,14 +256,14 @@ def _fit_gaussian_chunk(
     if size == "footprint":
         spread = spread * (torch.stack(areas) / (opacity * torch.stack(bells))).mean(0)[:, None, None]
     elif size == "profile":
-        wider, opacity = _fit_profile(screens, torch.stack(areas), torch.stack(bells), ticks)
+        wider, opacity = _fit_gaussian_ply_profile(screens, torch.stack(areas), torch.stack(bells), ticks)
         spread = spread * wider[:, None, None]
     world = R * scales[:, None, :]
     means = moved.means.double() + (world @ mean[:, :, None])[..., 0]
     return means, world @ spread @ world.transpose(1, 2), opacity, kept
 
 
-def _fit_profile(
+def _fit_gaussian_ply_profile(
     screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return (n,) factors on the covariance and (n,) opacities of the bells closest to three screens.
@@ -287,7 +291,9 @@ def _fit_profile(
     return best[1], best[2]
 
 
-def draw_gaussians(gaussians: Gaussians, colours: Harmonics, camera: Camera, background: Tensor) -> Tensor:
+def draw_exported_gaussians(
+    gaussians: Gaussians, colours: ExportHarmonics, camera: Camera, background: Tensor
+) -> Tensor:
     """Draw a (H, W, 3) float32 image as the 3DGS rasteriser does, in float64.
 
     Projection by its local affine approximation (EWA), 0.3 square pixels of blur, alpha = min(0.99, opacity

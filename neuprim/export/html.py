@@ -23,7 +23,7 @@ from neuprim.core.io.files import write_text
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
-from neuprim.export.shared import choose_comparison_views, find_rgb_channels
+from neuprim.export.shared import choose_export_views, find_export_rgb_channels
 from neuprim.webpage.model_page import PageScene, PageView, fullest_conditions
 from neuprim.webpage.scene_page import DrawView, held_out_views, initial_conditions, page_subtitle, scene_page
 
@@ -37,15 +37,15 @@ OPTIONS = {
 _MEASURED_VIEWS = 4
 
 
-def _write_page(job: ExportJob) -> ExportReport:
+def _write_html_export(job: ExportJob) -> ExportReport:
     run = job.run
     if run.channels.own is not None:
         raise ConfigError(
             f"{run.directory}: pictures show {run.channels.display_text}; a page shows red, green and blue"
         )
-    find_rgb_channels(run)
+    find_export_rgb_channels(run)
     level, limit = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
-    views, notes = _load_page_views(job, limit)
+    views, notes = _load_html_export_views(job, limit)
     conditions = initial_conditions(run.task.conditions, views, job.frames()[0] if job.conditions else {})
     data = run.header.get("data")
     scene = PageScene(
@@ -58,10 +58,10 @@ def _write_page(job: ExportJob) -> ExportReport:
     )
     job.progress("packing", 0.4)
     name = run.directory.resolve().name
-    page = scene_page(name, run.model, run.channels, run.settings, _make_draw(run), scene, level)
+    page = scene_page(name, run.model, run.channels, run.settings, _make_html_export_draw(run), scene, level)
     job.progress("measuring", 0.7)
     shown = fullest_conditions(run.model, conditions)
-    errors = {} if level == 0 else {"psnr": _measure_page_psnr(job, page.model, views, shown)}
+    errors = {} if level == 0 else {"psnr": _measure_html_export_psnr(job, page.model, views, shown)}
     write_text(job.out, page.text)
     size, numbers = len(page.text.encode()) / 1e6, page.numbers / 1e6
     notes.append(f"{size:.2f} MB, {numbers:.2f} MB of them the model's numbers before base64")
@@ -71,7 +71,7 @@ def _write_page(job: ExportJob) -> ExportReport:
     return ExportReport((job.out,), False, errors, tuple(notes))
 
 
-def _load_page_views(job: ExportJob, limit: int) -> tuple[list[PageView], list[str]]:
+def _load_html_export_views(job: ExportJob, limit: int) -> tuple[list[PageView], list[str]]:
     """Return held-out views, or the reason why there are none."""
     if limit == 0:
         return [], []
@@ -82,7 +82,7 @@ def _load_page_views(job: ExportJob, limit: int) -> tuple[list[PageView], list[s
         return [], [f"no held-out cameras: {error}"]
 
 
-def _make_draw(run: TrainedModel) -> DrawView:
+def _make_html_export_draw(run: TrainedModel) -> DrawView:
     background, settings = torch.tensor(run.header["background"]), replace(run.settings, samples=1)
 
     @torch.no_grad()
@@ -92,15 +92,15 @@ def _make_draw(run: TrainedModel) -> DrawView:
     return draw
 
 
-def _measure_page_psnr(
+def _measure_html_export_psnr(
     job: ExportJob, stored: Primitives, views: Sequence[PageView], conditions: Mapping[str, Tensor]
 ) -> float:
     """Return the PSNR over some views of the page, or over an orbit if it has none, dB."""
     model = job.run.model
     if not views and not model.active(conditions).geometry.count:
         return math.inf  # both images are the background
-    draw, shown = _make_draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED_VIEWS]]
-    shown = shown or [(view.camera, conditions) for view in choose_comparison_views(job, "orbit", conditions)[0]]
+    draw, shown = _make_html_export_draw(job.run), [(view.camera, view.conditions) for view in views[:_MEASURED_VIEWS]]
+    shown = shown or [(view.camera, conditions) for view in choose_export_views(job, "orbit", conditions)[0]]
     errors = [(draw(model, *view) - draw(stored, *view)).double().square().mean() for view in shown]
     mean = float(torch.stack(errors).mean())
     return -10.0 * math.log10(mean) if mean else math.inf
@@ -110,7 +110,7 @@ EXPORTER = Exporter(
     API_VERSION,
     "html",
     "one web page that draws the model: turn it, play it, move the light; opens from disk",
-    _write_page,
+    _write_html_export,
     options=OPTIONS,
     conditions=True,
     default="model.html",

@@ -38,7 +38,7 @@ _PLY_MARK = "neuprim "
 _NOTE = "holds the text of config.yaml with paths to the run's data; `neuprim import` makes a run directory of it"
 
 
-def _pack_model_header(job: ExportJob) -> str:
+def _pack_export_header(job: ExportJob) -> str:
     """Return one line of JSON: the model's header, its parameters' shapes, and the text of ``config.yaml``."""
     run = job.run
     path = run.directory / "config.yaml"
@@ -51,8 +51,8 @@ def _pack_model_header(job: ExportJob) -> str:
     return json.dumps(record, allow_nan=False)
 
 
-def _unpack_model_header(text: str, path: Path) -> tuple[dict[str, Any], dict[str, tuple[int, ...]], str]:
-    """Read model header, parameter shapes and configuration from an untrusted :func:`_pack_model_header` line."""
+def _unpack_export_header(text: str, path: Path) -> tuple[dict[str, Any], dict[str, tuple[int, ...]], str]:
+    """Read model header, parameter shapes and configuration from an untrusted :func:`_pack_export_header` line."""
     try:
         record = load_json(text)
     except (ValueError, RecursionError) as error:
@@ -73,14 +73,14 @@ def _unpack_model_header(text: str, path: Path) -> tuple[dict[str, Any], dict[st
 # ---------------------------------------------------------------- npz
 
 
-def _write_npz(job: ExportJob) -> ExportReport:
+def _write_npz_export(job: ExportJob) -> ExportReport:
     arrays = {name: value.detach().float().contiguous().numpy() for name, value in job.run.model.params.items()}
     with atomic_path(job.out) as temporary, open(temporary, "wb") as file:
-        np.savez(file, header=np.array(_pack_model_header(job)), **arrays)  # type: ignore[arg-type]
+        np.savez(file, header=np.array(_pack_export_header(job)), **arrays)  # type: ignore[arg-type]
     return ExportReport((job.out,), True, notes=(_NOTE,))
 
 
-def _read_npz(path: Path) -> StoredModel:
+def _read_npz_export(path: Path) -> StoredModel:
     try:
         with zipfile.ZipFile(path) as archive:
             entries = {i.filename: i for i in archive.infolist()}
@@ -88,16 +88,16 @@ def _read_npz(path: Path) -> StoredModel:
                 raise DataError(f"{path}: entries repeat, or more than 1000 of them")
             if "header.npy" not in entries:
                 raise DataError(f"{path}: no array 'header'; expected a file written by `neuprim export --format npz`")
-            text = _read_array(archive, entries["header.npy"], path, _HEADER_BYTES)
+            text = _read_npz_export_array(archive, entries["header.npy"], path, _HEADER_BYTES)
             if text.dtype.kind != "U" or text.shape != ():
                 raise DataError(f"{path}: header is {text.dtype} of shape {text.shape}; expected one text")
-            header, shapes, config = _unpack_model_header(str(text), path)
+            header, shapes, config = _unpack_export_header(str(text), path)
             tensors = {}
             for name, shape in shapes.items():
                 if (entry := entries.get(f"{name}.npy")) is None:
                     raise DataError(f"{path}: no array {name!r}, which the header names")
                 # arrays are stored uncompressed, so none is larger than the file
-                value = _read_array(archive, entry, path, path.stat().st_size)
+                value = _read_npz_export_array(archive, entry, path, path.stat().st_size)
                 if value.dtype != np.float32 or value.ndim != len(shape) + 1 or value.shape[1:] != shape:
                     found = f"{value.dtype} of shape {value.shape}"
                     raise DataError(f"{path}: {name} is {found}; expected float32 of (N, {str(shape)[1:]}")
@@ -109,7 +109,7 @@ def _read_npz(path: Path) -> StoredModel:
     return StoredModel(header, tensors, config)
 
 
-def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, limit: int) -> np.ndarray:
+def _read_npz_export_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, limit: int) -> np.ndarray:
     """Read one array. A size beyond ``limit`` bytes, packed or not, is refused before memory is allocated."""
     if entry.file_size > limit + _ARRAY_HEADER:
         raise DataError(f"{path}: {entry.filename} claims {entry.file_size} bytes; expected at most {limit}")
@@ -127,7 +127,7 @@ def _read_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, li
 # ---------------------------------------------------------------- ply
 
 
-def _write_lossless_ply(job: ExportJob) -> ExportReport:
+def _write_ply_export(job: ExportJob) -> ExportReport:
     model = job.run.model
     centers = job.run.world.world_points(model.params["means"].detach())
     columns = {axis: centers[:, i].numpy() for i, axis in enumerate("xyz")}
@@ -137,18 +137,18 @@ def _write_lossless_ply(job: ExportJob) -> ExportReport:
     rows = np.empty(model.count, [(name, column.dtype) for name, column in columns.items()])
     for name, column in columns.items():
         rows[name] = column
-    write_ply(job.out, rows, [_PLY_MARK + _pack_model_header(job)])
+    write_ply(job.out, rows, [_PLY_MARK + _pack_export_header(job)])
     return ExportReport((job.out,), True, notes=(_NOTE,))
 
 
-def _read_lossless_ply(path: Path) -> StoredModel:
+def _read_ply_export(path: Path) -> StoredModel:
     found = read_ply(path)
     headers = [c.removeprefix(_PLY_MARK) for c in found.comments if c.startswith(_PLY_MARK + "{")]
     if len(headers) != 1:
         hint = "; a PLY of 3D Gaussians or points can start a model: neuprim run ... model.init.points=FILE.ply"
         expected = f"expected one{'' if headers else hint}"
         raise DataError(f"{path}: {len(headers)} comments hold a neuprim header; {expected}")
-    header, shapes, config = _unpack_model_header(headers[0], path)
+    header, shapes, config = _unpack_export_header(headers[0], path)
     tensors = {}
     for name, shape in shapes.items():
         columns = [f"{name}_{i}" for i in range(math.prod(shape))]
@@ -165,8 +165,8 @@ NPZ = Exporter(
     API_VERSION,
     "npz",
     "the whole model as numpy arrays; lossless, `neuprim import` reads it",
-    _write_npz,
-    read=_read_npz,
+    _write_npz_export,
+    read=_read_npz_export,
     default="model.npz",
     suffixes=(".npz",),
 )
@@ -174,8 +174,8 @@ PLY = Exporter(
     API_VERSION,
     "ply",
     "the whole model, one vertex per primitive; lossless, `neuprim import` reads it",
-    _write_lossless_ply,
-    read=_read_lossless_ply,
+    _write_ply_export,
+    read=_read_ply_export,
     default="model.ply",
     suffixes=(".ply",),
 )

@@ -40,7 +40,13 @@ from neuprim.core.render import render
 from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
-from neuprim.export.shared import Harmonics, choose_comparison_views, ellipsoid_box, find_rgb_channels, fit_harmonics
+from neuprim.export.shared import (
+    ExportHarmonics,
+    choose_export_views,
+    find_export_box,
+    find_export_rgb_channels,
+    fit_export_harmonics,
+)
 
 OPTIONS = {
     "grid": (192, "voxels along the longest side, 8 to 1024"),
@@ -68,18 +74,18 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     (conditions,) = job.frames()
     channels = job.run.channels
     hint = f", and task {job.run.task.name!r} has no display that makes these"
-    rgb = None if channels.own is not None else find_rgb_channels(job.run, hint)
-    contour = _load_contouring()
+    rgb = None if channels.own is not None else find_export_rgb_channels(job.run, hint)
+    contour = _load_export_contouring()
     smooth, keep = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0
     up, turn = job.choice("up", "auto", "z", "y"), job.run.world.rotation
     if up == "auto":  # of the world's axes, the one that is the scene's z
         up = "y" if turn is not None and float(turn[2, 1]) > 0.5 else "z"
-    seen = fit_harmonics(job.run, conditions)
+    seen = fit_export_harmonics(job.run, conditions)
     job.progress("sampling the density", 0.0)
-    sigma, scene_from_index = _sample_density(job, conditions, job.count("grid", 8, 1024) or 192)
+    sigma, scene_from_index = _sample_exported_density(job, conditions, job.count("grid", 8, 1024) or 192)
     step = float(scene_from_index[0, 0])
     given = job.number("level", 1e-9, 1e9)
-    level = find_surface_level(sigma, step) if given is None else given
+    level = find_export_surface_level(sigma, step) if given is None else given
     notes = [f"surface at an extinction of {level:.4g} per scene unit" + ", chosen by silhouettes" * (given is None)]
     field = ndimage.gaussian_filter(sigma, smooth) if smooth else sigma
     job.progress("contouring", 0.3)
@@ -95,9 +101,9 @@ def _write_mesh(job: ExportJob) -> ExportReport:
         mesh.invert()
     job.progress("colouring", 0.5)
     vertices, normals = np.array(mesh.vertices), np.array(mesh.vertex_normals)
-    colours = torch.from_numpy(_vertex_colours(job, conditions, seen, vertices, normals)).float()
+    colours = torch.from_numpy(_exported_vertex_colours(job, conditions, seen, vertices, normals)).float()
     colours = channels.display_rows(colours) if rgb is None else colours[:, list(rgb)]
-    iou = _compare_silhouettes(job, conditions, mesh)
+    iou = _compare_exported_silhouettes(job, conditions, mesh)
     _save_mesh(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
     seen_from = "weighted by density, seen along the normal from outside"
@@ -112,7 +118,7 @@ def _write_mesh(job: ExportJob) -> ExportReport:
 # ---------------------------------------------------------------- surface
 
 
-def _load_contouring() -> Any:
+def _load_export_contouring() -> Any:
     """Return a function (values (X, Y, Z), level) -> points (V, 3) in indices, triangles (F, 3)."""
     try:
         import pyvista
@@ -131,9 +137,9 @@ def _load_contouring() -> Any:
     return contour
 
 
-def _sample_density(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
+def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
     """Sample the extinction on a lattice with an empty border; return it and (4, 4) scene_from_index."""
-    low, high = (v.numpy() for v in ellipsoid_box(job, [conditions]))
+    low, high = (v.numpy() for v in find_export_box(job, [conditions]))
     step = float((high - low).max()) / count
     shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
     if math.prod(shape) > _MOST_VOXELS:
@@ -145,7 +151,7 @@ def _sample_density(job: ExportJob, conditions: Conditions, count: int) -> tuple
     return density_grid(job.run.model, conditions, *place, settings.threads, device).numpy(), matrix
 
 
-def find_surface_level(sigma: np.ndarray, step: float) -> float:
+def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
     """Find the level at which most columns agree: their densest voxel passes it if they are more than half opaque.
 
     Columns along all three axes count. If nothing is half opaque, half of the largest optical depth replaces ln 2.
@@ -182,8 +188,8 @@ def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 # ---------------------------------------------------------------- colour
 
 
-def _vertex_colours(
-    job: ExportJob, conditions: Conditions, colours: Harmonics, points: np.ndarray, normals: np.ndarray
+def _exported_vertex_colours(
+    job: ExportJob, conditions: Conditions, colours: ExportHarmonics, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
     """Return (V, C) colours of the primitives around each point, weighted by density, or of the nearest primitive."""
     with torch.no_grad():
@@ -262,9 +268,9 @@ def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
 # ---------------------------------------------------------------- error
 
 
-def _compare_silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
+def _compare_exported_silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
     """Return the intersection over union of the mesh's and the model's silhouettes, pooled over an orbit."""
-    views, _ = choose_comparison_views(job, "orbit", conditions)
+    views, _ = choose_export_views(job, "orbit", conditions)
     both = either = 0
     for i, view in enumerate(views):
         job.progress("comparing silhouettes", i / len(views))

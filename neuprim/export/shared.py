@@ -21,7 +21,7 @@ _DIRECTIONS = 64
 _VIEWS, _SIZE = 8, 160
 
 
-class Harmonics:
+class ExportHarmonics:
     """Colours max(0, SH(direction) + 1/2) of the primitives that are active under some conditions.
 
     Attributes:
@@ -42,22 +42,22 @@ class Harmonics:
         mixed = basis[:, :1] * self.dc[rows] + (basis[:, 1:, None] * self.rest[rows]).sum(1)
         return (mixed + 0.5).clamp_min(0.0)
 
-    def rotate(self, rotation: Tensor | None) -> Harmonics:
+    def rotate(self, rotation: Tensor | None) -> ExportHarmonics:
         """Return the same colours on axes rotated by ``rotation`` (3, 3). This is exact, band by band."""
         if rotation is None:
             return self
         directions = fibonacci_sphere(_DIRECTIONS)
         after, before = (sh.sh_basis(d, _DEGREE)[:, 1:] for d in (directions @ rotation.T, directions))
         rest = torch.einsum("bk,nkc->nbc", torch.linalg.pinv(after) @ before, self.rest)
-        return Harmonics(self.dc, rest, self.residual)
+        return ExportHarmonics(self.dc, rest, self.residual)
 
-    def select_channels(self, channels: tuple[int, ...]) -> Harmonics:
+    def select_channels(self, channels: tuple[int, ...]) -> ExportHarmonics:
         """Return the same with these channels only, in this order."""
         index = list(channels)
-        return Harmonics(self.dc[:, index], self.rest[:, :, index], self.residual)
+        return ExportHarmonics(self.dc[:, index], self.rest[:, :, index], self.residual)
 
 
-def find_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
+def find_export_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
     """Find which of the model's channels are red, green and blue; a grey one is all three.
 
     Raises:
@@ -71,7 +71,7 @@ def find_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]
     return channels.rgb
 
 
-def fit_harmonics(run: TrainedModel, conditions: Conditions) -> Harmonics:
+def fit_export_harmonics(run: TrainedModel, conditions: Conditions) -> ExportHarmonics:
     """Return a model's colours under some conditions as harmonics.
 
     They are exact if the colour field is made of harmonics. Else degree 3 is fitted by least squares to the colours at
@@ -85,16 +85,16 @@ def fit_harmonics(run: TrainedModel, conditions: Conditions) -> Harmonics:
         params = model.active(conditions).params
         exact = model.colour.harmonics({spec.name: params[spec.name] for spec in model.colour.parameters()}, conditions)
         if exact is not None:
-            return Harmonics(exact[0], exact[1], 0.0)
+            return ExportHarmonics(exact[0], exact[1], 0.0)
         directions = fibonacci_sphere(_DIRECTIONS)
-        seen = torch.stack([_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, C)
+        seen = torch.stack([_export_colours_from_afar(run, conditions, d) for d in directions], 1)  # (M, V, C)
         basis = sh.sh_basis(directions, _DEGREE)
         fitted = torch.einsum("bv,nvc->nbc", torch.linalg.pinv(basis), seen - 0.5)
         residual = float((torch.einsum("vb,nbc->nvc", basis, fitted) + 0.5 - seen).square().mean().sqrt())
-        return Harmonics(fitted[:, 0], fitted[:, 1:], residual)
+        return ExportHarmonics(fitted[:, 0], fitted[:, 1:], residual)
 
 
-def _from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
+def _export_colours_from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
     """Return (M, C) float64 colours at the primitives' centres, all seen along one direction."""
     means = run.model.params["means"].double()
     middle = means.mean(0)
@@ -117,7 +117,7 @@ def fibonacci_sphere(count: int) -> Tensor:
     return torch.stack([r * turn.cos(), r * turn.sin(), z], -1)
 
 
-def choose_comparison_views(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[View], str]:
+def choose_export_views(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[View], str]:
     """Choose at most eight views under the given conditions, and say what they are.
 
     Args:
@@ -143,7 +143,7 @@ def choose_comparison_views(job: ExportJob, which: str, conditions: Conditions) 
     return [View(f"orbit_{i}", c, conditions) for i, c in enumerate(cameras)], f"{_VIEWS} orbit views"
 
 
-def ellipsoid_box(job: ExportJob, frames: Sequence[Conditions]) -> tuple[Tensor, Tensor]:
+def find_export_box(job: ExportJob, frames: Sequence[Conditions]) -> tuple[Tensor, Tensor]:
     """Return lower and upper corner (3,) float64 of a box around the ellipsoids of all frames, scene units.
 
     Raises:

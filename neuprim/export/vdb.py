@@ -42,7 +42,7 @@ from neuprim.core.volumes.density_truth import (
     measure_density_errors,
     split_grid_planes,
 )
-from neuprim.export.shared import ellipsoid_box
+from neuprim.export.shared import find_export_box
 
 OPTIONS = {
     "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
@@ -70,8 +70,8 @@ class _GridFrame:
 
 
 def _write_vdb_frames(job: ExportJob) -> ExportReport:
-    source, placement, notes = _find_source(job, job.flag("source"))
-    frames = _list_grid_frames(job, placement)
+    source, placement, notes = _find_export_source(job, job.flag("source"))
+    frames = _list_export_frames(job, placement)
     paths = _name_vdb_files(job, frames)
     units = job.choice("units", "auto", "source", "world", "scene")
     if units == "auto":
@@ -81,14 +81,14 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     scene_from_world = job.run.world.scene_from_world.numpy() if placement is None else placement.scene_from_world
     per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
     factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
-    box = np.stack([v.numpy() for v in ellipsoid_box(job, [f.conditions for f in frames])])
+    box = np.stack([v.numpy() for v in find_export_box(job, [f.conditions for f in frames])])
     threshold = job.number("threshold", 0.0, 1e9)
     threshold = 1e-3 / float((box[1] - box[0]).max()) * factor if threshold is None else threshold
     name = str(job.options["name"])
     own = job.number("grid") is None and job.number("voxel_size") is None and source is not None
     origin = np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
-    fallback = _voxel_transform(job, box, scene_from_world, origin)
-    sampler = _DensitySampler(job, _component(job, placement), scene_from_world, name, factor, threshold)
+    fallback = _export_voxel_transform(job, box, scene_from_world, origin)
+    sampler = _VdbExportSampler(job, _exported_component(job, placement), scene_from_world, name, factor, threshold)
     cut = _CutVoxels(0, 0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
@@ -102,14 +102,14 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         if placement is not None and placement.extents:
             extents = placement.extents  # of a time between frames: around all
             extent = GridExtent.around(extents) if frame.source is None else extents[frame.source]
-            grid, more_cut = _clamp_to_extent(grid, extent, placement.sigma_per_unit * factor)
+            grid, more_cut = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
             cut = _CutVoxels(*(a + b for a, b in zip(cut, more_cut, strict=True)))
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
         if source is not None and frame.source is not None:
             errors |= _measure_vdb_errors(job, source, frame, path, scene_from_world, factor)
-    notes += _describe_grid(placement, units, factor, name)
+    notes += _describe_exported_grid(placement, units, factor, name)
     if any(cut):
         above = f"{cut.above} voxels were above the source's largest value and are set to it"
         notes.append(f"{above}; {cut.outside} outside its bounds are left out")
@@ -125,7 +125,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     return ExportReport(tuple(paths), False, errors, tuple(notes))
 
 
-def _describe_grid(placement: Placement | None, units: str, factor: float, name: str) -> list[str]:
+def _describe_exported_grid(placement: Placement | None, units: str, factor: float, name: str) -> list[str]:
     """Say what the values of the written grid mean."""
     unit = f"extinction per {units} unit"
     if units == "source" and placement is not None:
@@ -144,7 +144,7 @@ class _CutVoxels(NamedTuple):
     outside: int
 
 
-def _component(job: ExportJob, placement: Placement | None) -> Primitives:
+def _exported_component(job: ExportJob, placement: Placement | None) -> Primitives:
     """Return the model, or its part that comes from the source's grid if other grids absorb, too.
 
     Raises:
@@ -162,7 +162,7 @@ def _component(job: ExportJob, placement: Placement | None) -> Primitives:
     return model.component(placement.component)
 
 
-def _clamp_to_extent(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[Grid, _CutVoxels]:
+def _clamp_exported_grid(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[Grid, _CutVoxels]:
     """Clamp a grid to an extent: no value above its largest, none outside its box; and count what that changed.
 
     Args:
@@ -186,7 +186,7 @@ def _clamp_to_extent(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[G
 # ---------------------------------------------------------------- which frames, and where
 
 
-def _find_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
+def _find_export_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
     """Find the scene's files, how the model lies in their world, and notes about it."""
     notes: list[str] = []
     source = None
@@ -206,24 +206,24 @@ def _find_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Pla
     return source, kept if source is None else source.placement, notes
 
 
-def _list_grid_frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
+def _list_export_frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
     """List the frames that the user names, else those of the run; a model without conditions has one."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
         frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
-        return [_GridFrame(f.number, f.conditions, _source_frame(f.conditions, placement)) for f in frames]
-    return [_GridFrame(n, _frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
+        return [_GridFrame(f.number, f.conditions, _export_source_frame(f.conditions, placement)) for f in frames]
+    return [_GridFrame(n, _export_frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
 
 
-def _frame_conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
+def _export_frame_conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
     return {name: torch.tensor(values[frame]) for name, values in placement.times.items()}
 
 
-def _source_frame(conditions: Conditions, placement: Placement | None) -> int | None:
+def _export_source_frame(conditions: Conditions, placement: Placement | None) -> int | None:
     """Find the frame of the source with these conditions."""
     for i in range(0 if placement is None else len(placement.numbers)):
-        known = _frame_conditions(placement, i)
+        known = _export_frame_conditions(placement, i)
         same = (torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items())
         if known.keys() == conditions.keys() and all(same):
             return i
@@ -245,7 +245,9 @@ def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     return [job.out / f"density_{f.number:0{width}d}.vdb" for f in frames]
 
 
-def _voxel_transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray) -> np.ndarray:
+def _export_voxel_transform(
+    job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray
+) -> np.ndarray:
     """Return the (4, 4) matrix from index to world of the user's voxels, with the index origin at ``origin`` (3,)."""
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
@@ -257,7 +259,7 @@ def _voxel_transform(job: ExportJob, box: np.ndarray, scene_from_world: np.ndarr
 # ---------------------------------------------------------------- sampling
 
 
-class _DensitySampler(NamedTuple):
+class _VdbExportSampler(NamedTuple):
     """Samples a model's extinction x ``factor`` on voxels; values below ``threshold`` are background."""
 
     job: ExportJob
@@ -278,7 +280,7 @@ class _DensitySampler(NamedTuple):
         """
         scene_from_index = self.scene_from_world @ transform
         try:
-            low, high = (v.numpy() for v in ellipsoid_box(self.job, [conditions]))
+            low, high = (v.numpy() for v in find_export_box(self.job, [conditions]))
         except ConfigError:  # no primitive is active in this frame: an empty grid is a frame too
             low = high = scene_from_index[:3, 3]
         corners = np.stack(np.meshgrid(*np.stack([low, high], -1), indexing="ij"), -1).reshape(-1, 3)

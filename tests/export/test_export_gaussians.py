@@ -22,8 +22,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.initial_model import initial_model
 from neuprim.core.train.settings import ModelSettings
 from neuprim.export import shared
-from neuprim.export.gaussian_ply import LAYOUT, SIZES, Gaussians, draw_gaussians, fit_gaussians
-from neuprim.export.shared import Harmonics, fit_harmonics
+from neuprim.export.gaussian_ply import LAYOUT, SIZES, Gaussians, draw_exported_gaussians, fit_gaussians
+from neuprim.export.shared import ExportHarmonics, fit_export_harmonics
 from neuprim.plugins.registry import load_task
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
@@ -169,15 +169,15 @@ def test_the_renderer_draws_one_gaussian_as_the_formula_says() -> None:
     camera = Camera(view, 50.0, 50.0, 16.0, 16.0, 32, 32)
     covariance = torch.diag(torch.tensor([0.09, 0.01, 0.04], dtype=torch.float64))[None]
     g = Gaussians(torch.zeros(1, 3).double(), covariance, torch.tensor([0.6]).double(), torch.tensor([0]))
-    colour = Harmonics((torch.tensor([[1.0, 0.2, 0.0]]) - 0.5) / sh.C0, None, 0.0)
-    image = draw_gaussians(g, colour, camera, torch.zeros(3)).double()
+    colour = ExportHarmonics((torch.tensor([[1.0, 0.2, 0.0]]) - 0.5) / sh.C0, None, 0.0)
+    image = draw_exported_gaussians(g, colour, camera, torch.zeros(3)).double()
     y, x = np.mgrid[:32, :32] + 0.5 - 16
     bell = 0.6 * np.exp(-0.5 * (x**2 / (0.09 * 12.5**2 + 0.3) + y**2 / (0.04 * 12.5**2 + 0.3)))
     bell[bell < 1 / 255] = 0
     assert np.allclose(image[..., 0].numpy(), bell, atol=1e-6) and np.allclose(
         image[..., 1].numpy(), 0.2 * bell, atol=1e-6
     )
-    white = draw_gaussians(g, colour, camera, torch.ones(3)).double()
+    white = draw_exported_gaussians(g, colour, camera, torch.ones(3)).double()
     assert np.allclose(white[..., 2].numpy(), 1 - bell, atol=1e-6)
 
 
@@ -186,8 +186,8 @@ def test_nearer_gaussians_hide_farther_ones() -> None:
     camera = Camera(view, 50.0, 50.0, 8.5, 8.5, 17, 17)
     means = torch.tensor([[0.0, 1.0, 0.0], [0.0, -1.0, 0.0], [0.0, -5.0, 0.0]]).double()
     g = Gaussians(means, 0.01 * torch.eye(3).double().expand(3, 3, 3), torch.full((3,), 0.8).double(), torch.arange(3))
-    colour = Harmonics((torch.eye(3) - 0.5) / sh.C0, None, 0.0)
-    middle = draw_gaussians(g, colour, camera, torch.zeros(3))[8, 8]
+    colour = ExportHarmonics((torch.eye(3) - 0.5) / sh.C0, None, 0.0)
+    middle = draw_exported_gaussians(g, colour, camera, torch.zeros(3))[8, 8]
     assert torch.allclose(middle, torch.tensor([0.8 * 0.2, 0.8, 0.0]), atol=1e-4)  # the third is behind the camera
 
 
@@ -226,7 +226,7 @@ def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> Non
     report = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["light=1,2,3", "light_intensity=1,1,1"])
     assert any("no harmonics" in note for note in report.notes) and report.errors["psnr"] > 20
     light = {"light": torch.tensor([1.0, 2.0, 3.0]), "light_intensity": torch.ones(3)}
-    fitted = fit_harmonics(open_run(run), light)
+    fitted = fit_export_harmonics(open_run(run), light)
     assert 0 < fitted.residual < 0.05
     eye = torch.tensor([0.0, 0.0, 500.0])
     camera = Camera(look_at(eye, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0])), 50.0, 50.0, 8, 8, 16, 16)

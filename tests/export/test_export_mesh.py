@@ -13,7 +13,7 @@ import torch
 from neuprim.core.compute import device
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.export import mesh, shared
-from neuprim.export.mesh import find_surface_level
+from neuprim.export.mesh import find_export_surface_level
 from neuprim.runs.export import export_run
 from tests.plugins import marked
 
@@ -86,12 +86,12 @@ def test_the_best_level_tells_opaque_columns_from_faint_ones() -> None:
     sigma = np.zeros((24, 24, 24), np.float32)
     sigma[4:20, 4:20, 4:20] = 0.5  # 16 voxels of 0.05: a depth of 0.4
     sigma[8:16, 8:16, 8:16] = 30.0
-    assert 0.5 < find_surface_level(sigma, 0.05) < 30
+    assert 0.5 < find_export_surface_level(sigma, 0.05) < 30
     assert (
-        0.5 < find_surface_level(np.minimum(sigma, 0.6), 0.05) < 0.6
-        or find_surface_level(np.minimum(sigma, 0.6), 0.05) < 0.5
+        0.5 < find_export_surface_level(np.minimum(sigma, 0.6), 0.05) < 0.6
+        or find_export_surface_level(np.minimum(sigma, 0.6), 0.05) < 0.5
     )  # all faint
-    assert find_surface_level(np.zeros((4, 4, 4), np.float32), 1.0) > 0
+    assert find_export_surface_level(np.zeros((4, 4, 4), np.float32), 1.0) > 0
 
 
 def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:

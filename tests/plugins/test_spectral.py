@@ -194,7 +194,7 @@ def test_whole_models_keep_every_channel(trained: Path, tmp_path: Path) -> None:
 def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
     trained: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("neuprim.export.gaussian_ply.fit_harmonics", lambda *a: pytest.fail("too late"))
+    monkeypatch.setattr("neuprim.export.gaussian_ply.fit_export_harmonics", lambda *a: pytest.fail("too late"))
     with pytest.raises(
         ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"
     ):

@@ -21,7 +21,7 @@ from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.io.ply import read_ply
 from neuprim.core.io.vdb import read_grid
-from neuprim.export.shared import Harmonics, fibonacci_sphere
+from neuprim.export.shared import ExportHarmonics, fibonacci_sphere
 from neuprim.runs.export import export_run, import_run_directory
 from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import open_run, read_metrics
@@ -179,7 +179,7 @@ def test_a_page_and_a_compressed_model_say_where_they_are(tmp_path: Path) -> Non
 
 def test_colours_turn_with_the_axes() -> None:
     generator = torch.Generator().manual_seed(3)
-    colours = Harmonics(torch.randn(2, 3, generator=generator), torch.randn(2, 15, 3, generator=generator), 0.0)
+    colours = ExportHarmonics(torch.randn(2, 3, generator=generator), torch.randn(2, 15, 3, generator=generator), 0.0)
     turn, directions, rows = MESH.rotation, fibonacci_sphere(20), torch.zeros(20, dtype=torch.int64)
     assert turn is not None
     assert torch.allclose(

@@ -45,8 +45,8 @@ from neuprim.core.render import render
 from neuprim.runs.export import export_run
 from neuprim.runs.fit import prepare_training
 from neuprim.runs.open import open_run
-from neuprim.webpage import Condition, PageScene, web_page
-from neuprim.webpage.model_page import camera_numbers
+from neuprim.webpage import Condition, PageScene, make_model_webpage
+from neuprim.webpage.model_page import webpage_camera_numbers
 
 sys.path.insert(0, str(ROOT))
 
@@ -109,7 +109,7 @@ def count_chords(tab: Tab, run: TrainedModel) -> int:
     scale = HIGH / view.camera.height
     fx, fy = scale * view.camera.fx, scale * view.camera.fy
     camera = replace(view.camera, fx=fx, fy=fy, cx=WIDE / 2, cy=HIGH / 2, width=WIDE, height=HIGH)
-    halves = tab.page.evaluate(_HALVES, [camera_numbers(camera), as_lists(view.conditions)])
+    halves = tab.page.evaluate(_HALVES, [webpage_camera_numbers(camera), as_lists(view.conditions)])
     return round(sum(min(math.pi * hx * hy, WIDE * HIGH) if hx >= 0 else WIDE * HIGH for hx, hy in halves))
 
 
@@ -138,7 +138,7 @@ def measure_preparation(chromium: Any, scene: str, count: int, folder: Path) -> 
     model, view, specs = fitted.model, fitted.dataset.test.view(0), fitted.task.conditions
     conditions = [Condition(spec, view.conditions[spec.name]) for spec in specs]
     path = folder / f"{scene}_{count}.html"
-    page = web_page(scene, model, (0, 1, 2), fitted.config.renderer, PageScene(conditions=conditions))
+    page = make_model_webpage(scene, model, (0, 1, 2), fitted.config.renderer, PageScene(conditions=conditions))
     path.write_text(page.text, encoding="utf-8")
     middle = model.params["means"].detach().mean(0)
     away = float((view.camera.position - middle).norm())
@@ -157,7 +157,9 @@ def measure_preparation(chromium: Any, scene: str, count: int, folder: Path) -> 
 
 def time_frames(tab: Tab, cameras: Sequence[Camera], conditions: Sequence[Mapping[str, Tensor]]) -> dict[str, float]:
     """Median and fastest frame, and how many primitives a frame has; frames before are for the browser's compiler."""
-    frames = [[camera_numbers(camera), as_lists(values)] for camera, values in zip(cameras, conditions, strict=True)]
+    frames = [
+        [webpage_camera_numbers(camera), as_lists(values)] for camera, values in zip(cameras, conditions, strict=True)
+    ]
     rounds = [tab.page.evaluate(_TIMES, frames) for _ in range(2)]
     times = [one["milliseconds"] for one in rounds[-1]]
     return {

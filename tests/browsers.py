@@ -18,7 +18,7 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.webpage.model_page import camera_numbers
+from neuprim.webpage.model_page import webpage_camera_numbers
 
 __all__ = ["Tab", "browser", "executable", "open_tab"]
 
@@ -81,7 +81,7 @@ class Tab:
         """(H, W, 4) float64: colour before the background (of DEPTH, sum of w z), and transmittance."""
         values = {name: value.double().tolist() for name, value in (conditions or {}).items()}
         found = self.page.evaluate(
-            "([c, v, m, p]) => probe.numbers(c, v, m, p)", [camera_numbers(camera), values, mode, plane]
+            "([c, v, m, p]) => probe.numbers(c, v, m, p)", [webpage_camera_numbers(camera), values, mode, plane]
         )
         assert found["exact"], "this browser blends 16-bit floats only"
         pixels = np.frombuffer(base64.b64decode(found["pixels"]), np.float32)
@@ -90,7 +90,7 @@ class Tab:
     def shown(self, camera: Camera, conditions: Mapping[str, Tensor] | None = None) -> np.ndarray:
         """(H, W, 3) uint8 of the canvas."""
         values = {name: value.double().tolist() for name, value in (conditions or {}).items()}
-        found = self.page.evaluate("([c, v]) => probe.shown(c, v)", [camera_numbers(camera), values])
+        found = self.page.evaluate("([c, v]) => probe.shown(c, v)", [webpage_camera_numbers(camera), values])
         return np.frombuffer(base64.b64decode(found), np.uint8).reshape(camera.height, camera.width, 4)[::-1, :, :3]
 
     def canvas(self) -> np.ndarray:

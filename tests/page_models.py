@@ -17,7 +17,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
-from neuprim.webpage import Condition, PageScene, PageView, WebPage, web_page
+from neuprim.webpage import Condition, PageScene, PageView, WebPage, make_model_webpage
 
 __all__ = ["LIGHT", "SETTINGS", "camera_at", "page_of", "random_model"]
 
@@ -69,6 +69,6 @@ def page_of(
     given = [Condition(_SPECS[name], value) for name, value in (conditions or {}).items()]
     views = more.pop("views", [PageView("first", camera_at((0.3, -3.0, 1.0)), conditions or {})])
     name, level = more.pop("name", "model"), more.pop("level", 0)
-    page = web_page(name, model, (0, 1, 2), settings, PageScene(conditions=given, views=views, **more), level)
+    page = make_model_webpage(name, model, (0, 1, 2), settings, PageScene(conditions=given, views=views, **more), level)
     path.write_text(page.text, encoding="utf-8")
     return page

@@ -24,8 +24,14 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.export.shared import choose_export_views, find_export_rgb_channels
-from neuprim.webpage.model_page import PageScene, PageView, fullest_conditions
-from neuprim.webpage.scene_page import DrawView, held_out_views, initial_conditions, page_subtitle, scene_page
+from neuprim.webpage.model_page import PageScene, PageView, fullest_webpage_conditions
+from neuprim.webpage.scene_page import (
+    DrawView,
+    held_out_webpage_views,
+    initial_webpage_conditions,
+    scene_page,
+    webpage_subtitle,
+)
 
 OPTIONS = {
     "level": (
@@ -46,10 +52,10 @@ def _write_html_export(job: ExportJob) -> ExportReport:
     find_export_rgb_channels(run)
     level, limit = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
     views, notes = _load_html_export_views(job, limit)
-    conditions = initial_conditions(run.task.conditions, views, job.frames()[0] if job.conditions else {})
+    conditions = initial_webpage_conditions(run.task.conditions, views, job.frames()[0] if job.conditions else {})
     data = run.header.get("data")
     scene = PageScene(
-        page_subtitle(run.task.name, str(run.header.get("data_source", "real"))),
+        webpage_subtitle(run.task.name, str(run.header.get("data_source", "real"))),
         run.header["background"],
         up=data.get("up", ()) if isinstance(data, Mapping) else (),
         conditions=conditions,
@@ -60,7 +66,7 @@ def _write_html_export(job: ExportJob) -> ExportReport:
     name = run.directory.resolve().name
     page = scene_page(name, run.model, run.channels, run.settings, _make_html_export_draw(run), scene, level)
     job.progress("measuring", 0.7)
-    shown = fullest_conditions(run.model, conditions)
+    shown = fullest_webpage_conditions(run.model, conditions)
     errors = {} if level == 0 else {"psnr": _measure_html_export_psnr(job, page.model, views, shown)}
     write_text(job.out, page.text)
     size, numbers = len(page.text.encode()) / 1e6, page.numbers / 1e6
@@ -77,7 +83,7 @@ def _load_html_export_views(job: ExportJob, limit: int) -> tuple[list[PageView],
         return [], []
     job.progress("reading the scene", 0.0)
     try:
-        return held_out_views(job.run.dataset(), job.run.channels, limit), []
+        return held_out_webpage_views(job.run.dataset(), job.run.channels, limit), []
     except NeuprimError as error:
         return [], [f"no held-out cameras: {error}"]
 

@@ -22,7 +22,7 @@ from neuprim.report.regions import WorstRegions
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.webpage import PageScene
-from neuprim.webpage.scene_page import held_out_views, initial_conditions, page_subtitle, scene_page
+from neuprim.webpage.scene_page import held_out_webpage_views, initial_webpage_conditions, scene_page, webpage_subtitle
 
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36
@@ -88,12 +88,12 @@ def _make_run_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
     def render_frame(model: Primitives, camera: Camera, conditions: Conditions) -> Tensor:
         return render_image(model, View("", camera, conditions), settings, dataset.background)
 
-    views = held_out_views(dataset, channels, _SHOWN_VIEWS)
+    views = held_out_webpage_views(dataset, channels, _SHOWN_VIEWS)
     scene = PageScene(
-        page_subtitle(task.name, dataset.data_source),
+        webpage_subtitle(task.name, dataset.data_source),
         dataset.background.tolist(),
         up=dataset.up.tolist(),
-        conditions=initial_conditions(task.conditions, views, {}),
+        conditions=initial_webpage_conditions(task.conditions, views, {}),
         views=views,
     )
     try:

@@ -27,7 +27,7 @@ from neuprim.runs.open import move_to_render_device
 from neuprim.runs.render_config import RunRendering
 from neuprim.viewer.quality import Front
 from neuprim.webpage import PageView
-from neuprim.webpage.scene_page import held_out_views, initial_conditions
+from neuprim.webpage.scene_page import held_out_webpage_views, initial_webpage_conditions
 
 COLOUR, ALPHA, DEPTH = "colour", "alpha", "depth"
 
@@ -196,7 +196,7 @@ class ViewerScene:
     def start_view(self) -> View:
         """Return the first view: the held-out view with most contrast, else the whole model from the side."""
         if self.dataset is not None:
-            views = held_out_views(self.dataset, self.channels, _START_CANDIDATES)
+            views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES)
             if views:
                 return View(views[0].name, views[0].camera, self._initial_conditions(views))
         conditions = self._initial_conditions([])
@@ -210,4 +210,4 @@ class ViewerScene:
         return View("", camera, conditions)
 
     def _initial_conditions(self, views: Sequence[PageView]) -> dict[str, Tensor]:
-        return {c.spec.name: c.value.float() for c in initial_conditions(self.task.conditions, views, {})}
+        return {c.spec.name: c.value.float() for c in initial_webpage_conditions(self.task.conditions, views, {})}

@@ -4,6 +4,6 @@ What runs in the browser lies in ``assets`` and in the scripts of the fields, wh
 closed forms (:meth:`~neuprim.core.model.fields.Field.script`).
 """
 
-from neuprim.webpage.model_page import Condition, PageScene, PageView, WebPage, web_page
+from neuprim.webpage.model_page import Condition, PageScene, PageView, WebPage, make_model_webpage
 
-__all__ = ["Condition", "PageScene", "PageView", "WebPage", "web_page"]
+__all__ = ["Condition", "PageScene", "PageView", "WebPage", "make_model_webpage"]

@@ -99,7 +99,7 @@ class WebPage:
     nonce: str
 
 
-def web_page(
+def make_model_webpage(
     name: str,
     model: Primitives,
     rgb: tuple[int, int, int],
@@ -112,16 +112,18 @@ def web_page(
     Args:
         rgb: which of the model's channels are red, green and blue.
         settings: of these, only the cuts and the near plane are used.
-        level: see :func:`pack_model`.
+        level: see :func:`pack_webpage_model`.
 
     Raises:
         ConfigError: a field without a script for browsers, or no such level.
         CheckpointError: numbers that cannot be stored.
     """
     scripts = {"density": _field_script("density", model.density), "colour": _field_script("colour", model.colour)}
-    packed = pack_model(model, level)
-    middle, radius, top = _measure_extent(packed.model, fullest_conditions(packed.model, scene.conditions))
-    home = scene.views[0].camera if scene.views else _make_home_camera(middle, radius, scene.up)
+    packed = pack_webpage_model(model, level)
+    middle, radius, top = _measure_webpage_extent(
+        packed.model, fullest_webpage_conditions(packed.model, scene.conditions)
+    )
+    home = scene.views[0].camera if scene.views else _make_webpage_camera(middle, radius, scene.up)
     header = {
         "name": name,
         "count": model.count,
@@ -141,7 +143,7 @@ def web_page(
         "views": [_view_json(view) for view in scene.views],
         "still": bool(scene.still),
         **({} if scene.world is None or scene.world.identity else {"world": scene.world.to_json()}),
-        "home": camera_numbers(home),
+        "home": webpage_camera_numbers(home),
     }
     assets = resources.files(__package__).joinpath("assets")
     names = ("page.html", "page.css", *_SHARED_SCRIPTS, *_MAIN_SCRIPTS, *_SHADERS)
@@ -177,7 +179,7 @@ def _field_script(kind: str, field: Field) -> str:
 # ---------------------------------------------------------------- scene
 
 
-def fullest_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
+def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
     """Return the initial conditions; if no primitive is active there, those along one range where most are."""
     start = {condition.spec.name: condition.value for condition in conditions}
     if model.active(start).geometry.count:
@@ -192,7 +194,7 @@ def fullest_conditions(model: Primitives, conditions: Sequence[Condition]) -> di
 
 
 @torch.no_grad()
-def _measure_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
+def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
     """Return middle and radius of what is drawn, and the 95 % quantile of the extinction at the centres."""
     active = model.active(conditions)
     if not active.geometry.count:
@@ -205,13 +207,13 @@ def _measure_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tupl
     return middle.tolist(), radius or 1.0, float(torch.quantile(sigma[:_QUANTILE_ROWS], 0.95)) or 1.0
 
 
-def _make_home_camera(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera:
+def _make_webpage_camera(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera:
     """Make a camera that sees all of a scene, from the side and a little above."""
     template = Camera(torch.eye(4, dtype=torch.float64), 717.0, 717.0, 256, 256, 512, 512)
     return orbit(template, torch.tensor(middle), torch.tensor(up), 3.2 * radius, 0.4, 1)[0]
 
 
-def camera_numbers(camera: Camera) -> dict[str, Any]:
+def webpage_camera_numbers(camera: Camera) -> dict[str, Any]:
     """Return a camera as the scripts take it: world-to-camera R (row by row) and t, OpenCV axes; intrinsics, pixels."""
     view = camera.viewmat.detach().double().cpu()
     names = [key.name for key in dataclasses.fields(camera) if key.name != "viewmat"]
@@ -221,7 +223,12 @@ def camera_numbers(camera: Camera) -> dict[str, Any]:
 
 def _view_json(view: PageView) -> dict[str, Any]:
     conditions = {name: value.double().tolist() for name, value in view.conditions.items()}
-    return {"name": view.name, "camera": camera_numbers(view.camera), "conditions": conditions, "truth": view.truth}
+    return {
+        "name": view.name,
+        "camera": webpage_camera_numbers(view.camera),
+        "conditions": conditions,
+        "truth": view.truth,
+    }
 
 
 def _condition_json(condition: Condition, views: Sequence[PageView]) -> dict[str, Any]:
@@ -253,15 +260,15 @@ def shader_constants(edge: int) -> dict[str, list[float]]:
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     turn = 2 * math.pi
     return {
-        "cos": _fit_polynomial(lambda v: np.cos(turn * v)),
-        "sinc": _fit_polynomial(lambda v: np.sinc(2 * v)),
-        "edge": _fit_polynomial(lambda v: edge_profile(torch.from_numpy(turn * v), edge).numpy()),
+        "cos": _fit_webpage_polynomial(lambda v: np.cos(turn * v)),
+        "sinc": _fit_webpage_polynomial(lambda v: np.sinc(2 * v)),
+        "edge": _fit_webpage_polynomial(lambda v: edge_profile(torch.from_numpy(turn * v), edge).numpy()),
         "nodes": nodes[_QUADRATURE_POINTS // 2 :].tolist(),
         "weights": weights[_QUADRATURE_POINTS // 2 :].tolist(),
     }
 
 
-def _fit_polynomial(function: Callable[[np.ndarray], np.ndarray]) -> list[float]:
+def _fit_webpage_polynomial(function: Callable[[np.ndarray], np.ndarray]) -> list[float]:
     """Fit a polynomial at the Chebyshev points of z in [0, 1/4]."""
     z = 0.125 * (1 + np.cos(np.pi * (np.arange(_FIT_SAMPLES) + 0.5) / _FIT_SAMPLES))
     fit = np.polynomial.chebyshev.Chebyshev.fit(z, function(np.sqrt(z)), _DEGREE, domain=[0, 0.25])
@@ -285,14 +292,14 @@ class PackedModel(NamedTuple):
     model: Primitives
 
 
-def pack_model(model: Primitives, level: int) -> PackedModel:
+def pack_webpage_model(model: Primitives, level: int) -> PackedModel:
     """Pack all parameters: every bit at level 0, else quantised as ``neuprim compress --level`` 1 to 5 does.
 
     Raises:
         ConfigError: no such level.
         CheckpointError: numbers that cannot be stored.
     """
-    packed = _pack_exact(model) if level == 0 else _pack_quantized(model, level)
+    packed = _pack_exact_for_webpage(model) if level == 0 else _pack_quantized_for_webpage(model, level)
     data = gzip.compress(b"".join(planes for _, planes, _ in packed), 9, mtime=0)
     decoded = Primitives(model.density, model.colour, {part["name"]: values for part, _, values in packed})
     return PackedModel(tuple(part for part, _, _ in packed), data, decoded)
@@ -301,7 +308,7 @@ def pack_model(model: Primitives, level: int) -> PackedModel:
 _PackedParameters = list[tuple[dict[str, Any], bytes, Tensor]]
 
 
-def _pack_exact(model: Primitives) -> _PackedParameters:
+def _pack_exact_for_webpage(model: Primitives) -> _PackedParameters:
     packed: _PackedParameters = []
     for spec in model.specs:
         x = model.params[spec.name].detach().cpu().float().contiguous()
@@ -311,7 +318,7 @@ def _pack_exact(model: Primitives) -> _PackedParameters:
     return packed
 
 
-def _pack_quantized(model: Primitives, level: int) -> _PackedParameters:
+def _pack_quantized_for_webpage(model: Primitives, level: int) -> _PackedParameters:
     model = canonical_model(model)
     quantizers = fit_quantizers(model, bit_table(level, (), model.specs))
     order = storage_order(model, quantizers)

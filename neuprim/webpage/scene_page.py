@@ -17,7 +17,7 @@ from neuprim.core.io.images import webp_data_uri
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
-from neuprim.webpage.model_page import Condition, PageScene, PageView, WebPage, web_page
+from neuprim.webpage.model_page import Condition, PageScene, PageView, WebPage, make_model_webpage
 
 DrawView = Callable[[Primitives, Camera, Mapping[str, Tensor]], Tensor]
 """(model, camera, conditions) -> (H, W, C), over the scene's background."""
@@ -25,7 +25,7 @@ DrawView = Callable[[Primitives, Camera, Mapping[str, Tensor]], Tensor]
 _TRUTH_PIXELS, _STILL_PIXELS = 320, 640
 
 
-def held_out_views(dataset: Dataset, channels: Channels, limit: int) -> list[PageView]:
+def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int) -> list[PageView]:
     """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; first the one with most contrast."""
     count = min(limit, len(dataset.test))
     views, contrasts = [], []
@@ -41,7 +41,7 @@ def held_out_views(dataset: Dataset, channels: Channels, limit: int) -> list[Pag
     return views
 
 
-def initial_conditions(
+def initial_webpage_conditions(
     specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
 ) -> list[Condition]:
     """Return float64 conditions: those given, else of the first view, else the middle of a bounded range, else 1."""
@@ -54,7 +54,7 @@ def initial_conditions(
     return found
 
 
-def page_subtitle(task: str, data_source: str) -> str:
+def webpage_subtitle(task: str, data_source: str) -> str:
     """Name the task, and the kind of data unless they are real."""
     return task if data_source == "real" else f"{task}, {data_source} data"
 
@@ -83,11 +83,11 @@ def scene_page(
         start = {condition.spec.name: condition.value for condition in scene.conditions}
         image = draw(model, scene.views[0].camera, scene.views[0].conditions or start)
         still = webp_data_uri(channels.display(image).clamp(0.0, 1.0), _STILL_PIXELS)
-    scene = replace(scene, still=still, linear=channels.color_space == "linear", up=_read_axis(scene.up))
-    return web_page(name, model, channels.rgb, settings, scene, level)
+    scene = replace(scene, still=still, linear=channels.color_space == "linear", up=_read_webpage_axis(scene.up))
+    return make_model_webpage(name, model, channels.rgb, settings, scene, level)
 
 
-def _read_axis(up: Sequence[float]) -> tuple[float, ...]:
+def _read_webpage_axis(up: Sequence[float]) -> tuple[float, ...]:
     """Return +z for anything but three finite numbers that are not all 0; a damaged header may hold something else."""
     try:
         found = tuple(float(x) for x in up)

@@ -19,7 +19,7 @@ from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.webpage.scene_page import held_out_views
+from neuprim.webpage.scene_page import held_out_webpage_views
 from tests.core import tiny
 from tests.page_models import random_model
 from tests.plugins import marked
@@ -59,7 +59,7 @@ def test_a_page_begins_where_something_is_to_be_seen(tmp_path: Path) -> None:
     """The first frame of a sequence may be empty."""
     run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "vdb"))
     dataset = open_run(run).dataset()
-    views = held_out_views(dataset, open_run(run).channels, 4)
+    views = held_out_webpage_views(dataset, open_run(run).channels, 4)
     picked = {
         view.name: float(dataset.test.pixels(i).over(dataset.background).std())
         for i, view in enumerate(map(dataset.test.view, range(len(dataset.test))))

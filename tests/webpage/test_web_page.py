@@ -19,7 +19,7 @@ from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
-from neuprim.webpage.model_page import pack_model, shader_constants
+from neuprim.webpage.model_page import pack_webpage_model, shader_constants
 from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
 
 
@@ -35,14 +35,14 @@ def test_what_a_level_keeps(tmp_path: Path) -> None:
     model = random_model(CosineDensity(4, edge=2, gain=True), SphericalHarmonics(3), count=400)
     sizes, errors = [], []
     for level in range(6):
-        packed = pack_model(model, level)
+        packed = pack_webpage_model(model, level)
         sizes.append(len(packed.data))
         order = torch.cdist(packed.model.params["means"], model.params["means"]).argmin(1)  # the file's own order
         errors.append(float((packed.model.params["sh_rest"] - model.params["sh_rest"][order]).abs().max()))
     assert sizes == sorted(sizes, reverse=True) and sizes[0] > 1.5 * sizes[1]
     assert errors == sorted(errors) and errors[0] == 0.0 < errors[1] < 0.01
     with pytest.raises(ConfigError, match="--level 6: expected one of 1, 2, 3, 4, 5"):
-        pack_model(model, 6)
+        pack_webpage_model(model, 6)
 
 
 @pytest.mark.parametrize("edge", [0, 1, 2])

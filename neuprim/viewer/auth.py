@@ -5,7 +5,7 @@ WebSockets to this machine. The printed address holds the token; the page receiv
 pages cannot send.
 
 viser does not check messages either. A message passes only if the page's own code sends such messages, and a control's
-value only if the control, as it was created, can take it. Every message goes through :class:`CheckedConnection`.
+value only if the control, as it was created, can take it. Every message goes through :class:`ViewerConnection`.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class TokenAuth:
     def __init__(self, host: str = "localhost") -> None:
         self.token = secrets.token_urlsafe(32)
         self.installed = False
-        own = [socket.gethostname(), socket.getfqdn()] if _is_unspecified(host) else []
+        own = [socket.gethostname(), socket.getfqdn()] if _is_unspecified_viewer_host(host) else []
         listens = f"[{host}]" if ":" in host else host
         self._hosts = tuple(dict.fromkeys(x.lower() for x in ("localhost", "127.0.0.1", "[::1]", *own, listens)))
 
@@ -68,12 +68,12 @@ class TokenAuth:
 
         viser passes its own request hook to ``websockets.asyncio.server.serve`` and offers no way to add one. So
         ``serve`` is replaced while viser starts. A proxy in front would leave viser's own port open to every page.
-        The arguments are those of :class:`CheckedConnection`.
+        The arguments are those of :class:`ViewerConnection`.
         """
         from websockets.asyncio import server
 
         original = server.serve
-        connection: Any = functools.partial(CheckedConnection, check_message=check_message, on_refusal=on_refusal)
+        connection: Any = functools.partial(ViewerConnection, check_message=check_message, on_refusal=on_refusal)
 
         def serve(*args: Any, process_request: Callable[..., Any] | None = None, **options: Any) -> Any:
             self.installed = True
@@ -124,7 +124,7 @@ class TokenAuth:
     def _is_own_name(self, host: str) -> bool:
         """A server that listens on every address also answers to any IP address, which nobody can rebind."""
         name = re.sub(r":\d+$", "", host).lower()
-        return name in self._hosts or (_is_unspecified(self._hosts[-1]) and _parse_ip(name) is not None)
+        return name in self._hosts or (_is_unspecified_viewer_host(self._hosts[-1]) and _parse_ip(name) is not None)
 
 
 def _parse_ip(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None:
@@ -134,7 +134,7 @@ def _parse_ip(host: str) -> ipaddress.IPv4Address | ipaddress.IPv6Address | None
         return None
 
 
-def _is_unspecified(host: str) -> bool:
+def _is_unspecified_viewer_host(host: str) -> bool:
     address = _parse_ip(host)
     return address is not None and address.is_unspecified
 
@@ -210,13 +210,13 @@ _KINDS = tuple(_Message.__subclasses__())
 _DECODER = msgspec.msgpack.Decoder(functools.reduce(operator.or_, _KINDS))  # type: ignore[arg-type]
 
 
-def is_known_protocol(messages: Any) -> bool:
+def is_known_viewer_protocol(messages: Any) -> bool:
     """Whether viser's messages module defines these messages with these fields; other versions may not."""
     kinds = ((kind, getattr(messages, kind.__name__, None)) for kind in _KINDS)
     return all(own and {f.name for f in dataclasses.fields(own)} == set(kind.__struct_fields__) for kind, own in kinds)
 
 
-class CheckedConnection(ServerConnection):
+class ViewerConnection(ServerConnection):
     """Drops messages for which ``check_message`` returns a reason, and calls ``on_refusal`` with itself and it."""
 
     def __init__(
@@ -251,11 +251,11 @@ def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> 
     handle = find_control(decoded.uuid)
     if handle is None:
         return "a control that is not there"
-    reason = refuse_value(handle, decoded.updates.value)
+    reason = refuse_control_value(handle, decoded.updates.value)
     return None if reason is None else f"{getattr(handle, 'label', 'a control')}: {reason}"
 
 
-def refuse_value(handle: Any, value: Any) -> str | None:
+def refuse_control_value(handle: Any, value: Any) -> str | None:
     """Return why a control cannot take a value, by the type, choices and bounds that it was created with."""
     now, props = handle._impl.value, handle._impl.props
     options, low, high, step = (getattr(props, name, None) for name in ("options", "min", "max", "step"))

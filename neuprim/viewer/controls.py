@@ -23,8 +23,8 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.core.settings import SortOrder
 from neuprim.inspect.field import measure_absorption
 from neuprim.inspect.views import unit_sphere
-from neuprim.viewer.session import DEFAULT_LONGEST, Pose, Session
-from neuprim.viewer.viewer_scene import Viewpoint, list_quantities
+from neuprim.viewer.session import DEFAULT_LONGEST, Session, ViewerPose
+from neuprim.viewer.viewer_scene import Viewpoint, list_viewer_quantities
 
 _MAX_SLIDER_RANGE = 1e4
 _PLAY_FPS = 12.0
@@ -36,7 +36,7 @@ _NONE, _WIRE, _SOLID = "none", "wire", "solid"
 _MAX_ELLIPSOIDS, _DEFAULT_ELLIPSOIDS = 20_000, 1_000
 
 
-def format_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
+def format_viewer_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
     """Write a condition's value as ``neuprim render`` takes it."""
     digits = 4 if spec.place is None or world.identity else 10
     return ",".join(f"{x:.{digits}g}" for x in spec.given(value, world).flatten().tolist())
@@ -76,7 +76,7 @@ class ConditionControls:
                 near = float(value.clamp(low, high))
                 if not math.isclose(slider.value, near, abs_tol=1e-6):
                     slider.value = near
-            written = format_condition(spec, value, self.session.scene.world)
+            written = format_viewer_condition(spec, value, self.session.scene.world)
             if text.value != written and not play.value and not typed:
                 text.value = written
             if handle is not None:
@@ -87,7 +87,7 @@ class ConditionControls:
         play.on_update(lambda _: self._play(spec, text.value, play) if play.value else None)
 
     def _format(self, spec: ConditionSpec) -> str:
-        return format_condition(spec, self.session.conditions[spec.name], self.session.scene.world)
+        return format_viewer_condition(spec, self.session.conditions[spec.name], self.session.scene.world)
 
     def _add_handle(self, spec: ConditionSpec) -> Any:
         """Add a draggable handle for a position in the scene."""
@@ -159,7 +159,9 @@ class RenderControls:
         self.session = session
         self._values: dict[str, Any] = {}
         gui, settings = session.client.gui, session.settings
-        quantity = gui.add_dropdown("show", list_quantities(session.scene.channels), initial_value=session.quantity)
+        quantity = gui.add_dropdown(
+            "show", list_viewer_quantities(session.scene.channels), initial_value=session.quantity
+        )
         quantity.on_update(lambda _: self._set_session("quantity", quantity.value))
         hint = "on the longer side of the full picture"
         longest = gui.add_slider("pixels", 128, 2048, 32, DEFAULT_LONGEST, hint=hint)
@@ -217,7 +219,7 @@ class ViewControls:
 
     def _jump(self, name: str) -> None:
         view = self.session.scene.load_view(name)
-        self.session.set_camera(Pose.from_camera(view.camera))
+        self.session.set_camera(ViewerPose.from_camera(view.camera))
         self.session.set_conditions({key: value.float() for key, value in view.conditions.items()})
         self._on_jump()
         self._show_comparison(name)
@@ -258,7 +260,7 @@ class FrameEllipsoids(NamedTuple):
     colours: np.ndarray
 
 
-def list_ellipsoids(model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int) -> FrameEllipsoids:
+def list_viewer_ellipsoids(model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int) -> FrameEllipsoids:
     """Return the ellipsoids of a frame: at most ``limit``, those that absorb most."""
     with torch.no_grad():
         lowered = model.lower(viewpoint.camera, viewpoint.conditions)
@@ -269,10 +271,10 @@ def list_ellipsoids(model: Primitives, viewpoint: Viewpoint, channels: Channels,
             chosen = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:limit]))
         colours = lowered.center_colors(viewpoint.camera.position.to(lowered.geometry.means)).float().cpu()
         shown = np.rint(255 * channels.display_rows(colours.clamp_min(0)).numpy()).astype(np.uint8)
-        return _select_ellipsoids(lowered.geometry, lowered.rows, chosen, shown)
+        return _select_viewer_ellipsoids(lowered.geometry, lowered.rows, chosen, shown)
 
 
-def make_ellipsoid(model: Primitives, viewpoint: Viewpoint, row: int) -> FrameEllipsoids | None:
+def make_viewer_ellipsoid(model: Primitives, viewpoint: Viewpoint, row: int) -> FrameEllipsoids | None:
     """Return one primitive in yellow; None if it is not active in the frame.
 
     Raises:
@@ -285,10 +287,12 @@ def make_ellipsoid(model: Primitives, viewpoint: Viewpoint, row: int) -> FrameEl
     rows = torch.arange(model.count) if active.rows is None else active.rows.cpu()
     chosen = (rows == row).nonzero()[:, 0]
     yellow = np.tile(np.array([[255, 210, 0]], np.uint8), (len(rows), 1))
-    return _select_ellipsoids(active.geometry, rows, chosen, yellow) if len(chosen) else None
+    return _select_viewer_ellipsoids(active.geometry, rows, chosen, yellow) if len(chosen) else None
 
 
-def _select_ellipsoids(geometry: Geometry, rows: Tensor | None, chosen: Tensor, colours: np.ndarray) -> FrameEllipsoids:
+def _select_viewer_ellipsoids(
+    geometry: Geometry, rows: Tensor | None, chosen: Tensor, colours: np.ndarray
+) -> FrameEllipsoids:
     tensors = (geometry.means, geometry.scales, geometry.quats)
     means, scales, quats = (x.detach().float().cpu()[chosen] for x in tensors)
     numbers = chosen if rows is None else rows.cpu()[chosen]
@@ -317,7 +321,7 @@ def pick_primitive(
     return int(weight.argmax()) if len(weight) and float(weight.max()) > 0 else None
 
 
-def describe_primitive(model: Primitives, row: int) -> str:
+def describe_viewer_primitive(model: Primitives, row: int) -> str:
     """Return a primitive's semi-axes and parameters, one a line."""
     lines = [f"primitive {row} of {model.count}"]
     axes = model.params["log_scales"][row].detach().double().exp().tolist()
@@ -376,15 +380,17 @@ class PrimitiveControls:
         found = None
         if self._style.value != _NONE:
             scene = self.session.scene
-            found = list_ellipsoids(scene.model(), self.session.viewpoint(), scene.channels, int(self._limit.value))
+            found = list_viewer_ellipsoids(
+                scene.model(), self.session.viewpoint(), scene.channels, int(self._limit.value)
+            )
         self._show_meshes("/ellipsoids", found, wire=self._style.value == _WIRE)
 
     def _describe_chosen(self) -> None:
         self._show_meshes("/chosen", None, wire=True)
         row, model, found, text = int(self._row.value), self.session.scene.model(), None, ""
         if row >= 0:
-            found = make_ellipsoid(model, self.session.viewpoint(), row)
-            text = describe_primitive(model, row) + ("" if found is not None else "\nnot active in this frame")
+            found = make_viewer_ellipsoid(model, self.session.viewpoint(), row)
+            text = describe_viewer_primitive(model, row) + ("" if found is not None else "\nnot active in this frame")
         self._text.value = text
         self._show_meshes("/chosen", found, wire=True)
 

@@ -20,7 +20,7 @@ from neuprim.config.command_settings import ViewerSettings
 from neuprim.runs.fit import Evaluated, Event, Events, Finishing, Fitted, Note, Preparing, Step
 from neuprim.runs.training import save_run_training
 from neuprim.viewer.render_queue import RenderQueue
-from neuprim.viewer.server import PageServer
+from neuprim.viewer.server import ViewerServer
 from neuprim.viewer.session import Session
 from neuprim.viewer.view import SessionManager
 from neuprim.viewer.viewer_scene import ViewerScene
@@ -113,7 +113,7 @@ class LiveTraining:
     """Context manager around a run: an event listener whose :meth:`between` is called between steps.
 
     Raises:
-        ConfigError, BackendUnavailable: as :class:`~neuprim.viewer.server.PageServer`.
+        ConfigError, BackendUnavailable: as :class:`~neuprim.viewer.server.ViewerServer`.
     """
 
     def __init__(
@@ -126,7 +126,7 @@ class LiveTraining:
         self._controls: list[TrainingControls] = []
         self._sessions: SessionManager | None = None
         self._updated = 0.0
-        self._server = PageServer(settings, config.output_dir.name)
+        self._server = ViewerServer(settings, config.output_dir.name)
         self.address = self._server.address
         on_open(self.address)
 

@@ -25,7 +25,7 @@ Front = Sequence[tuple[tuple[str, ...], float]]
 """Overrides of render configurations, best quality first, each with its time relative to the full image."""
 
 
-def read_front(run_dir: Path, warn: Callable[[str], None] = lambda text: None) -> Front:
+def read_viewer_front(run_dir: Path, warn: Callable[[str], None] = lambda text: None) -> Front:
     """Read the measured front of time against quality; empty if there is none, or with a warning if it is unusable."""
     try:
         record = read_tradeoff_record(run_dir / TRADEOFF_FOLDER / TRADEOFF_FILE)

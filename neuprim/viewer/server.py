@@ -35,7 +35,7 @@ def is_loopback(host: str) -> bool:
         return False
 
 
-class PageServer:
+class ViewerServer:
     """A running viser server.
 
     Attributes:
@@ -55,7 +55,7 @@ class PageServer:
         auth = TokenAuth(settings.host)
         # Pages may be closed while something is sent to them.
         warnings.filterwarnings("ignore", message=r"Queued a \w+ on a closed connection")
-        port = _free_port(settings.host, settings.port)
+        port = _free_viewer_port(settings.host, settings.port)
         guarded = auth.guard_server(lambda message: refuse_message(message, self._find_control), self._report_refusal)
         with contextlib.redirect_stdout(io.StringIO()), guarded:
             self.viser = viser.ViserServer(host=settings.host, port=port, label=title, verbose=False)
@@ -78,13 +78,13 @@ class PageServer:
         try:
             from viser import _messages
 
-            from neuprim.viewer.auth import is_known_protocol
+            from neuprim.viewer.auth import is_known_viewer_protocol
 
             for kind in (_messages.ShareUrlRequest, _messages.ShareUrlDisconnect):
                 self.viser._websock_server.unregister_handler(kind)
         except (ImportError, AttributeError, AssertionError):  # another version of viser
             return False
-        return is_known_protocol(_messages)
+        return is_known_viewer_protocol(_messages)
 
     def on_client(
         self, connect: Callable[[Any], None], disconnect: Callable[[Any], None], refuse: Callable[[int, str], None]
@@ -109,7 +109,7 @@ class PageServer:
             self.viser.stop()
 
 
-def _free_port(host: str, port: int) -> int:
+def _free_viewer_port(host: str, port: int) -> int:
     """Return a free port: this one, or any for 0."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)

@@ -30,7 +30,7 @@ DEFAULT_LONGEST = 960  # pixels
 
 
 @dataclass(frozen=True, eq=False)
-class Pose:
+class ViewerPose:
     """A camera as a page knows it, without its window.
 
     Attributes:
@@ -44,7 +44,7 @@ class Pose:
     fov: float
 
     @classmethod
-    def from_camera(cls, camera: Camera) -> Pose:
+    def from_camera(cls, camera: Camera) -> ViewerPose:
         """Convert a camera; its principal point is lost."""
         view = camera.viewmat.detach().double().cpu().numpy()
         x, y, z, w = Rotation.from_matrix(view[:3, :3].T).as_quat()
@@ -67,7 +67,7 @@ class Pose:
         return Camera(viewmat, focal, focal, width / 2, height / 2, width, height)
 
 
-def fit_size(size: Sequence[int], longest: int) -> tuple[int, int]:
+def fit_viewer_size(size: Sequence[int], longest: int) -> tuple[int, int]:
     """Scale (width, height) down to at most ``longest`` pixels a side, at least 1."""
     scale = min(1.0, longest / max(*size, 1))
     return max(1, round(scale * size[0])), max(1, round(scale * size[1]))
@@ -78,7 +78,7 @@ class Session:
 
     Attributes:
         client: a ``viser.ClientHandle``.
-        quantity: one of :func:`~neuprim.viewer.viewer_scene.list_quantities`.
+        quantity: one of :func:`~neuprim.viewer.viewer_scene.list_viewer_quantities`.
         conditions: every condition of the task.
         settings: of the full image.
         longest: pixels on the longer side of the full image.
@@ -103,7 +103,7 @@ class Session:
     def open(self, start: View) -> None:
         """Show the start view, then follow the page's camera."""
         self._status = self.client.gui.add_text("status", "", disabled=True)
-        self.set_camera(Pose.from_camera(start.camera))
+        self.set_camera(ViewerPose.from_camera(start.camera))
         self.client.camera.on_update(lambda _: self.redraw())
         self.redraw()
 
@@ -130,7 +130,7 @@ class Session:
             traceback.print_exception(error)
             self.notify(f"{type(error).__name__}: {error}", "red")
 
-    def set_camera(self, pose: Pose) -> None:
+    def set_camera(self, pose: ViewerPose) -> None:
         """Move the page's camera. Dragging then turns it around the point ahead that is closest to the scene's
         centre."""
         forward = pose.rotation.as_matrix()[:, 2]
@@ -146,8 +146,8 @@ class Session:
     def viewpoint(self) -> Viewpoint:
         """Return what the page shows now."""
         camera = self.client.camera
-        pose = Pose(camera.wxyz.copy(), camera.position.copy(), float(camera.fov))
-        width, height = fit_size((camera.image_width or 1, camera.image_height or 1), self.longest)
+        pose = ViewerPose(camera.wxyz.copy(), camera.position.copy(), float(camera.fov))
+        width, height = fit_viewer_size((camera.image_width or 1, camera.image_height or 1), self.longest)
         with self._lock:
             return Viewpoint(pose.to_camera(width, height), dict(self.conditions), self.quantity)
 

@@ -19,9 +19,9 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import RunRendering
 from neuprim.viewer.controls import ConditionControls, PrimitiveControls, RenderControls, ViewControls
-from neuprim.viewer.quality import read_front
+from neuprim.viewer.quality import read_viewer_front
 from neuprim.viewer.render_queue import RenderQueue
-from neuprim.viewer.server import PageServer, require_viser
+from neuprim.viewer.server import ViewerServer, require_viser
 from neuprim.viewer.session import Session
 from neuprim.viewer.viewer_scene import ViewerScene, Viewpoint
 
@@ -33,7 +33,7 @@ class SessionManager:
 
     def __init__(
         self,
-        server: PageServer,
+        server: ViewerServer,
         scene: ViewerScene,
         queue: RenderQueue,
         add_training: Callable[[Session], None] | None = None,
@@ -87,7 +87,7 @@ class SessionManager:
             PrimitiveControls(session)
 
 
-def open_scene(
+def open_viewer_scene(
     run_dir: Path,
     warn: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
@@ -106,8 +106,8 @@ def open_scene(
     except NeuprimError as error:
         warn(f"no held-out views: {error}")
     means = model.params["means"].detach().double().cpu()
-    up = _read_vector(header, "up", torch.tensor([0.0, 0.0, 1.0]))
-    center = _read_vector(header, "center", means.median(0).values if len(means) else torch.zeros(3))
+    up = _read_viewer_vector(header, "up", torch.tensor([0.0, 0.0, 1.0]))
+    center = _read_viewer_vector(header, "center", means.median(0).values if len(means) else torch.zeros(3))
     if dataset is not None:
         up, center = dataset.up, dataset.center
     return ViewerScene(
@@ -121,11 +121,11 @@ def open_scene(
         center=np.asarray(center.double().numpy()),
         world=World.of(header, str(run_dir)),
         dataset=dataset,
-        front=read_front(run_dir, warn),
+        front=read_viewer_front(run_dir, warn),
     )
 
 
-def _read_vector(header: Mapping[str, Any], name: str, default: torch.Tensor) -> torch.Tensor:
+def _read_viewer_vector(header: Mapping[str, Any], name: str, default: torch.Tensor) -> torch.Tensor:
     """Read (3,) numbers about the scene from a model's header.
 
     Raises:
@@ -156,11 +156,11 @@ def view_run(
     """
     require_viser()  # before the data are read
     end = end or threading.Event()
-    queue, scene = RenderQueue(), open_scene(run_dir, warn, progress)
+    queue, scene = RenderQueue(), open_viewer_scene(run_dir, warn, progress)
     progress("preparing the renderer", 0.0)  # the first image compiles kernels, once per installation
     start = scene.start_view()
     scene.draw(Viewpoint(start.camera.resized(32, 32), start.conditions), RunRendering(scene.settings))
-    server = PageServer(settings, scene.name)
+    server = ViewerServer(settings, scene.name)
     try:
         SessionManager(server, scene, queue)
         on_open(server.address)

@@ -40,7 +40,7 @@ _CACHED_MODELS = 4
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """What a page shows: a camera, every condition of the task, and one of :func:`list_quantities`."""
+    """What a page shows: a camera, every condition of the task, and one of :func:`list_viewer_quantities`."""
 
     camera: Camera
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
@@ -65,12 +65,12 @@ class ViewComparison:
     psnr: float
 
 
-def list_quantities(channels: Channels) -> list[str]:
+def list_viewer_quantities(channels: Channels) -> list[str]:
     """Colour, alpha, depth, and each channel if there are several."""
     return [COLOUR, ALPHA, DEPTH, *(f"channel {name}" for name in channels.names if channels.count > 1)]
 
 
-def draw_viewpoint(
+def draw_viewer_picture(
     model: Primitives, viewpoint: Viewpoint, config: RunRendering, background: Tensor, channels: Channels
 ) -> Picture:
     """Draw a model that the render configuration was applied to.
@@ -93,22 +93,22 @@ def draw_viewpoint(
     if viewpoint.quantity == COLOUR:
         image = to_uint8(channels.display(output.rgb.cpu())).numpy()
     elif viewpoint.quantity == ALPHA:
-        image = _to_grey(output.alpha.cpu())
+        image = _to_viewer_grey(output.alpha.cpu())
     elif viewpoint.quantity == DEPTH:
         assert output.depth is not None
-        image, caption = _colour_depth(output.depth.cpu().numpy(), output.alpha.cpu().numpy())
+        image, caption = _colour_viewer_depth(output.depth.cpu().numpy(), output.alpha.cpu().numpy())
     else:
         index = [f"channel {name}" for name in channels.names].index(viewpoint.quantity)
-        image = _to_grey(output.rgb[..., index].cpu())
+        image = _to_viewer_grey(output.rgb[..., index].cpu())
         caption = f"{channels.names[index]}, 0 is black and 1 is white, {channels.color_space}"
     return Picture(image, caption, time.perf_counter() - start)
 
 
-def _to_grey(values: Tensor) -> np.ndarray:
+def _to_viewer_grey(values: Tensor) -> np.ndarray:
     return np.asarray(to_uint8(values[..., None].expand(-1, -1, 3)).numpy())
 
 
-def _colour_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
+def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
     """(H, W, 3) uint8, near is bright and empty is black; and a caption."""
     solid = alpha > _MIN_ALPHA
     image = np.zeros((*depth.shape, 3), np.uint8)
@@ -133,7 +133,7 @@ class ViewerScene:
         center: (3,) point that a camera turns around, scene units.
         world: coordinates in which positions are typed and shown.
         dataset: for held-out views; None if its files are gone.
-        front: see :func:`~neuprim.viewer.quality.read_front`.
+        front: see :func:`~neuprim.viewer.quality.read_viewer_front`.
     """
 
     name: str
@@ -163,9 +163,9 @@ class ViewerScene:
         return self._cache[key]
 
     def draw(self, viewpoint: Viewpoint, config: RunRendering) -> Picture:
-        """Draw the current model; see :func:`draw_viewpoint`."""
+        """Draw the current model; see :func:`draw_viewer_picture`."""
         model = self.prepare_model(config, View("", viewpoint.camera, viewpoint.conditions))
-        return draw_viewpoint(model, viewpoint, config, self.background, self.channels)
+        return draw_viewer_picture(model, viewpoint, config, self.background, self.channels)
 
     def list_views(self) -> list[str]:
         """Return the names of the held-out views with a pinhole camera."""

@@ -27,7 +27,7 @@ from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import open_run, read_metrics
 from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.tasks.relight import TASK as RELIGHT
-from neuprim.viewer.controls import format_condition
+from neuprim.viewer.controls import format_viewer_condition
 from tests.core import tiny
 from tests.plugins import marked
 from tests.short_runs import fit, words
@@ -155,7 +155,7 @@ def test_a_light_is_read_and_written_in_the_world() -> None:
     (value,) = light.within(UTM).parse("448251.25,5411930,214.5")
     assert value.tolist() == [1.25, 0.0, 4.5] and value.dtype == torch.float32
     assert torch.equal(light.within(UTM).parse("orbit:4:40:3")[0], light.parse("orbit:4:40:3")[0])
-    assert format_condition(light, value, UTM) == "448251.25,5411930,214.5"
+    assert format_viewer_condition(light, value, UTM) == "448251.25,5411930,214.5"
 
 
 def test_a_page_and_a_compressed_model_say_where_they_are(tmp_path: Path) -> None:

@@ -186,7 +186,7 @@ def test_a_picture_that_fails_ends_no_training(
     def broken(*args: Any) -> None:
         raise RuntimeError("no such picture")
 
-    monkeypatch.setattr("neuprim.viewer.viewer_scene.draw_viewpoint", broken)
+    monkeypatch.setattr("neuprim.viewer.viewer_scene.draw_viewer_picture", broken)
 
     def look(live: LiveTraining, page: Visitor) -> None:
         until(page, lambda: any("no such picture" in str(m) for m in page.messages))

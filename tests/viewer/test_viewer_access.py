@@ -29,9 +29,9 @@ from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.tasks.static import TASK, SphericalHarmonics
-from neuprim.viewer.auth import TokenAuth, is_known_protocol, refuse_message
+from neuprim.viewer.auth import TokenAuth, is_known_viewer_protocol, refuse_message
 from neuprim.viewer.render_queue import RenderQueue
-from neuprim.viewer.server import PageServer, is_loopback
+from neuprim.viewer.server import ViewerServer, is_loopback
 from neuprim.viewer.view import SessionManager
 from neuprim.viewer.viewer_scene import ViewerScene
 from tests.page_models import random_model
@@ -53,17 +53,17 @@ CLICK = {
 
 
 @pytest.fixture(scope="module")
-def page() -> Iterator[PageServer]:
-    made = PageServer(ViewerSettings(port=0), "a run")
+def page() -> Iterator[ViewerServer]:
+    made = ViewerServer(ViewerSettings(port=0), "a run")
     yield made
     made.close()
 
 
-def without_token(page: PageServer) -> str:
+def without_token(page: ViewerServer) -> str:
     return page.address.partition("?")[0]
 
 
-def test_the_page_is_for_those_with_the_token(page: PageServer) -> None:
+def test_the_page_is_for_those_with_the_token(page: ViewerServer) -> None:
     status, headers, body = fetch(page.address)
     assert status == 200 and b"<html" in body
     assert headers["Set-Cookie"].endswith("; Path=/; HttpOnly; SameSite=Strict")
@@ -82,7 +82,7 @@ def test_the_page_is_for_those_with_the_token(page: PageServer) -> None:
         assert status == 403 and b"<html" not in body and headers["Set-Cookie"] is None, address
 
 
-def test_a_stranger_gets_no_connection_and_nothing_is_sent(page: PageServer) -> None:
+def test_a_stranger_gets_no_connection_and_nothing_is_sent(page: ViewerServer) -> None:
     come: list[Any] = []
     page.viser._websock_server.on_client_connect(come.append)
     token = page.address.partition("token=")[2]
@@ -109,7 +109,7 @@ def test_a_stranger_gets_no_connection_and_nothing_is_sent(page: PageServer) -> 
     assert websocket_server.serve.__name__ == "serve" and isinstance(websocket_server.serve, type), "viser is unchanged"
 
 
-def test_odd_requests_are_refused(page: PageServer) -> None:
+def test_odd_requests_are_refused(page: ViewerServer) -> None:
     host, port = "127.0.0.1", page.viser.get_port()
     token = page.address.partition("?")[2]
     for hosts in ([], ["a b"], ["x;y"], ["one:1", "two:2"]):
@@ -124,7 +124,7 @@ def test_odd_requests_are_refused(page: PageServer) -> None:
 
 
 def test_the_page_cannot_be_passed_on_through_a_server_elsewhere(
-    page: PageServer, monkeypatch: pytest.MonkeyPatch
+    page: ViewerServer, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     asked: list[str] = []
     monkeypatch.setattr("viser._viser.ViserTunnel", lambda *args: asked.append("tunnel"))
@@ -144,7 +144,7 @@ def test_without_its_gate_a_server_does_not_stay(monkeypatch: pytest.MonkeyPatch
 
     monkeypatch.setattr(TokenAuth, "guard_server", nothing)
     with pytest.raises(BackendUnavailable, match="did not start behind the check"):
-        PageServer(ViewerSettings(port=0), "a run")
+        ViewerServer(ViewerSettings(port=0), "a run")
 
 
 def test_pages_of_another_viser_are_not_served(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -152,17 +152,17 @@ def test_pages_of_another_viser_are_not_served(monkeypatch: pytest.MonkeyPatch) 
     messages = importlib.import_module("viser._messages")
     longer = dataclasses.make_dataclass("ViewerCameraMessage", [("wxyz", tuple), ("zoom", float)])
     monkeypatch.setattr(messages, "ViewerCameraMessage", longer)
-    assert not is_known_protocol(messages)
+    assert not is_known_viewer_protocol(messages)
     monkeypatch.undo()
-    assert is_known_protocol(messages)
+    assert is_known_viewer_protocol(messages)
 
 
-def test_ports_and_hosts_that_are_not_to_be_had(page: PageServer) -> None:
+def test_ports_and_hosts_that_are_not_to_be_had(page: ViewerServer) -> None:
     port = page.viser.get_port()
     with pytest.raises(ConfigError, match=f"port {port}.*expected an address of this machine and a free port"):
-        PageServer(ViewerSettings(port=port), "another")
+        ViewerServer(ViewerSettings(port=port), "another")
     with pytest.raises(ConfigError, match=r"host\.invalid"):
-        PageServer(ViewerSettings("host.invalid", 0), "another")
+        ViewerServer(ViewerSettings("host.invalid", 0), "another")
 
 
 @pytest.mark.parametrize(
@@ -267,7 +267,7 @@ CONTROLS: list[tuple[Callable[[Any], Any], list[Any], list[Any]]] = [
 
 
 @pytest.mark.parametrize("number", range(len(CONTROLS)))
-def test_a_control_takes_what_it_was_made_for(page: PageServer, number: int) -> None:
+def test_a_control_takes_what_it_was_made_for(page: ViewerServer, number: int) -> None:
     make, good, bad = CONTROLS[number]
     handle = make(page.viser.gui)
     for value in good:
@@ -285,7 +285,7 @@ def visited() -> Iterator[tuple[SessionManager, str]]:
     model = random_model(CosineDensity(2, edge=2), SphericalHarmonics(1), count=30)
     channels = Channels(("R", "G", "B"), "srgb", None, "static")
     own = (TASK, lambda: model, channels, RenderSettings(backend="reference"), torch.ones(3), (0.0, 0.0, 1.0))
-    server, queue, end = PageServer(ViewerSettings(port=0), "it"), RenderQueue(), threading.Event()
+    server, queue, end = ViewerServer(ViewerSettings(port=0), "it"), RenderQueue(), threading.Event()
     manager = SessionManager(server, ViewerScene("it", *own, np.zeros(3)), queue)
     thread = threading.Thread(target=lambda: [queue.work(0.05) for _ in iter(end.is_set, True)])
     thread.start()

@@ -30,12 +30,25 @@ from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import TASK as STATIC
 from neuprim.tasks.static import SphericalHarmonics
-from neuprim.viewer.controls import describe_primitive, list_ellipsoids, make_ellipsoid, pick_primitive
-from neuprim.viewer.quality import QualityLadder, QualityLevel, read_front
+from neuprim.viewer.controls import (
+    describe_viewer_primitive,
+    list_viewer_ellipsoids,
+    make_viewer_ellipsoid,
+    pick_primitive,
+)
+from neuprim.viewer.quality import QualityLadder, QualityLevel, read_viewer_front
 from neuprim.viewer.render_queue import RenderQueue
-from neuprim.viewer.session import Pose, fit_size
-from neuprim.viewer.view import open_scene
-from neuprim.viewer.viewer_scene import ALPHA, COLOUR, DEPTH, ViewerScene, Viewpoint, draw_viewpoint, list_quantities
+from neuprim.viewer.session import ViewerPose, fit_viewer_size
+from neuprim.viewer.view import open_viewer_scene
+from neuprim.viewer.viewer_scene import (
+    ALPHA,
+    COLOUR,
+    DEPTH,
+    ViewerScene,
+    Viewpoint,
+    draw_viewer_picture,
+    list_viewer_quantities,
+)
 from tests.core import tiny
 from tests.page_models import camera_at, random_model
 from tests.pretend_card import CARD, pretended
@@ -56,31 +69,31 @@ def view_at(shows: str = COLOUR) -> Viewpoint:
 
 
 def test_colour_is_what_a_render_draws(model: Primitives) -> None:
-    picture = draw_viewpoint(model, view_at(), RunRendering(SETTINGS), WHITE, RGB)
+    picture = draw_viewer_picture(model, view_at(), RunRendering(SETTINGS), WHITE, RGB)
     expected = to_uint8(RGB.display(render_image(model, View("", view_at().camera), SETTINGS, WHITE))).numpy()
     assert picture.image.shape == (30, 40, 3) and picture.image.std() > 10 and picture.seconds > 0
     assert np.array_equal(picture.image, expected) and picture.caption == ""
 
 
 def test_alpha_depth_and_single_channels(model: Primitives) -> None:
-    assert list_quantities(RGB) == [COLOUR, ALPHA, DEPTH, "channel R", "channel G", "channel B"]
+    assert list_viewer_quantities(RGB) == [COLOUR, ALPHA, DEPTH, "channel R", "channel G", "channel B"]
     point = RunRendering(SETTINGS)
-    alpha = draw_viewpoint(model, view_at(ALPHA), point, WHITE, RGB).image
+    alpha = draw_viewer_picture(model, view_at(ALPHA), point, WHITE, RGB).image
     assert (alpha[..., 0] == alpha[..., 2]).all() and alpha.max() > 200 and alpha[0, 0].max() == 0
-    depth = draw_viewpoint(model, view_at(DEPTH), point, WHITE, RGB)
+    depth = draw_viewer_picture(model, view_at(DEPTH), point, WHITE, RGB)
     assert depth.image[0, 0].tolist() == [0, 0, 0] and len(np.unique(depth.image.reshape(-1, 3), axis=0)) > 20
     near, far = (float(word) for word in depth.caption.split() if word[0].isdigit())
     assert 1.0 < near < far < 6.0
     away = replace(view_at(DEPTH), camera=camera_at((300.0, -3.0, 1.0), (8, 8), 4000.0).resized(4, 4))
     away = replace(away, camera=replace(away.camera, cx=4000.0))
-    assert draw_viewpoint(model, away, point, WHITE, RGB).caption == "nothing is in sight"
-    red = draw_viewpoint(model, view_at("channel R"), point, WHITE, RGB)
-    colour = draw_viewpoint(model, view_at(), point, WHITE, RGB).image
+    assert draw_viewer_picture(model, away, point, WHITE, RGB).caption == "nothing is in sight"
+    red = draw_viewer_picture(model, view_at("channel R"), point, WHITE, RGB)
+    colour = draw_viewer_picture(model, view_at(), point, WHITE, RGB).image
     assert np.array_equal(red.image[..., 0], colour[..., 0]) and "R, 0 is black" in red.caption
 
 
 def test_lower_resolution_is_sent_as_it_was_drawn(model: Primitives) -> None:
-    assert draw_viewpoint(model, view_at(), RunRendering(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (
+    assert draw_viewer_picture(model, view_at(), RunRendering(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (
         8,
         10,
         3,
@@ -92,7 +105,7 @@ def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
     with pytest.raises(
         ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"
     ):
-        draw_viewpoint(model, look, RunRendering(replace(SETTINGS, samples=16)), WHITE, RGB)
+        draw_viewer_picture(model, look, RunRendering(replace(SETTINGS, samples=16)), WHITE, RGB)
 
 
 def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
@@ -119,10 +132,10 @@ def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Pat
         TradeoffPoint("combined", ("resolution=0.5", "density.neurons=1"), {"psnr": 28.0}, 1, ms=[2.0], ratios=[0.2]),
         TradeoffPoint("combined", ("density.neurons=7",), {"psnr": 27.0}, 1, ms=[1.0], ratios=[0.1]),
     ]
-    assert read_front(tmp_path) == ()
+    assert read_viewer_front(tmp_path) == ()
     (tmp_path / "tradeoff").mkdir()
     TradeoffRecord({}, points=points, speed=[0, 1, 2, 3]).write(tmp_path / "tradeoff" / "tradeoff.json")
-    front = read_front(tmp_path)
+    front = read_viewer_front(tmp_path)
     assert [ratio for _, ratio in front] == [0.5, 0.2, 0.1]
     told: list[str] = []
     levels = QualityLadder.build(model, SETTINGS, front, told.append)
@@ -134,7 +147,7 @@ def test_levels_are_the_front_that_was_measured(model: Primitives, tmp_path: Pat
         "a point that does not fit this model is left out and told"
     )
     (tmp_path / "tradeoff" / "tradeoff.json").write_text("{")
-    assert read_front(tmp_path, told.append) == () and "tradeoff.json" in told[-1]
+    assert read_viewer_front(tmp_path, told.append) == () and "tradeoff.json" in told[-1]
 
 
 def test_words_over_the_settings_are_the_full_picture(model: Primitives) -> None:
@@ -188,9 +201,9 @@ def test_a_waiting_worker_hears_of_new_work_and_faults_are_told() -> None:
 
 def test_a_pose_is_its_camera_in_any_window() -> None:
     camera = camera_at((1.3, -3.0, 1.0))
-    same = Pose.from_camera(camera).to_camera(camera.width, camera.height)
+    same = ViewerPose.from_camera(camera).to_camera(camera.width, camera.height)
     assert torch.allclose(same.viewmat, camera.viewmat.double(), atol=1e-6) and same.fy == pytest.approx(camera.fy)
-    wide = Pose.from_camera(camera).to_camera(2 * camera.width, camera.height)
+    wide = ViewerPose.from_camera(camera).to_camera(2 * camera.width, camera.height)
     assert isinstance(wide, Camera) and wide.fx == wide.fy == pytest.approx(camera.fy) and wide.cx == camera.width
     for size, expected in (
         ((1280, 800), (960, 600)),
@@ -198,7 +211,7 @@ def test_a_pose_is_its_camera_in_any_window() -> None:
         ((1, 5000), (1, 960)),
         ((0, 0), (1, 1)),
     ):
-        assert fit_size(size, 960) == expected
+        assert fit_viewer_size(size, 960) == expected
 
 
 def weights(model: Primitives, look: Viewpoint, x: float, y: float) -> torch.Tensor:
@@ -236,7 +249,7 @@ def test_ellipsoids_are_where_the_frame_has_them() -> None:
     model = random_model(TimeDensity(2, "window+motion", edge=2), TimeHarmonics(1), count=40)
     look = Viewpoint(camera_at((0.3, -3.0, 1.0)), {"time": torch.tensor(0.3)})
     active = model.active(look.conditions)
-    every = list_ellipsoids(model, look, RGB, 1000)
+    every = list_viewer_ellipsoids(model, look, RGB, 1000)
     assert np.array_equal(every.rows, active.rows.numpy()) and 0 < len(every.rows) < 40  # type: ignore[union-attr]
     assert np.allclose(every.positions, active.geometry.means) and np.allclose(every.scales, active.geometry.scales)
     assert (
@@ -244,19 +257,19 @@ def test_ellipsoids_are_where_the_frame_has_them() -> None:
         and every.colours.dtype == np.uint8
         and every.colours.std() > 5
     )
-    few = list_ellipsoids(model, look, RGB, 5)
+    few = list_viewer_ellipsoids(model, look, RGB, 5)
     assert len(few.rows) == 5 and set(few.rows) < set(every.rows)
-    one = make_ellipsoid(model, look, int(every.rows[3]))
+    one = make_viewer_ellipsoid(model, look, int(every.rows[3]))
     assert one is not None and np.array_equal(one.positions[0], every.positions[3])
     gone = next(i for i in range(40) if i not in every.rows)
-    assert make_ellipsoid(model, look, gone) is None
+    assert make_viewer_ellipsoid(model, look, gone) is None
     with pytest.raises(ConfigError, match="primitive 40: the model has 40 primitives, 0 to 39"):
-        make_ellipsoid(model, look, 40)
+        make_viewer_ellipsoid(model, look, 40)
 
 
 def test_parameters_in_words() -> None:
     model = random_model(CosineDensity(2, edge=2), SphericalHarmonics(3), count=3)
-    lines = describe_primitive(model, 1).splitlines()
+    lines = describe_viewer_primitive(model, 1).splitlines()
     assert lines[0] == "primitive 1 of 3" and lines[1].startswith("semi-axes ")
     assert [line.partition(":")[0] for line in lines[2:]] == list(model.params)
     assert any(line.endswith("(45 numbers)") for line in lines)
@@ -272,7 +285,7 @@ def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_run_with_its_data(run_dir: Path) -> None:
-    scene = open_scene(run_dir)
+    scene = open_viewer_scene(run_dir)
     names = scene.list_views()
     assert scene.dataset is not None and len(names) == len(scene.dataset.test) and scene.start_view().name in names
     assert np.allclose(scene.center, scene.dataset.center) and scene.up == tuple(scene.dataset.up.tolist())
@@ -293,7 +306,7 @@ def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path
     config = (copy / "config.yaml").read_text()
     (copy / "config.yaml").write_text(config.replace(str(run_dir.parent / "two"), str(tmp_path / "gone")))
     told: list[str] = []
-    scene = open_scene(copy, told.append)
+    scene = open_viewer_scene(copy, told.append)
     assert scene.dataset is None and scene.list_views() == [] and len(told) == 1 and "no held-out views: " in told[0]
     start = scene.start_view()
     image = scene.draw(Viewpoint(start.camera.resized(96, 54), start.conditions), RunRendering(scene.settings)).image
@@ -310,7 +323,7 @@ def test_a_damaged_header_is_named(run_dir: Path, tmp_path: Path) -> None:
     more = {k: v for k, v in header.items() if k in ("background", "color_space", "channels", "data_source")}
     save_model(copy / "model.safetensors", model, "static", {**more, "data": {"up": [0, "x", 1], "center": [0, 0, 0]}})
     with pytest.raises(DataError, match=r"the model's header: data: up\[1\] is .*expected a finite number"):
-        open_scene(copy)
+        open_viewer_scene(copy)
 
 
 def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -326,7 +339,11 @@ def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.Monke
         start = scene.start_view()
         assert start.camera.viewmat.isfinite().all()
         picture = scene.draw(look, RunRendering(settings)).image
-        return picture, list_ellipsoids(model, look, channels, 5).rows, pick_primitive(model, look, direction, settings)
+        return (
+            picture,
+            list_viewer_ellipsoids(model, look, channels, 5).rows,
+            pick_primitive(model, look, direction, settings),
+        )
 
     expected = asked()
     with pretended(monkeypatch):

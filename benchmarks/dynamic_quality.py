@@ -41,7 +41,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import render_image
-from neuprim.tasks.dynamic import recording_of
+from neuprim.tasks.dynamic import vdb_recording_of
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 
@@ -150,7 +150,7 @@ def measure_between_frames(fitted: Fitted, metrics: dict[str, Any]) -> dict[str,
     jump 1 or more.
     """
     data, model, settings = fitted.dataset, fitted.model, fitted.trainer.renderer
-    recording = recording_of(data)
+    recording = vdb_recording_of(data)
     assert recording is not None
     frames, every = len(recording.test.times), recording.every
     errors: dict[str, list[float]] = {"learned": [], "between": [], "repeat": []}

@@ -76,7 +76,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
             ("Adam", kernels_warp.adam_kernels()),
             ("SSIM", kernels_warp.ssim_kernels()),
             ("grid", (density_grid_warp._add_kernel(),)),
-            ("rays of volumes", (raymarch_warp._image_kernel(), raymarch_warp._depth_kernel())),
+            ("rays of volumes", (raymarch_warp._march_image_kernel(), raymarch_warp._march_depth_kernel())),
         ):
             for number, kernel in enumerate(made, 1):
                 yield f"{title} {number}" if len(made) > 1 else title, kernel, BLOCK

@@ -51,7 +51,7 @@ def test_they_are_found() -> None:
     assert names >= {
         "RenderSettings",
         "TrainSettings",
-        "VolumeSettings",
+        "VdbSceneSettings",
         "OlatSettings",
         "SolidsSettings",
         "SolverSettings",

@@ -92,11 +92,11 @@ def test_a_sequence_lies_on_the_voxels_of_its_files_and_in_their_units(moving: P
 
 
 def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Path) -> None:
-    from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
+    from neuprim.tasks.dynamic.volume.capture_density import compare_capture_extinction
 
     report = export_run(moving, "vdb", tmp_path / "frames")
     run = open_run(moving)
-    expected = compare_extinction(run.model, run.volume().capture, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
+    expected = compare_capture_extinction(run.model, run.volume().capture, [0.0, 0.5, 1.0])["sigma_frames"]  # type: ignore[union-attr]
     assert len(expected) == 3
     for entry in expected:
         name = f"frame_{entry['frame']:04d}"

@@ -468,7 +468,9 @@ FORMATS: dict[str, Format] = {
         _loader(_DATASETS, "load_nerfstudio"),
         {"transforms.json": m.json_of, "points.ply": m.text_of, "mask.png": m.png},
     ),
-    "multiview": Format(_multiview, _loader("neuprim.tasks.dynamic.multiview", "load_multiview"), _SPLITS, slow=True),
+    "multiview": Format(
+        _multiview, _loader("neuprim.tasks.dynamic.multiview", "load_moving_multiview"), _SPLITS, slow=True
+    ),
     "olat": Format(_olat, _loader("neuprim.tasks.relight.datasets", "load_olat"), _SPLITS),
     "colmap": Format(
         _colmap(False), _loader(_DATASETS, "load_colmap"), {f"sparse/0/{part}.bin": m.lies(0, 400) for part in _PARTS}

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 _MIN_OPACITY = 1.0 / 255.0  # of a visible primitive
 
 
-def _check_model(model: Mapping[str, Any]) -> None:
+def _check_dynamic_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
     validate_choices(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
@@ -44,7 +44,7 @@ def _check_model(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+def _tunable_time_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     return {
         **DENSITY_TRADE,
         "model.density.time": ("none", "phase", "window", "window+motion", "phase+window+motion"),
@@ -54,13 +54,13 @@ def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     }
 
 
-def _build_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
+def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     components = () if dataset.points is None else dataset.points.components
     density = TimeDensity(model["neurons"], **model["density"], components=components)
     return density, TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
 
 
-def parse_time(text: str) -> list[Tensor]:
+def parse_dynamic_time(text: str) -> list[Tensor]:
     """Parse a time in 0..1 after ``--time``; raise ConfigError for anything else."""
     try:
         time = float(text)
@@ -76,7 +76,7 @@ def parse_time(text: str) -> list[Tensor]:
 # ---------------------------------------------------------------- evaluation
 
 
-def recording_of(dataset: Dataset) -> VolumeRecording | None:
+def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
     """The volume sequence that the images were rendered from; None if there is none.
 
     Raises:
@@ -91,37 +91,37 @@ def recording_of(dataset: Dataset) -> VolumeRecording | None:
 
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
     """Pixels that show matter in some frame of the view's camera."""
-    recording = recording_of(dataset)
+    recording = vdb_recording_of(dataset)
     return None if recording is None else recording.matter_mask(index)
 
 
 def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
     """One film of all frames per test camera."""
-    recording = recording_of(dataset)
+    recording = vdb_recording_of(dataset)
     if recording is None:
         return ()
     n = len(recording.capture.frames)
     return [Clip(f"cam_{c:02d}", range(i * n, (i + 1) * n), 24.0) for i, c in enumerate(recording.test.cameras)]
 
 
-def compare_with_volume(dataset: Dataset, model: Primitives) -> dict[str, Any]:
+def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str, Any]:
     """Compare the model's extinction and size with those of the files."""
-    recording = recording_of(dataset)
+    recording = vdb_recording_of(dataset)
     if recording is None:
         return {}
-    from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
+    from neuprim.tasks.dynamic.volume.capture_density import compare_capture_extinction
 
     capture, times = recording.capture, recording.test.times
     return {
         "exposure": dataset.exposure,
         "vdb_bytes": sum(frame.path.stat().st_size for frame in capture.frames),
         "normalisation": vars(capture.normalisation),
-        "invisible_fraction": invisible_fraction(model, times),
-        **compare_extinction(model, capture, [float(t) for t in times]),
+        "invisible_fraction": invisible_fraction_over_time(model, times),
+        **compare_capture_extinction(model, capture, [float(t) for t in times]),
     }
 
 
-def invisible_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
+def invisible_fraction_over_time(model: Primitives, times: Sequence[Tensor]) -> float:
     """Share of primitives whose opacity along each of their axes stays below 1/255 at all of these times.
 
     The chord along axis j through the centre has half length s_j, so that I = (N_p s_j/m) (b2 + sum_k w2_k cos(omega0
@@ -144,11 +144,11 @@ def invisible_fraction(model: Primitives, times: Sequence[Tensor]) -> float:
     return float((most_opaque < _MIN_OPACITY).double().mean())
 
 
-def _draw_emission(frame: LayerFrame) -> Tensor | None:
+def _draw_fire_emission(frame: LayerFrame) -> Tensor | None:
     return frame.emitted
 
 
-def _draw_absorption(frame: LayerFrame) -> Tensor | None:
+def _draw_smoke_absorption(frame: LayerFrame) -> Tensor | None:
     return None if frame.emitted is None else frame.emitted - frame.drawn.rgb
 
 
@@ -158,19 +158,19 @@ _LAYERS = (
     LayerSpec(
         "emission",
         "all light that is emitted along the ray, as if nothing absorbed any: the integral of sigma c, linear light",
-        _draw_emission,
+        _draw_fire_emission,
     ),
     LayerSpec(
         "absorption",
         "the part of the emission that is absorbed before it arrives, linear light: beauty = emission - absorption",
-        _draw_absorption,
+        _draw_smoke_absorption,
     ),
 )
 
 # ---------------------------------------------------------------- the task
 
 
-def _import_when_called(module: str, function: str) -> Callable[..., Any]:
+def _import_dynamic_function(module: str, function: str) -> Callable[..., Any]:
     """A function of a module of this task; loaders pull in many modules that other commands do not need."""
 
     def call(*arguments: Any) -> Any:
@@ -187,8 +187,8 @@ _VOLUME_SCENES = {
     "vdb": "any sequence of .vdb files: scene.vdb=DIR",
 }
 _VOLUME_FUNCTIONS = tuple(
-    _import_when_called("volume.volume_scene", function)
-    for function in ("load_volume_scene", "open_volume_source", "open_rendered_frames", "split_into_chunks")
+    _import_dynamic_function("volume.volume_scene", function)
+    for function in ("load_volume_scene", "open_volume_source", "open_captured_vdb_frames", "split_into_time_chunks")
 )
 _MULTIVIEW = "images with a time per frame (D-NeRF layout): scene.path=DIR"
 
@@ -199,17 +199,17 @@ TASK = TaskSpec(
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
         *(SceneSpec(name, summary, *_VOLUME_FUNCTIONS) for name, summary in _VOLUME_SCENES.items()),
-        SceneSpec("multiview", _MULTIVIEW, _import_when_called("multiview", "load_multiview")),
+        SceneSpec("multiview", _MULTIVIEW, _import_dynamic_function("multiview", "load_moving_multiview")),
     ),
-    build=_build_fields,
+    build=_build_time_fields,
     loss=photometric,
-    check=_check_model,
-    tunable_settings=_tunable_settings,
-    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_time, sweep="0:1"),),
+    check=_check_dynamic_model,
+    tunable_settings=_tunable_time_settings,
+    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_dynamic_time, sweep="0:1"),),
     fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
     mask=matter_mask,
-    diagnose=compare_with_volume,
+    diagnose=compare_with_vdb_recording,
     clips=held_out_clips,
     layers=_LAYERS,
 )

@@ -50,7 +50,7 @@ _AUTO = "auto"
 _TimeRange = tuple[float, float]
 
 
-def load_multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load the scene in the folder ``settings["path"]``; sRGB from PNG and JPEG, linear light from OpenEXR.
 
     Raises:
@@ -122,7 +122,7 @@ def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: 
             f"{where}: no frame has a time, so this is a static scene; expected a time in every frame, or task=static"
         )
     if setting != _AUTO:
-        low, high = _parse_time_range(setting)
+        low, high = _parse_multiview_time_range(setting)
         for record in records:
             time = _read_time(record)
             if not low <= time <= high:
@@ -150,7 +150,7 @@ def _read_time(record: JsonReader) -> float:
     return record.number("time", f"a finite number for {name}")
 
 
-def _parse_time_range(value: str) -> _TimeRange:
+def _parse_multiview_time_range(value: str) -> _TimeRange:
     """The two numbers of "LOW:HIGH"; ValueError where it is something else."""
     low, high = (float(part) for part in value.split(":"))
     if not (math.isfinite(low) and math.isfinite(high) and low < high and math.isfinite(high - low)):
@@ -160,7 +160,7 @@ def _parse_time_range(value: str) -> _TimeRange:
 
 def _is_time_range(value: str) -> bool:
     try:
-        return value == _AUTO or bool(_parse_time_range(value))
+        return value == _AUTO or bool(_parse_multiview_time_range(value))
     except ValueError:
         return False
 
@@ -215,7 +215,7 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
         rays, owner = ray_starting_points(views, count, generator, _MIN_OPACITY)
         return drop_repeated_points(PointCloud(rays.means, rays.colors, {"time": times[owner]}))
     if views_have_alpha(views):
-        points = _hull_points(views, times, count, generator)
+        points = _moving_hull_points(views, times, count, generator)
         if points is not None:
             return points
     points = box_starting_points(views, count, generator)
@@ -223,7 +223,7 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
     return PointCloud(points.means, points.colors, {"time": times[drawn]})
 
 
-def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
+def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
     """Points on the hulls; None if every image has its own time and all hulls are empty."""
     moments, shared = _choose_moments(times)
     surfaces, owners, sides = [], [], []
@@ -245,7 +245,7 @@ def _hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Gen
         return None
     centers, owner = torch.cat(surfaces), torch.cat(owners)
     voxel = torch.cat([torch.full((len(s),), side) for s, side in zip(surfaces, sides, strict=True)])
-    rows = _draw_one_per_cell(centers, float(np.median(sides)), generator)
+    rows = _draw_moving_point_per_cell(centers, float(np.median(sides)), generator)
     if count <= len(rows):
         rows = rows[farthest_points(centers[rows], count, generator)]
     else:
@@ -276,7 +276,7 @@ def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]
     return [moments[i] for i in kept], shared
 
 
-def _draw_one_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
+def _draw_moving_point_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
     """Rows of one random point in every cubic cell with points: things at rest are found in all moments."""
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()

@@ -62,8 +62,8 @@ class TimeHarmonics(ColourField):
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, sh.sh_coefficient_count(self.degree) - 1
         specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_sh_dc(c.colors))]
-        specs += [ParameterSpec(name, (n, C), 5e-3, _zeros(n, C)) for name, n in self._term_counts() if n]
-        return specs + ([ParameterSpec("sh_rest", (rest, C), 2e-3, _zeros(rest, C))] if rest else [])
+        specs += [ParameterSpec(name, (n, C), 5e-3, _zero_time_colours(n, C)) for name, n in self._term_counts() if n]
+        return specs + ([ParameterSpec("sh_rest", (rest, C), 2e-3, _zero_time_colours(rest, C))] if rest else [])
 
     def _term_counts(self) -> list[tuple[str, int]]:
         return list(zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True))
@@ -123,5 +123,5 @@ class TimeHarmonics(ColourField):
         return Constant(sh.sh_colors(geometry.means, dc, rest, camera.position, self.active))
 
 
-def _zeros(terms: int, channels: int) -> Any:
+def _zero_time_colours(terms: int, channels: int) -> Any:
     return lambda ctx: torch.zeros(ctx.count, terms, channels)

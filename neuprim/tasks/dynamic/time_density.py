@@ -37,7 +37,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
-from neuprim.tasks.dynamic.time_kernels import apply_window, move_means, rows_in_window
+from neuprim.tasks.dynamic.time_kernels import apply_time_window, move_means, rows_in_time_window
 
 TIME_PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
@@ -57,7 +57,7 @@ def get_frame_time(conditions: Conditions) -> Tensor:
     return conditions["time"].detach().double().reshape(())
 
 
-def validate_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
+def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
     """Overlaps as tuples. Raises ValueError unless they are pairs of ascending times, one after the other."""
     try:
         overlaps = tuple((float(begin), float(end)) for begin, end in seams)
@@ -69,7 +69,7 @@ def validate_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
     return overlaps
 
 
-def chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
+def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
     """Weights 0 to 1 at time ``xi`` () of primitives of these chunks, float64 in the shape of ``chunk``.
 
     Args:
@@ -117,7 +117,7 @@ class TimeDensity(DensityField):
         self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
         self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in TIME_PARTS if p in parts) or "none", frozenset(parts)
-        self.seams = validate_chunk_overlaps(seams)
+        self.seams = validate_time_chunk_overlaps(seams)
         if isinstance(components, str) or not all(isinstance(name, str) and name.isidentifier() for name in components):
             raise ValueError(f"components {components!r}; expected a list of names")
         self.named = tuple(components)
@@ -141,15 +141,17 @@ class TimeDensity(DensityField):
         if "phase" in self.parts:
             specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=c.number("rate", 0.1))))
         if "offset" in self.parts:
-            specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zeros(OFFSET_TERMS)) for name in _OFFSETS]
+            specs += [
+                ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zero_time_parameters(OFFSET_TERMS)) for name in _OFFSETS
+            ]
         if "window" in self.parts:
-            specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_center))
-            specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_window))
+            specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_time_window_center))
+            specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_time_window))
         if "motion" in self.parts:
-            specs += [ParameterSpec(name, (3,), 1e-2, _zeros(3), lr_unit="extent") for name in _MOTION]
+            specs += [ParameterSpec(name, (3,), 1e-2, _zero_time_parameters(3), lr_unit="extent") for name in _MOTION]
         if self.seams:
-            specs.append(ParameterSpec("chunk", (1,), 0.0, _zeros(1)))
-        specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zeros(1)) for name in self.named]
+            specs.append(ParameterSpec("chunk", (1,), 0.0, _zero_time_parameters(1)))
+        specs += [ParameterSpec(_SHARE + name, (1,), 0.3, _zero_time_parameters(1)) for name in self.named]
         return specs
 
     def components(self, params: Params) -> dict[str, Tensor]:
@@ -167,9 +169,9 @@ class TimeDensity(DensityField):
             return None
         xi, rows = get_frame_time(conditions), None
         if "window" in self.parts:
-            rows = rows_in_window(params["window_center"], params["log_window"], xi)
+            rows = rows_in_time_window(params["window_center"], params["log_window"], xi)
         if self.seams:
-            counts = chunk_weights(params["chunk"], self.seams, xi)[:, 0] > 0
+            counts = time_chunk_weights(params["chunk"], self.seams, xi)[:, 0] > 0
             rows = counts.nonzero()[:, 0] if rows is None else rows[counts[rows]]
         return rows
 
@@ -186,7 +188,7 @@ class TimeDensity(DensityField):
         xi = get_frame_time(conditions)
         b1 = params["b1"]
         if "phase" in self.parts:
-            b1 = _advance_phase(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)
+            b1 = _advance_phase_in_time(b1, params["W_t"], xi, 2 * math.pi / self.static.omega0)
         changed = dict(params)
         if "offset" in self.parts:
             angle = math.pi * xi * torch.arange(1, OFFSET_TERMS + 1, dtype=torch.float64, device=xi.device)
@@ -196,9 +198,9 @@ class TimeDensity(DensityField):
             changed["b2"] = b2 + (cosines + sines)[:, None]
         w2, b2 = apply_density_gain(changed["w2"], changed["b2"], changed.get("log_gain"))
         if "window" in self.parts:
-            w2, b2 = apply_window(w2, b2, params["window_center"], params["log_window"], xi)
+            w2, b2 = apply_time_window(w2, b2, params["window_center"], params["log_window"], xi)
         if self.seams:
-            weight = chunk_weights(params["chunk"], self.seams, xi).to(b2)
+            weight = time_chunk_weights(params["chunk"], self.seams, xi).to(b2)
             w2, b2 = w2 * weight, b2 * weight
         return Cosine(params["W1"], b1, w2, b2, self.static.omega0, self.static.edge)
 
@@ -283,24 +285,24 @@ class TimeDensity(DensityField):
         return scaled
 
 
-def _advance_phase(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
+def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
     """b1 + xi W_t without whole turns of 2 pi/omega0; float32-exact also for times far outside 0..1."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
 
-def _zeros(width: int) -> Any:
+def _zero_time_parameters(width: int) -> Any:
     return lambda ctx: torch.zeros(ctx.count, width)
 
 
-def _initial_center(ctx: InitContext) -> Tensor:
+def _initial_time_window_center(ctx: InitContext) -> Tensor:
     """The starting point's time, else a random one, evenly distributed over the sequence."""
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
     return (ctx.uniform(1) + 1) / 2
 
 
-def _initial_log_window(ctx: InitContext) -> Tensor:
+def _initial_log_time_window(ctx: InitContext) -> Tensor:
     """Limit new windows to a number of frames: a longer sequence shows more events, not longer ones."""
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
@@ -321,15 +323,20 @@ def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float
     cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of e^(i xi a). A window leaves its mean
     factor, a motion its mean position. The dropped part's own tensors are still in the result.
     """
-    changes = {"phase": _mean_phase, "offset": _mean_offset, "window": _mean_window, "motion": _mean_motion}
+    changes = {
+        "phase": _mean_phase_over_time,
+        "offset": _mean_offset_over_time,
+        "window": _mean_time_window,
+        "motion": _mean_motion_over_time,
+    }
     return {**params, **changes[part](params, geometry, omega0)}
 
 
-def _mean_times(like: Tensor) -> Tensor:
+def _sequence_mean_times(like: Tensor) -> Tensor:
     return (torch.arange(_MEAN_TIMES, dtype=torch.float64, device=like.device) + 0.5) / _MEAN_TIMES
 
 
-def _window_factor(params: Params, xi: Tensor) -> Tensor:
+def _time_window_factor(params: Params, xi: Tensor) -> Tensor:
     """(N, 1) factors of the windows at a time."""
     u = (xi - params["window_center"].double()) / params["log_window"].double().exp()
     return (1 - u * u).clamp_min(0.0).square()
@@ -337,11 +344,11 @@ def _window_factor(params: Params, xi: Tensor) -> Tensor:
 
 def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
     """(time, (N, 1) weights), which add up to 1."""
-    times = _mean_times(params["b1"])
+    times = _sequence_mean_times(params["b1"])
     if "window_center" not in params:
         even = torch.full_like(params["b2"].double(), 1.0 / _MEAN_TIMES)
         return [(xi, even) for xi in times]
-    factors = [_window_factor(params, xi) for xi in times]
+    factors = [_time_window_factor(params, xi) for xi in times]
     total = torch.stack(factors).sum(0)
     active = total > 0
     divisor = total.where(active, torch.ones_like(total))
@@ -349,7 +356,7 @@ def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
     return list(zip(times, weights, strict=True))
 
 
-def _mean_phase(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+def _mean_phase_over_time(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
     advance = omega0 * params["W_t"].double()
     real, imaginary = torch.zeros_like(advance), torch.zeros_like(advance)
     for xi, weight in _time_weights(params):
@@ -360,7 +367,7 @@ def _mean_phase(params: Params, geometry: Geometry, omega0: float) -> dict[str, 
     return {"b1": b1.to(params["b1"]), "w2": w2.to(params["w2"])}
 
 
-def _mean_offset(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+def _mean_offset_over_time(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
     cosines, sines = params["offset_cos"].double(), params["offset_sin"].double()
     order = math.pi * torch.arange(1, cosines.shape[1] + 1, dtype=torch.float64, device=cosines.device)
     b2 = params["b2"].double()
@@ -369,8 +376,8 @@ def _mean_offset(params: Params, geometry: Geometry, omega0: float) -> dict[str,
     return {"b2": b2.to(params["b2"])}
 
 
-def _mean_window(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
-    mean = torch.stack([_window_factor(params, xi) for xi in _mean_times(params["b1"])]).mean(0)
+def _mean_time_window(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+    mean = torch.stack([_time_window_factor(params, xi) for xi in _sequence_mean_times(params["b1"])]).mean(0)
     names = [name for name in ("w2", "b2", *_OFFSETS) if name in params]
     faded = {name: (params[name].double() * mean).to(params[name]) for name in names}
     if "velocity" not in params:
@@ -382,7 +389,7 @@ def _mean_window(params: Params, geometry: Geometry, omega0: float) -> dict[str,
     return {**faded, "means": means.to(geometry.means), "velocity": moved}
 
 
-def _mean_motion(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+def _mean_motion_over_time(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
     velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
     center = params["window_center"].double() if "window_center" in params else _MIDDLE
     means = geometry.means.double()

@@ -18,7 +18,7 @@ WINDOW_EDGE = 2  # exponent of the window in time
 
 
 @exact_kernel
-def _rows_in_window(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
+def _rows_in_time_window(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
     """Write the rows to the start of ``rows``; returns their number."""
     count = 0
     for n in range(center.shape[0]):
@@ -28,17 +28,17 @@ def _rows_in_window(center, log_window, xi, rows):  # type: ignore[no-untyped-de
     return count
 
 
-def rows_in_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
+def rows_in_time_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
     """Ascending int64 rows of (N, 1) tensors with abs(xi - center) < exp(log_window), in float64; no gradient."""
     center, log_window = center.detach(), log_window.detach()
     if not device.on_numba(center, log_window):
         return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
     rows = np.empty(len(center), np.int64)
-    count = _rows_in_window(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
+    count = _rows_in_time_window(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
     return torch.from_numpy(rows[:count])
 
 
-class _Window(torch.autograd.Function):
+class _TimeWindow(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor
@@ -59,7 +59,7 @@ class _Window(torch.autograd.Function):
         return g_w2, g_b2, -g_u / tau, -g_u * u, None
 
 
-def apply_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
+def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
     """(w2, b2) (N, K) and (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
 
     ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
@@ -67,12 +67,12 @@ def apply_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi:
     if not device.on_numba(w2, b2, center, log_window):
         weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
         return w2 * weight, b2 * weight
-    result: tuple[Tensor, Tensor] = apply_autograd(_Window, w2, b2, center, log_window, xi)
+    result: tuple[Tensor, Tensor] = apply_autograd(_TimeWindow, w2, b2, center, log_window, xi)
     return result
 
 
 @exact_kernel
-def _move_backward(velocity, acceleration, since, pulled, g_velocity, g_acceleration, g_center):  # type: ignore[no-untyped-def]
+def _move_in_time_backward(velocity, acceleration, since, pulled, g_velocity, g_acceleration, g_center):  # type: ignore[no-untyped-def]
     for n in range(since.shape[0]):
         total = 0.0
         for j in range(3):
@@ -82,7 +82,7 @@ def _move_backward(velocity, acceleration, since, pulled, g_velocity, g_accelera
         g_center[n, 0] = -total
 
 
-class _Move(torch.autograd.Function):
+class _MoveInTime(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:  # type: ignore[override]
         since = xi.to(velocity) - center
@@ -94,7 +94,7 @@ class _Move(torch.autograd.Function):
         velocity, acceleration, since = ctx.saved_tensors
         made = [torch.empty(x.shape, dtype=x.dtype) for x in (velocity, acceleration, since)]
         given = (x.detach().contiguous().numpy() for x in (velocity, acceleration, since, pulled))
-        _move_backward(*given, *(x.numpy() for x in made))
+        _move_in_time_backward(*given, *(x.numpy() for x in made))
         return pulled, *made, None
 
 
@@ -107,5 +107,5 @@ def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Te
     if not device.on_numba(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center
         return means + (velocity + acceleration * since) * since
-    moved: Tensor = apply_autograd(_Move, means, velocity, acceleration, center, xi)
+    moved: Tensor = apply_autograd(_MoveInTime, means, velocity, acceleration, center, xi)
     return moved

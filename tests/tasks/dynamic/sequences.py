@@ -10,7 +10,7 @@ import numpy as np
 from neuprim.core.data import Dataset
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.task import SceneContext
-from neuprim.tasks.dynamic import recording_of
+from neuprim.tasks.dynamic import vdb_recording_of
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.capture_dataset import VolumeRecording
 from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
@@ -56,6 +56,6 @@ def dataset(folder: Path, tmp_path: Path, **changes: Any) -> Dataset:
 
 def recorded(data: Dataset) -> VolumeRecording:
     """What its images were rendered from."""
-    found = recording_of(data)
+    found = vdb_recording_of(data)
     assert found is not None
     return found

@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.runs.open import load_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic import TASK, parse_time
+from neuprim.tasks.dynamic import TASK, parse_dynamic_time
 from tests.reports import offered
 from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
@@ -104,7 +104,7 @@ def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: p
 @pytest.mark.parametrize("text", ["2", "-0.1", "nan", "a", "0:1", ""])
 def test_impossible_times(text: str) -> None:
     with pytest.raises(ConfigError, match=r"expected a time in 0\.\.1"):
-        parse_time(text)
+        parse_dynamic_time(text)
 
 
 def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(files: Path, tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Models join_chunks from chunks of a sequence: what counts when, exactly; and what is done with such a model."""
+"""Models joined from chunks of a sequence: what counts when, exactly; and what is done with such a model."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.volumes.points import volume_values_at
 from neuprim.tasks.dynamic import TASK
-from neuprim.tasks.dynamic.time_density import TimeDensity, chunk_weights, validate_chunk_overlaps
-from neuprim.tasks.dynamic.volume.volume_scene import join_chunks
+from neuprim.tasks.dynamic.time_density import TimeDensity, time_chunk_weights, validate_time_chunk_overlaps
+from neuprim.tasks.dynamic.volume.volume_scene import join_time_chunks
 from tests import scenes
 from tests.timed_models import model
 
@@ -45,21 +45,21 @@ def three(time: str = "phase+window+motion") -> list[Primitives]:
     return models
 
 
-# ---------------------------------------------------------------- chunk_weights
+# ---------------------------------------------------------------- weights of chunks
 
 
 def test_shares_add_up_to_one_at_every_time_and_at_most_two_count() -> None:
     for time in torch.linspace(-0.5, 1.5, 401, dtype=torch.float64):
-        own = chunk_weights(CHUNKS, SEAMS, time)[:, 0]
+        own = time_chunk_weights(CHUNKS, SEAMS, time)[:, 0]
         assert float(own.sum()) == pytest.approx(1.0, abs=1e-15) and int((own > 0).sum()) <= 2
 
 
 def test_a_chunk_is_all_or_nothing_at_the_frames_beside_a_seam() -> None:
     for (begin, end), chunk in zip(SEAMS, range(2), strict=True):
         for time, expected in ((begin, chunk), (end, chunk + 1)):
-            weights = chunk_weights(CHUNKS, SEAMS, torch.tensor(time))[:, 0].tolist()
+            weights = time_chunk_weights(CHUNKS, SEAMS, torch.tensor(time))[:, 0].tolist()
             assert weights == [float(c == expected) for c in range(3)]
-    assert chunk_weights(CHUNKS, SEAMS, torch.tensor(0.3125))[:, 0].tolist() == [0.5, 0.5, 0.0]
+    assert time_chunk_weights(CHUNKS, SEAMS, torch.tensor(0.3125))[:, 0].tolist() == [0.5, 0.5, 0.0]
 
 
 @pytest.mark.parametrize(
@@ -67,7 +67,7 @@ def test_a_chunk_is_all_or_nothing_at_the_frames_beside_a_seam() -> None:
 )
 def test_other_seams_are_refused(wrong: object) -> None:
     with pytest.raises(ValueError, match="expected pairs of"):
-        validate_chunk_overlaps(wrong)  # type: ignore[arg-type]
+        validate_time_chunk_overlaps(wrong)  # type: ignore[arg-type]
 
 
 # ---------------------------------------------------------------- joining
@@ -76,10 +76,10 @@ def test_other_seams_are_refused(wrong: object) -> None:
 @pytest.mark.parametrize("time", ["phase", "window+motion", "phase+offset+window+motion"])
 def test_a_joined_field_is_the_sum_of_the_chunks_by_their_shares(time: str) -> None:
     models = three(time=time)
-    whole = join_chunks(models, [0, 1, 2], SEAMS)
+    whole = join_time_chunks(models, [0, 1, 2], SEAMS)
     points = torch.rand((200, 3), generator=torch.Generator().manual_seed(5)) - 0.5
     for moment in TIMES:
-        own = chunk_weights(CHUNKS, SEAMS, torch.tensor(moment))[:, 0]
+        own = time_chunk_weights(CHUNKS, SEAMS, torch.tensor(moment))[:, 0]
         parts = [_sums(m, points, moment) for m in models]
         found = _sums(whole, points, moment)
         assert float(found.abs().max()) > 0
@@ -95,7 +95,7 @@ def _sums(m: Primitives, points: Tensor, time: float) -> Tensor:
 
 def test_a_frame_of_one_chunk_is_that_chunks_own_image_to_the_bit() -> None:
     models = three()
-    whole, camera = join_chunks(models, [0, 1, 2], SEAMS), scenes.camera()
+    whole, camera = join_time_chunks(models, [0, 1, 2], SEAMS), scenes.camera()
     for moment, chunk in ((0.0, 0), (0.25, 0), (0.375, 1), (0.625, 1), (0.75, 2), (1.0, 2)):
         expected = render(models[chunk], camera, at(moment)).rgb
         assert torch.equal(render(whole, camera, at(moment)).rgb, expected)
@@ -103,7 +103,7 @@ def test_a_frame_of_one_chunk_is_that_chunks_own_image_to_the_bit() -> None:
 
 
 def test_nothing_lives_where_its_chunk_has_seen_nothing_however_long_its_window() -> None:
-    whole = join_chunks(three(), [0, 1, 2], SEAMS)
+    whole = join_time_chunks(three(), [0, 1, 2], SEAMS)
     for moment in torch.linspace(0, 1, 101).tolist():
         alive = whole.density.active_rows(whole.of(whole.density), at(moment))
         assert alive is not None and len(alive)
@@ -116,7 +116,7 @@ def test_nothing_lives_where_its_chunk_has_seen_nothing_however_long_its_window(
 
 def test_a_chunk_that_holds_nothing_leaves_its_time_empty() -> None:
     first, _, last = three()
-    whole = join_chunks([first, last], [0, 2], SEAMS)
+    whole = join_time_chunks([first, last], [0, 2], SEAMS)
     alive = whole.density.active_rows(whole.of(whole.density), at(0.5))
     assert alive is not None and len(alive) == 0
     assert not bool(render(whole, scenes.camera(), at(0.5)).alpha.any())
@@ -124,17 +124,17 @@ def test_a_chunk_that_holds_nothing_leaves_its_time_empty() -> None:
 
 def test_models_of_other_forms_are_refused() -> None:
     with pytest.raises(ConfigError, match="different forms"):
-        join_chunks([three()[0], *three(time="window+motion")[1:]], [0, 1, 2], SEAMS)
-    whole = join_chunks(three(), [0, 1, 2], SEAMS)
+        join_time_chunks([three()[0], *three(time="window+motion")[1:]], [0, 1, 2], SEAMS)
+    whole = join_time_chunks(three(), [0, 1, 2], SEAMS)
     with pytest.raises(ConfigError, match="expected a TimeDensity without seams"):
-        join_chunks([whole, whole, whole], [0, 1, 2], SEAMS)
+        join_time_chunks([whole, whole, whole], [0, 1, 2], SEAMS)
 
 
 # ---------------------------------------------------------------- what is done with it
 
 
 def test_the_reference_agrees_and_labels_have_no_gradient() -> None:
-    whole, camera = join_chunks(three(), [0, 1, 2], SEAMS), scenes.camera()
+    whole, camera = join_time_chunks(three(), [0, 1, 2], SEAMS), scenes.camera()
     whole.params = {name: value.requires_grad_() for name, value in whole.params.items()}
     for moment in (0.3, 0.7):
         image = render(whole, camera, at(moment), RenderSettings(alpha_min=0.0, transmittance_min=0.0)).rgb
@@ -144,14 +144,14 @@ def test_the_reference_agrees_and_labels_have_no_gradient() -> None:
 
 
 def test_a_part_of_time_can_be_taken_away() -> None:
-    whole = join_chunks(three(), [0, 1, 2], SEAMS)
+    whole = join_time_chunks(three(), [0, 1, 2], SEAMS)
     field, fewer = whole.density.reduce(whole.of(whole.density), whole.geometry, "phase", 0)
     assert isinstance(field, TimeDensity) and field.seams == SEAMS
     assert torch.equal(fewer["chunk"], whole.params["chunk"])
 
 
 def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
-    whole = join_chunks(three(), [0, 1, 2], SEAMS)
+    whole = join_time_chunks(three(), [0, 1, 2], SEAMS)
     checkpoint.save_model(tmp_path / "model.safetensors", whole, "dynamic", {})
     again, _ = checkpoint.load_model(tmp_path / "model.safetensors", TASK)
     assert again.density.settings() == whole.density.settings()
@@ -161,7 +161,7 @@ def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
 def test_labels_survive_every_level_of_compression() -> None:
     count = 40
     seams = tuple((n / count, (n + 0.5) / count) for n in range(1, count))
-    whole = join_chunks([three()[0]] * count, range(count), seams)
+    whole = join_time_chunks([three()[0]] * count, range(count), seams)
     small = canonical_model(whole)
     for table in LEVELS.values():
         back = fake_quantize(small.params, fit_quantizers(small, table))["chunk"]

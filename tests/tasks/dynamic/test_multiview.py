@@ -17,7 +17,7 @@ from torch import Tensor
 from neuprim.core.data.hull import EmptyHull
 from neuprim.core.data.initial import box_starting_points
 from neuprim.core.io.exr import write_exr
-from neuprim.tasks.dynamic.multiview import load_multiview, sample_moving_points
+from neuprim.tasks.dynamic.multiview import load_moving_multiview, sample_moving_points
 
 SIZE, ANGLE, RADIUS, COLOR = 48, 0.7, 0.35, np.array([0.8, 0.4, 0.2])
 TIMES = [i / 11 for i in range(12)]
@@ -88,7 +88,7 @@ def rng(seed: int = 0) -> torch.Generator:
 
 
 def test_views_and_times(folder: Path, scenes: Any, context: Any) -> None:
-    data = load_multiview({"path": folder}, context)
+    data = load_moving_multiview({"path": folder}, context)
     assert (len(data.train), len(data.test), data.name, data.color_space) == (48, 5, "ball", "srgb")
     assert (data.data_source, data.up.tolist(), data.background.tolist()) == ("real", [0.0, 0.0, 1.0], [1.0] * 3)
     time = data.train.view(5).conditions["time"]
@@ -107,7 +107,7 @@ def test_views_and_times(folder: Path, scenes: Any, context: Any) -> None:
 
 def test_one_file_of_frames(tmp_path: Path, scenes: Any, context: Any) -> None:
     write(tmp_path, "", views(scenes), scenes)
-    data = load_multiview({"path": tmp_path, "test_every": 4}, context)
+    data = load_moving_multiview({"path": tmp_path, "test_every": 4}, context)
     assert (len(data.train), len(data.test)) == (36, 12)
     assert times_of(data.test) == [np.float32(t) for t in TIMES]
     document = json.loads((tmp_path / "transforms.json").read_text())
@@ -116,7 +116,7 @@ def test_one_file_of_frames(tmp_path: Path, scenes: Any, context: Any) -> None:
         frame["file_path"] += ".png"
         frame["fl_x"], frame["k1"] = 60.0, 1e-4  # the cameras of the nerfstudio loader, lenses included
     scenes.write_json(tmp_path / "transforms.json", document)
-    listed = load_multiview({"path": tmp_path}, context)
+    listed = load_moving_multiview({"path": tmp_path}, context)
     assert (len(listed.train), len(listed.test), listed.test.view(0).camera.fx) == (47, 1, 60.0)
     assert listed.train.pixels(0).mask is not None
 
@@ -124,7 +124,7 @@ def test_one_file_of_frames(tmp_path: Path, scenes: Any, context: Any) -> None:
 def test_exr_is_linear_and_premultiplied(tmp_path: Path, scenes: Any, context: Any) -> None:
     for split in ("train", "test"):
         write(tmp_path, split, views(scenes)[:8], scenes, exr=True)
-    data = load_multiview({"path": tmp_path}, context)
+    data = load_moving_multiview({"path": tmp_path}, context)
     pixels = data.train.pixels(3)
     assert data.color_space == "linear" and pixels.alpha is not None
     assert torch.allclose(pixels.rgb, 2.0 * torch.tensor(COLOR).float() * pixels.alpha[..., None], atol=1e-3)
@@ -135,25 +135,35 @@ def test_exr_is_linear_and_premultiplied(tmp_path: Path, scenes: Any, context: A
 def test_frame_numbers_become_times(folder: Path, scenes: Any, context: Any) -> None:
     edit(folder / "transforms_train.json", lambda frames: [f.update(time=10 + i // 4) for i, f in enumerate(frames)])
     edit(folder / "transforms_test.json", lambda frames: [f.update(time=8 + i) for i, f in enumerate(frames)])
-    data = load_multiview({"path": folder, "time_range": "auto"}, context)
+    data = load_moving_multiview({"path": folder, "time_range": "auto"}, context)
     assert times_of(data.train) == [np.float32((2 + i // 4) / 13) for i in range(48)]
     assert times_of(data.test) == [np.float32(i / 13) for i in range(5)]
-    ranged = load_multiview({"path": folder, "time_range": "-2:38"}, context)
+    ranged = load_moving_multiview({"path": folder, "time_range": "-2:38"}, context)
     assert times_of(ranged.test) == [np.float32((10 + i) / 40) for i in range(5)]
     # not in use, yet part of the scene's clock
     write(folder, "val", [(scenes.opengl_pose((0.0, -3.0, 1.0)), 28)], scenes)
-    assert times_of(load_multiview({"path": folder, "time_range": "auto"}, context).test)[1] == np.float32(1 / 20)
-    assert times_of(load_multiview({"path": folder, "time_range": "auto", "test_split": "val"}, context).test) == [1.0]
+    assert times_of(load_moving_multiview({"path": folder, "time_range": "auto"}, context).test)[1] == np.float32(
+        1 / 20
+    )
+    assert times_of(
+        load_moving_multiview({"path": folder, "time_range": "auto", "test_split": "val"}, context).test
+    ) == [1.0]
 
 
 def test_files_that_are_missing(folder: Path, scenes: Any, context: Any) -> None:
-    scenes.refused(load_multiview, {"path": folder, "test_split": "late"}, context, "transforms_late.json", "not found")
+    scenes.refused(
+        load_moving_multiview, {"path": folder, "test_split": "late"}, context, "transforms_late.json", "not found"
+    )
     (folder / "train" / "r_007.png").unlink()
-    scenes.refused(load_multiview, {"path": folder}, context, "1 files not found", "train/r_007")
+    scenes.refused(load_moving_multiview, {"path": folder}, context, "1 files not found", "train/r_007")
     for split in ("train", "test"):
         (folder / f"transforms_{split}.json").unlink()
     scenes.refused(
-        load_multiview, {"path": folder}, context, str(folder), "neither transforms_train.json nor transforms.json"
+        load_moving_multiview,
+        {"path": folder},
+        context,
+        str(folder),
+        "neither transforms_train.json nor transforms.json",
     )
 
 
@@ -162,7 +172,7 @@ def test_a_scene_without_times_is_static(folder: Path, scenes: Any, context: Any
         edit(folder / f"transforms_{split}.json", lambda frames: [f.pop("time") for f in frames])
     for setting in ("0:1", "auto"):
         words = ("transforms_train.json: no frame has a time", "task=static")
-        scenes.refused(load_multiview, {"path": folder, "time_range": setting}, context, *words)
+        scenes.refused(load_moving_multiview, {"path": folder, "time_range": setting}, context, *words)
 
 
 @pytest.mark.parametrize(
@@ -181,12 +191,12 @@ def test_times_that_are_none(
     change = {} if value == "absent" else {"time": value}
     edit(folder / "transforms_test.json", lambda frames: (frames[3].pop("time"), frames[3].update(change)))
     where = ("transforms_test.json: frames[3]", "./test/r_003")
-    scenes.refused(load_multiview, {"path": folder, "time_range": setting}, context, *where, *words)
+    scenes.refused(load_moving_multiview, {"path": folder, "time_range": setting}, context, *where, *words)
 
 
 def test_times_out_of_range(folder: Path, scenes: Any, context: Any) -> None:
     scenes.refused(
-        load_multiview,
+        load_moving_multiview,
         {"path": folder, "time_range": "0:0.5"},
         context,
         "transforms_train.json: frames[24]",
@@ -196,12 +206,12 @@ def test_times_out_of_range(folder: Path, scenes: Any, context: Any) -> None:
         edit(folder / "transforms_train.json", lambda frames, value=value: frames[5].update(time=value))  # type: ignore[misc]
         place = ["transforms_train.json: frames[5]", "./train/r_005"]
         words = [*place, f"time is {value}", "from 0 to 1", "scene.time_range"]
-        scenes.refused(load_multiview, {"path": folder}, context, *words)
-        load_multiview({"path": folder, "time_range": "auto"}, context)
+        scenes.refused(load_moving_multiview, {"path": folder}, context, *words)
+        load_moving_multiview({"path": folder, "time_range": "auto"}, context)
     for split in ("train", "test"):
         edit(folder / f"transforms_{split}.json", lambda frames: [f.update(time=3) for f in frames])
     scenes.refused(
-        load_multiview,
+        load_moving_multiview,
         {"path": folder, "time_range": "auto"},
         context,
         "every frame has the time 3",
@@ -229,7 +239,7 @@ def beside(means: Tensor) -> float:
 
 
 def test_starting_points_cover_the_ball_at_all_times(folder: Path, context: Any) -> None:
-    data = load_multiview({"path": folder}, context)
+    data = load_moving_multiview({"path": folder}, context)
     points = data.initial_points(2000, rng(1))
     assert points.means.shape == (2000, 3) == points.colors.shape and len(points.means.unique(dim=0)) == 2000
     assert min(covered(points.means, 0.35 * RADIUS)) > 0.98 and beside(points.means) < 0.05
@@ -248,7 +258,7 @@ def test_a_camera_that_jumps_gives_points_where_the_ball_passes(tmp_path: Path, 
     eyes = 3.5 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
     write(tmp_path, "train", [(scenes.opengl_pose(tuple(eye)), i / 59) for i, eye in enumerate(eyes)], scenes)
     write(tmp_path, "test", [(scenes.opengl_pose((2.0, 2.0, 2.0)), 0.5)], scenes)
-    points = load_multiview({"path": tmp_path}, context).initial_points(1000, rng())
+    points = load_moving_multiview({"path": tmp_path}, context).initial_points(1000, rng())
     assert min(covered(points.means, RADIUS)) > 0.98 and beside(points.means) < 0.25
     assert len(points.conditions["time"].unique()) == 29, "runs of four images, half overlapping"
 
@@ -260,7 +270,7 @@ def test_what_rests_is_covered_evenly(tmp_path: Path, scenes: Any, context: Any)
     write(tmp_path, "test", still[:1], scenes)
     file = tmp_path / "transforms_train.json"
     edit(file, lambda frames: [f.update(time=TIMES[i // 4]) for i, f in enumerate(frames)])
-    points = load_multiview({"path": tmp_path}, context).initial_points(400, rng())
+    points = load_moving_multiview({"path": tmp_path}, context).initial_points(400, rng())
     gaps = torch.cdist(points.means, points.means).fill_diagonal_(9.0).min(dim=1).values
     assert gaps.quantile(0.05) > 0.3 * gaps.median() and len(set(points.conditions["time"].tolist())) == 12
 
@@ -268,9 +278,9 @@ def test_what_rests_is_covered_evenly(tmp_path: Path, scenes: Any, context: Any)
 def test_photographs_start_in_a_box_at_random_times(folder: Path, scenes: Any, context: Any) -> None:
     for file in [*folder.glob("train/*.png"), *folder.glob("test/*.png")]:
         scenes.save(file, np.full((SIZE, SIZE), 0.25))
-    points = load_multiview({"path": folder}, context).initial_points(500, rng())
+    points = load_moving_multiview({"path": folder}, context).initial_points(500, rng())
     assert torch.equal(
-        points.means, box_starting_points(load_multiview({"path": folder}, context).train, 500, rng()).means
+        points.means, box_starting_points(load_moving_multiview({"path": folder}, context).train, 500, rng()).means
     )
     assert sorted(set(points.conditions["time"].tolist())) == [np.float32(t) for t in TIMES]
 
@@ -280,10 +290,10 @@ def test_moments_without_matter_give_no_points_and_masks_that_disagree_are_named
 ) -> None:
     for i in range(8):  # the first two times show nothing yet
         scenes.save(folder / "train" / f"r_{i:03d}.png", np.zeros((SIZE, SIZE, 4)))
-    points = load_multiview({"path": folder}, context).initial_points(400, rng())
+    points = load_moving_multiview({"path": folder}, context).initial_points(400, rng())
     assert min(points.conditions["time"].tolist()) == pytest.approx(TIMES[2])
     for i in range(8, 48):
         scenes.save(folder / "train" / f"r_{i:03d}.png", np.zeros((SIZE, SIZE, 4)))
-    data = load_multiview({"path": folder}, context)
+    data = load_moving_multiview({"path": folder}, context)
     with pytest.raises(EmptyHull, match="4 alpha masks is empty"):
         sample_moving_points(data.train, 10, rng())

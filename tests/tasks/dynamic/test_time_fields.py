@@ -19,7 +19,7 @@ from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import RelocatePopulation, split_primitives
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.tasks.dynamic import TASK, invisible_fraction
+from neuprim.tasks.dynamic import TASK, invisible_fraction_over_time
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TIME_PARTS, TimeDensity
 from tests import scenes
@@ -241,7 +241,7 @@ def test_invisible_primitives_are_counted() -> None:
     m.params = params
     params["log_scales"][:] = math.log(0.3)
     times = [torch.tensor(t) for t in torch.linspace(0, 1, 50).tolist()]
-    assert invisible_fraction(m, times) == pytest.approx(5 / COUNT)
+    assert invisible_fraction_over_time(m, times) == pytest.approx(5 / COUNT)
 
 
 @pytest.mark.parametrize(

@@ -11,7 +11,7 @@ from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.tasks.dynamic.time_kernels import apply_window, move_means, rows_in_window
+from neuprim.tasks.dynamic.time_kernels import apply_time_window, move_means, rows_in_time_window
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
@@ -68,7 +68,7 @@ def test_windows_forward_and_backward(dtype: torch.dtype, tolerance: float, case
         log_window = 0 * log_window + torch.tensor(0.3, dtype=dtype).log()
     mine = [x.detach().requires_grad_() for x in (w2, b2, center, log_window)]
     exact = [x.detach().double().requires_grad_() for x in mine]
-    found, wanted = list(apply_window(*mine, xi)), list(windowed(*exact, xi))
+    found, wanted = list(apply_time_window(*mine, xi)), list(windowed(*exact, xi))
     assert all(torch.equal(a, b) for a, b in zip(found, windowed(*mine, xi), strict=True))
     if case == "at the edge":
         found, wanted = found[1:], wanted[1:]
@@ -102,15 +102,15 @@ def test_rows_in_their_windows(dtype: torch.dtype) -> None:
         time = torch.tensor(xi, dtype=torch.float64)
         wanted = [n for n in range(40) if abs(xi - float(center[n])) < float(log_window[n].double().exp())]
         for given in ((center, log_window), (wide[:, :1], wide[:, 1:])):
-            rows = rows_in_window(*given, time)
+            rows = rows_in_time_window(*given, time)
             assert rows.dtype == torch.int64 and rows.tolist() == wanted
-    assert rows_in_window(center[:2], log_window[:2], torch.tensor(0.25)).tolist() == [1]
-    assert rows_in_window(center[:0], log_window[:0], torch.tensor(0.25)).tolist() == []
+    assert rows_in_time_window(center[:2], log_window[:2], torch.tensor(0.25)).tolist() == [1]
+    assert rows_in_time_window(center[:0], log_window[:0], torch.tensor(0.25)).tolist() == []
 
 
 def test_without_a_gradient_the_same_numbers() -> None:
     xi = torch.tensor(0.37, dtype=torch.float64)
-    for operation, widths in ((apply_window, (2, 1, 1, 1)), (move_means, (3, 3, 3, 1))):
+    for operation, widths in ((apply_time_window, (2, 1, 1, 1)), (move_means, (3, 3, 3, 1))):
         plain = draw(4, torch.float32, *widths)
         asked = operation(*[x.clone().requires_grad_() for x in plain], xi)  # type: ignore[operator]
         with torch.no_grad():

@@ -18,9 +18,9 @@ from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume.volume_scene import (
     MAX_FRAMES,
     MIN_FRAMES,
-    count_chunks,
+    count_time_chunks,
     open_volume_source,
-    split_into_chunks,
+    split_into_time_chunks,
 )
 from tests.tasks.dynamic.sequences import dataset, empty_frame, recorded, write_blobs
 
@@ -46,7 +46,7 @@ def cache(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def chunks(folder: Path, cache: Path, *words: str) -> Chunks | None:
     config = config_of(folder, *words)
-    return split_into_chunks(config, SceneContext(0, cache / "cache"))
+    return split_into_time_chunks(config, SceneContext(0, cache / "cache"))
 
 
 def config_of(folder: Path, *words: str) -> dict[str, Any]:
@@ -75,7 +75,7 @@ def config_of(folder: Path, *words: str) -> dict[str, Any]:
 def test_the_number_follows_from_frames_and_memory(
     requested: int | str | None, frames: int, images: int, expected: int
 ) -> None:
-    assert count_chunks(requested, frames, images, 1) == expected
+    assert count_time_chunks(requested, frames, images, 1) == expected
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_the_number_follows_from_frames_and_memory(
 )
 def test_more_than_the_frames_allow_is_refused(requested: int, frames: int, message: str) -> None:
     with pytest.raises(ConfigError, match=f"scene.chunks={requested}: .*{message}"):
-        count_chunks(requested, frames, 0, 1)
+        count_time_chunks(requested, frames, 0, 1)
 
 
 # ---------------------------------------------------------------- which frames

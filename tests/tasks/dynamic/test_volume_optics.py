@@ -1,4 +1,4 @@
-"""Looks, black bodies, shadows, normalisation and the hemisphere_cameras of cameras."""
+"""Looks, black bodies, shadows, normalisation and the hemisphere_capture_cameras of cameras."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import read_grid, scale_transform, vdb_sequence, write_vdb
-from neuprim.tasks.dynamic.volume.capture import hemisphere_cameras
+from neuprim.tasks.dynamic.volume.capture import hemisphere_capture_cameras
 from neuprim.tasks.dynamic.volume.optics import (
     EMBERGEN_FIRE,
     OPTICS_PRESETS,
@@ -25,7 +25,7 @@ from neuprim.tasks.dynamic.volume.optics import (
     build_medium,
 )
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, render_medium
-from neuprim.tasks.dynamic.volume.survey import SceneNormalisation
+from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
 from tests.core.io.vdb.vdb_bytes import real_folder
 from tests.tasks.dynamic.volumes import grid_of, march_slowly, ragged, rotation
 
@@ -137,7 +137,7 @@ def test_grids_of_other_resolutions_meet_in_the_world() -> None:
     assert a.values.shape == b.values.shape and np.abs(a.values - b.values).max() < 0.02 * a.values.max()
     assert np.abs(a.values - b.values)[..., 0].max() < 0.003 * a.values[..., 0].max()
     tall = Optics(gradient=((1.0, 0.0, 0.0), (0.0, 0.0, 1.0)), ambient=(1.0, 1.0, 1.0), color_grid="color")
-    high = build_medium({"density": density}, tall, SceneNormalisation((0.5, 0.5, 0.5), 1.0).matrix()).values[
+    high = build_medium({"density": density}, tall, CaptureNormalisation((0.5, 0.5, 0.5), 1.0).matrix()).values[
         12, 12, 1:-1
     ]
     assert np.allclose(high[:, 3] / high[:, 0], where[0], atol=1e-5)
@@ -157,13 +157,13 @@ def test_normalisation(tmp_path: Path) -> None:
         write_vdb(tmp_path / f"f_{number}.vdb", [grid])
     boxes = [b for f in vdb_sequence(tmp_path).frames if (b := read_grid(f.path, "density").world_bounds()) is not None]
     bounds = np.stack([np.min(boxes, 0)[0], np.max(boxes, 0)[1]])
-    norm = SceneNormalisation.from_bounds(bounds)
+    norm = CaptureNormalisation.from_bounds(bounds)
     scene = norm.to_scene(bounds)
     assert np.allclose(scene[0], -scene[1]) and (scene[1] - scene[0]).max() == pytest.approx(1.0)
     points = np.random.default_rng(0).normal(size=(4, 3))
     assert np.allclose(norm.matrix()[:3, :3] @ points[0] + norm.matrix()[:3, 3], norm.to_scene(points[0]))
     with pytest.raises(DataError, match="volume"):
-        SceneNormalisation.from_bounds(np.zeros((2, 3)))
+        CaptureNormalisation.from_bounds(np.zeros((2, 3)))
 
 
 def test_extinction_is_per_scene_unit() -> None:
@@ -174,9 +174,9 @@ def test_extinction_is_per_scene_unit() -> None:
         grid = grid_of("density", cloud, scale_transform(size / 8, (size, 0.0, -size)))
         bounds = grid.world_bounds()
         assert bounds is not None
-        place = SceneNormalisation.from_bounds(bounds).matrix()
+        place = CaptureNormalisation.from_bounds(bounds).matrix()
         medium = build_medium({"density": grid}, OPTICS_PRESETS["dust_tornado"], place)
-        images.append(render_medium(medium, hemisphere_cameras(16)[1][0]))
+        images.append(render_medium(medium, hemisphere_capture_cameras(16)[1][0]))
     assert (images[0] - images[1]).abs().max() < 1e-6
 
 
@@ -188,11 +188,11 @@ def test_a_real_fire_converges() -> None:
     position = [f.number for f in fire.frames].index(40)
     grids = {n: read_grid(fire.frames[position].path, n) for n in ("temperature", "flames")}
     boxes = [g.world_bounds() for g in grids.values() if g is not None]
-    norm = SceneNormalisation.from_bounds(
+    norm = CaptureNormalisation.from_bounds(
         np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
     )  # type: ignore[index]
     medium = build_medium({n: g for n, g in grids.items() if g is not None}, EMBERGEN_FIRE, norm.matrix())
-    view = hemisphere_cameras(96)[1][0]
+    view = hemisphere_capture_cameras(96)[1][0]
     images = [render_medium(medium, view, subdivisions=n) for n in (1, 2, 4)]
     peak = images[-1][..., :3].max()
     assert (images[0] - images[1]).abs().max() < 5e-4 * peak and (images[1] - images[2]).abs().max() < 2e-4 * peak
@@ -202,7 +202,7 @@ def test_a_real_fire_converges() -> None:
 
 @pytest.mark.parametrize("up", ["y", "z"])
 def test_cameras_cover_the_upper_hemisphere(up: Axis) -> None:
-    train, test = hemisphere_cameras(64, 40, up=up, field_of_view=30.0)
+    train, test = hemisphere_capture_cameras(64, 40, up=up, field_of_view=30.0)
     assert (len(train), len(test)) == (38, 2)
     eyes = torch.stack([view.position for view in (*train, *test)]).double()
     heights = eyes[:, "xyz".index(up)] / 2.7

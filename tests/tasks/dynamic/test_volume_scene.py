@@ -17,10 +17,10 @@ from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume.capture_dataset import FrameViews, FrameVoxels, MediumVoxels
+from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels, VdbFrameViews
 from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
 from neuprim.tasks.dynamic.volume.optics import build_medium, optics_preset, override_optics
-from neuprim.tasks.dynamic.volume.survey import SceneNormalisation
+from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
 from neuprim.tasks.dynamic.volume.volume_scene import choose_volume_frames
 from tests.tasks.dynamic.sequences import (
     MIDDLE,
@@ -255,7 +255,7 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
         box = fine.world_bounds()
         assert box is not None
         grids = {"density": fine, "flames": coarse}
-        media.append(build_medium(grids, optics_preset("smoke_fire"), SceneNormalisation.from_bounds(box).matrix()))
+        media.append(build_medium(grids, optics_preset("smoke_fire"), CaptureNormalisation.from_bounds(box).matrix()))
     near, far = (m.values for m in media)
     assert near.shape == far.shape and np.allclose(near, far, atol=0.02 * float(near.max()))
 
@@ -354,7 +354,7 @@ def test_damaged_voxels_are_refused(change: dict[str, np.ndarray], tmp_path: Pat
 
 def test_memory_is_bounded_by_the_setting_whatever_the_length(hot: Path, tmp_path: Path, data: Dataset) -> None:
     def caches(data: Dataset) -> list[Any]:
-        assert isinstance(data.train, FrameViews) and isinstance(data.test, FrameViews)
+        assert isinstance(data.train, VdbFrameViews) and isinstance(data.test, VdbFrameViews)
         assert isinstance(data.points, FrameVoxels)
         return [data.train._images, data.test._images, data.points._voxels]
 

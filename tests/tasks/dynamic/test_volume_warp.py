@@ -16,7 +16,7 @@ from neuprim.core.data.dataset import SceneContext
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.tasks.dynamic.volume.capture_density import compare_extinction
+from neuprim.tasks.dynamic.volume.capture_density import compare_capture_extinction
 from neuprim.tasks.dynamic.volume.raymarch import render_medium
 from neuprim.tasks.dynamic.volume.volume_scene import open_volume_source
 from neuprim.tasks.static import SphericalHarmonics
@@ -73,9 +73,9 @@ def test_errors_of_a_model_are_the_processors(folder: Path, tmp_path: Path, monk
     times = {"time": torch.rand(30, generator=generator)}
     made = InitContext(means, torch.full((30,), 0.15), torch.zeros(30, 3), generator, conditions=times)
     model = Primitives.initialise(TimeDensity(2, "window+motion"), SphericalHarmonics(0), made)
-    wanted = compare_extinction(model, capture, [0.0, 0.5, 1.0])
+    wanted = compare_capture_extinction(model, capture, [0.0, 0.5, 1.0])
     on_blocks(monkeypatch)
-    found = compare_extinction(model, replace(capture), [0.0, 0.5, 1.0])
+    found = compare_capture_extinction(model, replace(capture), [0.0, 0.5, 1.0])
     assert len(wanted["sigma_frames"]) == 3 and abs(wanted["sigma_correlation_middle"]) > 0.05
     del wanted["sigma_frames"], found["sigma_frames"]
     assert found == pytest.approx(wanted, rel=1e-5)

@@ -32,7 +32,7 @@ from neuprim.core.notices import warn_once
 from neuprim.core.volumes.density_truth import GridExtent, Placement
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics, build_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
-from neuprim.tasks.dynamic.volume.survey import GridReader, SceneNormalisation
+from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
 RENDERER_VERSION = 2
 """Part of the cache's key: raise it with every change to the march, the optics, the cameras or the files' layout."""
@@ -65,7 +65,7 @@ class Capture:
     optics: Optics
     cameras: Sequence[Camera]
     samples: int
-    normalisation: SceneNormalisation
+    normalisation: CaptureNormalisation
     bounds: np.ndarray
     device: torch.device = hardware.HOST
     ends: tuple[int, int] | None = None
@@ -97,7 +97,7 @@ class Capture:
         optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
         parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation]
         parts += [self.device.type] * hardware.has_warp(self.device)
-        return hashlib.sha256(json.dumps(parts, default=_encode_plain).encode()).hexdigest()[:16]
+        return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
         """The medium of a frame's file; empty if the file lacks the grids that absorb in others."""
@@ -145,7 +145,7 @@ class Capture:
             "renderer_version": RENDERER_VERSION,
             "frames": [{"number": f.number, "file": str(f.path)} for f in self.frames],
             "grids": dict(self.reader.names),
-            "look": json.loads(json.dumps(asdict(self.optics), default=_encode_plain)),
+            "look": json.loads(json.dumps(asdict(self.optics), default=_encode_capture_value)),
             "cameras": len(self.cameras),
             "size": [self.cameras[0].width, self.cameras[0].height],
             "samples": self.samples,
@@ -197,14 +197,14 @@ def _sample_medium_points(medium: Medium, seed: int) -> dict[str, Any]:
     return {"means": means.astype(np.float32), "colors": colors.astype(np.float32), "weight": np.float64(total * cell)}
 
 
-def _encode_plain(value: Any) -> Any:
+def _encode_capture_value(value: Any) -> Any:
     return value.tolist() if hasattr(value, "tolist") else str(value)
 
 
 # ---------------------------------------------------------------- rendering all frames
 
 
-class RenderedFrames(DatasetImages):
+class CapturedVdbFrames(DatasetImages):
     """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
 
     A frame's folder appears when all of its files are written. So an interrupted run continues with the missing frames,
@@ -242,7 +242,7 @@ class RenderedFrames(DatasetImages):
         return [i for i, name in enumerate(self.frames) if name not in complete]
 
     def begin(self) -> None:
-        with _describe_write_errors(self.store):
+        with _describe_capture_write_errors(self.store):
             self.store.prepare()
 
     def make(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
@@ -255,11 +255,11 @@ class RenderedFrames(DatasetImages):
         def render(folder: Path) -> None:
             self.capture.render(self.capture.frames[frame], folder)
 
-        with _describe_write_errors(self.store):
+        with _describe_capture_write_errors(self.store):
             self.store.retry(lambda: self.store.write_folder(self.frames[frame], render, LAST_FILE), tell)
 
     def complete(self) -> None:
-        with _describe_write_errors(self.store):
+        with _describe_capture_write_errors(self.store):
             if not self.store.has_file(_SCENE_FILE):
                 self.store.write_file(_SCENE_FILE, lambda path: write_json(path, self.capture.describe()))
 
@@ -281,7 +281,7 @@ class RenderedFrames(DatasetImages):
 
 
 @contextmanager
-def _describe_write_errors(store: Store) -> Iterator[None]:
+def _describe_capture_write_errors(store: Store) -> Iterator[None]:
     """Turn errors of the disk into one line that names the store."""
     try:
         yield
@@ -304,7 +304,7 @@ _DISTANCE = 2.7  # of cameras from the origin, the centre of the box, scene unit
 _ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the highest camera
 
 
-def hemisphere_cameras(
+def hemisphere_capture_cameras(
     size: int, cameras: int = 40, *, up: str = "z", field_of_view: float = 27.0
 ) -> tuple[list[Camera], list[Camera]]:
     """Training cameras and two test cameras on a Fibonacci lattice over the upper hemisphere around the unit box.

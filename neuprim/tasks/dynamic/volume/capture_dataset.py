@@ -54,7 +54,7 @@ class _RecentFrames(Generic[T]):
         return item
 
 
-class FrameViews(ViewSet):
+class VdbFrameViews(ViewSet):
     """Frames of some cameras, camera by camera; half floats, decoded when first used.
 
     Args:
@@ -128,7 +128,7 @@ class VolumeRecording:
     exposure: float
     weights: Sequence[float]
     every: int
-    test: FrameViews
+    test: VdbFrameViews
     _masks: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
     def points(self, views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
@@ -145,7 +145,9 @@ class VolumeRecording:
         means, colors, times = [], [], []
         for t in np.flatnonzero(per_frame).tolist():
             wanted = per_frame[t]
-            stored = read_points_file(self.capture.fetch_points(self.folder, self.capture.frames[t]), "means", "colors")
+            stored = read_vdb_frame_points(
+                self.capture.fetch_points(self.folder, self.capture.frames[t]), "means", "colors"
+            )
             points = torch.from_numpy(stored["means"])
             rows = torch.randperm(len(points), generator=generator)[torch.arange(wanted) % len(points)]
             positions = points[rows]
@@ -195,7 +197,9 @@ def volume_dataset(
     Raises:
         DataError: every frame is black, or a file is damaged.
     """
-    stored = [read_points_file(capture.fetch_points(folder, frame), "brightest", "largest") for frame in capture.frames]
+    stored = [
+        read_vdb_frame_points(capture.fetch_points(folder, frame), "brightest", "largest") for frame in capture.frames
+    ]
     exposure = max(float(frame["brightest"]) for frame in stored)
     if not exposure > 0:
         raise DataError(
@@ -204,9 +208,9 @@ def volume_dataset(
     if used.span is not None:
         capture = capture.select_frames(*used.span)
     training = [c for c in range(len(capture.cameras)) if c not in held_out]
-    train = FrameViews(capture, folder, training, exposure, used.every, used.memory * TRAINING_MEMORY)
-    test = FrameViews(capture, folder, held_out, exposure, memory=used.memory * _TEST_MEMORY)
-    weights = [total_extinction(capture, folder, frame) for frame in capture.frames]
+    train = VdbFrameViews(capture, folder, training, exposure, used.every, used.memory * TRAINING_MEMORY)
+    test = VdbFrameViews(capture, folder, held_out, exposure, memory=used.memory * _TEST_MEMORY)
+    weights = [total_extinction_of_vdb_frame(capture, folder, frame) for frame in capture.frames]
     recording = VolumeRecording(name, capture, folder, exposure, weights, used.every, test)
     voxels = FrameVoxels(capture, folder, train, weights[:: used.every], used.memory * _VOXEL_MEMORY)
     camera = capture.cameras[0]
@@ -242,7 +246,7 @@ _POINTS_FILE = {
 }
 
 
-def read_points_file(path: Path, *names: str) -> dict[str, Any]:
+def read_vdb_frame_points(path: Path, *names: str) -> dict[str, Any]:
     """Read arrays of a frame's points file; DataError if it is damaged."""
     try:
         return read_npz_arrays(path, {name: _POINTS_FILE[name] for name in names})
@@ -250,9 +254,9 @@ def read_points_file(path: Path, *names: str) -> dict[str, Any]:
         raise DataError(f"{error}; delete its folder to render the frame again") from error
 
 
-def total_extinction(capture: Capture, store: Store, frame: VdbFrame) -> float:
+def total_extinction_of_vdb_frame(capture: Capture, store: Store, frame: VdbFrame) -> float:
     """The total extinction of a frame, from its points file."""
-    return float(read_points_file(capture.fetch_points(store, frame), "weight")["weight"])
+    return float(read_vdb_frame_points(capture.fetch_points(store, frame), "weight")["weight"])
 
 
 # ---------------------------------------------------------------- voxels to learn from
@@ -358,7 +362,7 @@ class FrameVoxels(PointSupervision):
     """
 
     def __init__(
-        self, capture: Capture, folder: Store, views: FrameViews, weights: Sequence[float], memory: float
+        self, capture: Capture, folder: Store, views: VdbFrameViews, weights: Sequence[float], memory: float
     ) -> None:
         self.capture, self.folder, self.frames, self.times = capture, folder, list(views.frames), list(views.times)
         self.exposure, self.components = views.exposure, capture.components

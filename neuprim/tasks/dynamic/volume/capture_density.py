@@ -94,7 +94,7 @@ class CaptureDensity(VolumeSource):
         return CaptureDensity(self.capture, path)
 
 
-def compare_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
+def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
     """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
     ``sigma_frames`` has the numbers of every compared frame

@@ -236,11 +236,11 @@ def build_medium(
         raise DataError(f"no grid {wanted} to take the extinction from{nearest(optics.extinction_grids[0], grids)}")
     box = base.bounds
     if flames is not None and optics.flame_extinction > 0.0:
-        box = _unite_boxes(box, _transform_bounds(flames, base.transform))
+        box = _unite_medium_boxes(box, _transform_medium_bounds(flames, base.transform))
     if box is None:
         return Medium.without_voxels()
-    sigma_s = _sample_grid(base, base.transform, box) * np.float32(optics.extinction)
-    flame = None if flames is None else _sample_grid(flames, base.transform, box)
+    sigma_s = _sample_medium_grid(base, base.transform, box) * np.float32(optics.extinction)
+    flame = None if flames is None else _sample_medium_grid(flames, base.transform, box)
     sigma = sigma_s if flame is None else sigma_s + flame * np.float32(optics.flame_extinction)
     values = np.zeros((*sigma.shape, 4), np.float32)
     values[..., 0] = sigma
@@ -259,7 +259,7 @@ def build_medium(
     return Medium.padded(values, scene_from_index, sigma_s if optics.mixes(grids) else None)
 
 
-def _transform_bounds(grid: Grid, transform: np.ndarray) -> Bounds | None:
+def _transform_medium_bounds(grid: Grid, transform: np.ndarray) -> Bounds | None:
     """Bounds, under another index-to-world map, of the voxels whose centres lie in the box of a grid's active ones."""
     if grid.bounds is None or _same_voxels(grid.transform, transform):
         return grid.bounds
@@ -267,16 +267,16 @@ def _transform_bounds(grid: Grid, transform: np.ndarray) -> Bounds | None:
     corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
     chain = np.linalg.inv(transform) @ grid.transform
     index = corners @ chain[:3, :3].T + chain[:3, 3]
-    return _make_bounds(np.ceil(index.min(0) - 1e-6), np.floor(index.max(0) + 1e-6) + 1)
+    return _make_medium_bounds(np.ceil(index.min(0) - 1e-6), np.floor(index.max(0) + 1e-6) + 1)
 
 
-def _unite_boxes(a: Bounds | None, b: Bounds | None) -> Bounds | None:
+def _unite_medium_boxes(a: Bounds | None, b: Bounds | None) -> Bounds | None:
     if a is None or b is None:
         return b if a is None else a
-    return _make_bounds(np.minimum(a[0], b[0]), np.maximum(a[1], b[1]))
+    return _make_medium_bounds(np.minimum(a[0], b[0]), np.maximum(a[1], b[1]))
 
 
-def _make_bounds(low: np.ndarray, high: np.ndarray) -> Bounds:
+def _make_medium_bounds(low: np.ndarray, high: np.ndarray) -> Bounds:
     (a, b, c), (d, e, f) = low.astype(int).tolist(), high.astype(int).tolist()
     return (a, b, c), (d, e, f)
 
@@ -289,7 +289,7 @@ def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
     return same_axes and np.allclose(shift, [0, 0, 0, 1], rtol=0, atol=1e-6)
 
 
-def _sample_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
+def _sample_medium_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
     """The grid at the voxel centres of ``box`` under ``transform``; 0 where it is not finite, or a scalar negative."""
     if grid.channels != channels:
         raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
@@ -300,7 +300,7 @@ def _sample_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int =
     elif grid.bounds is None:
         values = np.zeros((*shape, 3)[: 2 + min(channels, 2)], np.float32)
     else:
-        around = _make_bounds(np.array(grid.bounds[0]) - 1, np.array(grid.bounds[1]) + 1)
+        around = _make_medium_bounds(np.array(grid.bounds[0]) - 1, np.array(grid.bounds[1]) + 1)
         own = grid.to_dense(around, limit, 0.0)
         matrix = np.linalg.inv(grid.transform) @ transform
         offset = matrix[:3, :3] @ np.array(box[0], np.float64) + matrix[:3, 3] - np.array(around[0])
@@ -317,7 +317,7 @@ def _scattering_albedo(
     """An array that broadcasts to (X, Y, Z, 3)."""
     albedo = np.array(optics.albedo, np.float32)
     if optics.color_grid is not None and optics.color_grid in grids:
-        return albedo * np.clip(_sample_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
+        return albedo * np.clip(_sample_medium_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
     if optics.gradient is None:
         return albedo
     axis = "xyz".index(optics.up)
@@ -347,7 +347,7 @@ _SRGB_FROM_XYZ = np.array(
 )  # IEC 61966-2-1 with the white of D65 at (1, 1, 1)
 
 
-def _observer_lobe(mean: float, below: float, above: float) -> np.ndarray:
+def _black_body_observer_lobe(mean: float, below: float, above: float) -> np.ndarray:
     off = _WAVELENGTHS - mean
     return np.exp(-0.5 * (off * np.where(off < 0, below, above)) ** 2)
 
@@ -355,10 +355,16 @@ def _observer_lobe(mean: float, below: float, above: float) -> np.ndarray:
 @cache
 def _standard_observer() -> np.ndarray:
     """(3, L) colour matching functions, CIE 1931 2° observer: the fit of Wyman, Sloan and Shirley (JCGT 2013)."""
-    x = 0.362 * _observer_lobe(442.0, 0.0624, 0.0374) + 1.056 * _observer_lobe(599.8, 0.0264, 0.0323)
-    x -= 0.065 * _observer_lobe(501.1, 0.0490, 0.0382)
-    y = 0.821 * _observer_lobe(568.8, 0.0213, 0.0247) + 0.286 * _observer_lobe(530.9, 0.0613, 0.0322)
-    z = 1.217 * _observer_lobe(437.0, 0.0845, 0.0278) + 0.681 * _observer_lobe(459.0, 0.0385, 0.0725)
+    x = 0.362 * _black_body_observer_lobe(442.0, 0.0624, 0.0374) + 1.056 * _black_body_observer_lobe(
+        599.8, 0.0264, 0.0323
+    )
+    x -= 0.065 * _black_body_observer_lobe(501.1, 0.0490, 0.0382)
+    y = 0.821 * _black_body_observer_lobe(568.8, 0.0213, 0.0247) + 0.286 * _black_body_observer_lobe(
+        530.9, 0.0613, 0.0322
+    )
+    z = 1.217 * _black_body_observer_lobe(437.0, 0.0845, 0.0278) + 0.681 * _black_body_observer_lobe(
+        459.0, 0.0385, 0.0725
+    )
     return np.stack([x, y, z])
 
 

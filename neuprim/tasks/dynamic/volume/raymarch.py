@@ -165,7 +165,7 @@ def light_transmittance(medium: Medium, direction: Sequence[float], where: torch
 
 
 @inline
-def _clip_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
+def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
     """The part of [near, far] in which ``o + t d`` is within 0..size."""
     if abs(d) < 1e-12:
         return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
@@ -174,19 +174,19 @@ def _clip_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _first_cell(o, d, t, cells):  # type: ignore[no-untyped-def]
+def _first_march_cell(o, d, t, cells):  # type: ignore[no-untyped-def]
     """The cell of a point, per axis."""
     return min(max(math.floor(o + t * d), 0), cells - 1)
 
 
 @inline
-def _inverse_direction(d):  # type: ignore[no-untyped-def]
+def _inverse_march_direction(d):  # type: ignore[no-untyped-def]
     """1 / d; 0 where the ray runs along the cells."""
     return 1.0 / d if abs(d) > 1e-12 else 0.0
 
 
 @inline
-def _cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
+def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
     """Where the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
     if inverse > 0.0:
         return (cell + reach + 1 - o) * inverse
@@ -196,7 +196,7 @@ def _cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _next_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
+def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
     """The cell beyond ``t``, per axis: exact on the axis that is crossed, so that rounding never holds a ray up."""
     if crossed:
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
@@ -206,7 +206,7 @@ def _next_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _absorbed(depth):  # type: ignore[no-untyped-def]
+def _march_absorption(depth):  # type: ignore[no-untyped-def]
     """(1 - exp(-depth)) / depth and exp(-depth), float32; without cancellation and mostly without an exponential."""
     if depth < _HALF:
         mean = _ONE - depth * _C7
@@ -221,7 +221,7 @@ def _absorbed(depth):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _short_transmittance(depth):  # type: ignore[no-untyped-def]
+def _short_march_transmittance(depth):  # type: ignore[no-untyped-def]
     """exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
     rest = _ONE - depth * _C6
     rest = _ONE - depth * _C5 * rest
@@ -232,7 +232,7 @@ def _short_transmittance(depth):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _step_gains(a, b):  # type: ignore[no-untyped-def]
+def _march_step_gains(a, b):  # type: ignore[no-untyped-def]
     """How much of the sources of two Gauss points leaves a step, and its transmittance, float32.
 
     Args:
@@ -240,12 +240,12 @@ def _step_gains(a, b):  # type: ignore[no-untyped-def]
     """
     depth = a + b
     if depth > _HALF:  # the shortest steps of something all but solid: one point behind the other, never out of range
-        p, rest = _absorbed(a)
-        q, last = _absorbed(b)
+        p, rest = _march_absorption(a)
+        q, last = _march_absorption(b)
         return p, rest * q, rest * last
-    mean, rest = _absorbed(depth)
+    mean, rest = _march_absorption(depth)
     # depths up to the points if extinction is linear; the first may come out slightly below zero
-    p, q = _short_transmittance(_HALF * a - _LESS * b), _short_transmittance(_MORE * a + _HALF * b)
+    p, q = _short_march_transmittance(_HALF * a - _LESS * b), _short_march_transmittance(_MORE * a + _HALF * b)
     whole = a * p + b * q
     scale = mean * depth / whole if whole > _TINY else _ONE
     return p * scale, q * scale, rest
@@ -254,7 +254,7 @@ def _step_gains(a, b):  # type: ignore[no-untyped-def]
 _FREE = ("nsz", "contract", "reassoc")  # what LLVM may do with the arithmetic of _two_points
 
 
-def _generate_two_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
+def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
     """Trilinear values of the four channels at two points of one cell, as vectors of four: LLVM does not find them
     in scalar code, which takes 1.4 times as long.
 
@@ -304,7 +304,7 @@ def _generate_two_points(context: Any, flat: Any, corner: Any, first: Any, secon
     return signature, generate
 
 
-_two_points: Any = intrinsic(_generate_two_points)
+_two_points: Any = intrinsic(_generate_two_march_points)
 
 
 @kernel
@@ -335,22 +335,26 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
                 rx = (pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2]) * unit
                 ry = (pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2]) * unit
                 rz = (pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2]) * unit
-                t, end = _clip_to_slab(ox, rx, float(nx), 0.0, _FAR)
-                t, end = _clip_to_slab(oy, ry, float(ny), t, end)
-                t, end = _clip_to_slab(oz, rz, float(nz), t, end)
+                t, end = _clip_march_to_slab(ox, rx, float(nx), 0.0, _FAR)
+                t, end = _clip_march_to_slab(oy, ry, float(ny), t, end)
+                t, end = _clip_march_to_slab(oz, rz, float(nz), t, end)
                 if t >= end:
                     continue
-                ix, iy, iz = _inverse_direction(rx), _inverse_direction(ry), _inverse_direction(rz)
-                i, j, k = _first_cell(ox, rx, t, nx), _first_cell(oy, ry, t, ny), _first_cell(oz, rz, t, nz)
+                ix, iy, iz = _inverse_march_direction(rx), _inverse_march_direction(ry), _inverse_march_direction(rz)
+                i, j, k = (
+                    _first_march_cell(ox, rx, t, nx),
+                    _first_march_cell(oy, ry, t, ny),
+                    _first_march_cell(oz, rz, t, nz),
+                )
                 through = _ONE
                 r, g, b = _ZERO, _ZERO, _ZERO
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
                     tx, ty, tz = (
-                        _cell_exit(ox, ix, i, reach),
-                        _cell_exit(oy, iy, j, reach),
-                        _cell_exit(oz, iz, k, reach),
+                        _march_cell_exit(ox, ix, i, reach),
+                        _march_cell_exit(oy, iy, j, reach),
+                        _march_cell_exit(oz, iz, k, reach),
                     )
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
@@ -372,7 +376,7 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
                             if s1 + s2 > _HALF and part > _SHORTEST * step:
                                 part *= 0.5 if s1 + s2 < _ONE else 0.25
                                 continue
-                            p, q, rest = _step_gains(s1, s2)
+                            p, q, rest = _march_step_gains(s1, s2)
                             p *= through * half
                             q *= through * half
                             r += p * r1 + q * r2
@@ -383,9 +387,9 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
                             part = min(step, out - begin)
                         if through < _OPAQUE:
                             break
-                    i = _next_cell(ox, rx, i, reach, out, tx == out)
-                    j = _next_cell(oy, ry, j, reach, out, ty == out)
-                    k = _next_cell(oz, rz, k, reach, out, tz == out)
+                    i = _next_march_cell(ox, rx, i, reach, out, tx == out)
+                    j = _next_march_cell(oy, ry, j, reach, out, ty == out)
+                    k = _next_march_cell(oz, rz, k, reach, out, tz == out)
                     t = max(t, out)
                 sum_r += r
                 sum_g += g
@@ -398,7 +402,7 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
 
 
 @inline
-def _trilinear(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
+def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
     """Trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
@@ -419,7 +423,7 @@ def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignor
         result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
     """
     nx, ny, nz = skips.shape
-    ix, iy, iz = _inverse_direction(rx), _inverse_direction(ry), _inverse_direction(rz)
+    ix, iy, iz = _inverse_march_direction(rx), _inverse_march_direction(ry), _inverse_march_direction(rz)
     for a in range(start, stop):
         for b in range(ny + 1):
             for c in range(nz + 1):
@@ -432,9 +436,9 @@ def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignor
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
                     tx, ty, tz = (
-                        _cell_exit(ox, ix, i, reach),
-                        _cell_exit(oy, iy, j, reach),
-                        _cell_exit(oz, iz, k, reach),
+                        _march_cell_exit(ox, ix, i, reach),
+                        _march_cell_exit(oy, iy, j, reach),
+                        _march_cell_exit(oz, iz, k, reach),
                     )
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
@@ -442,9 +446,9 @@ def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignor
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)
                             x, y = np.float32(ox + s * rx - i), np.float32(oy + s * ry - j)
                             z = np.float32(oz + s * rz - k)
-                            depth += 0.5 * (out - t) * _trilinear(sigma, i, j, k, x, y, z)
-                    i = _next_cell(ox, rx, i, reach, out, tx == out)
-                    j = _next_cell(oy, ry, j, reach, out, ty == out)
-                    k = _next_cell(oz, rz, k, reach, out, tz == out)
+                            depth += 0.5 * (out - t) * _trilinear_march_sample(sigma, i, j, k, x, y, z)
+                    i = _next_march_cell(ox, rx, i, reach, out, tx == out)
+                    j = _next_march_cell(oy, ry, j, reach, out, ty == out)
+                    k = _next_march_cell(oz, rz, k, reach, out, tz == out)
                     t = max(t, out)
                 result[a, b, c] = depth

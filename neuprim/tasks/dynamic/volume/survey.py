@@ -132,7 +132,7 @@ def survey_volume_frames(
             if box is None or meaning not in histograms or grid.channels != 1:
                 continue
             extent = GridExtent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
-            histograms[meaning] += _count_values(grid.active_values())
+            histograms[meaning] += _count_vdb_values(grid.active_values())
             if meaning == reader.extinction:
                 extents[frame.number] = extent
             if meaning == "flames":
@@ -144,16 +144,16 @@ def survey_volume_frames(
         where = os.path.commonpath([f.path for f in frames])
         name = reader.names[reader.extinction]
         raise DataError(f"{where}: no frame has an active voxel of {name!r}; expected matter in at least one")
-    return SequenceSurvey(box, extents, hottest, {m: _peak_value(counts) for m, counts in histograms.items()})
+    return SequenceSurvey(box, extents, hottest, {m: _peak_vdb_value(counts) for m, counts in histograms.items()})
 
 
-def _count_values(values: np.ndarray) -> np.ndarray:
+def _count_vdb_values(values: np.ndarray) -> np.ndarray:
     """(2^15,) numbers of positive values by the upper half of a float32's bits, which rises with its value."""
     positive = values[np.isfinite(values) & (values > 0)]
     return np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=1 << 15)
 
 
-def _peak_value(counts: np.ndarray) -> float:
+def _peak_vdb_value(counts: np.ndarray) -> float:
     """A quantile close to the largest value, to about 1 %; 0 without any value."""
     cumulative = np.cumsum(counts)
     place = int(np.searchsorted(cumulative, _PEAK_QUANTILE * cumulative[-1]))
@@ -175,14 +175,14 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
 
 
 @dataclass(frozen=True)
-class SceneNormalisation:
+class CaptureNormalisation:
     """scene = (world - center) · scale, the same for all frames; axes are not turned."""
 
     center: tuple[float, float, float]
     scale: float
 
     @staticmethod
-    def from_bounds(bounds: np.ndarray) -> SceneNormalisation:
+    def from_bounds(bounds: np.ndarray) -> CaptureNormalisation:
         """Map the (2, 3) box ``bounds``, world units, to one around the origin with longest side 1.
 
         Raises:
@@ -195,7 +195,7 @@ class SceneNormalisation:
                 f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume"
             )
         x, y, z = ((low + high) / 2).tolist()
-        return SceneNormalisation((x, y, z), 1.0 / longest)
+        return CaptureNormalisation((x, y, z), 1.0 / longest)
 
     def to_scene(self, points: np.ndarray) -> np.ndarray:
         """Convert (…, 3) world points to float64 scene points."""

@@ -29,11 +29,11 @@ from neuprim.core.validation import Accepts, Range, coerce, nonempty_text, valid
 from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.scenes.smoke.smoke_scenes import MAX_TIMESTEPS, Resolution, simulate_smoke
 from neuprim.tasks.dynamic.time_density import ChunkOverlaps, TimeDensity
-from neuprim.tasks.dynamic.volume.capture import Capture, RenderedFrames, hemisphere_cameras
+from neuprim.tasks.dynamic.volume.capture import Capture, CapturedVdbFrames, hemisphere_capture_cameras
 from neuprim.tasks.dynamic.volume.capture_dataset import (
     TRAINING_MEMORY,
     TrainingFrames,
-    total_extinction,
+    total_extinction_of_vdb_frame,
     volume_dataset,
 )
 from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity
@@ -47,7 +47,7 @@ from neuprim.tasks.dynamic.volume.optics import (
     override_optics,
 )
 from neuprim.tasks.dynamic.volume.survey import (
-    SceneNormalisation,
+    CaptureNormalisation,
     data_dependent_optics,
     find_volume_grids,
     survey_volume_frames,
@@ -56,7 +56,7 @@ from neuprim.tasks.dynamic.volume.survey import (
 # ---------------------------------------------------------------- settings
 
 
-def _frame_range(frames: str) -> range | None:
+def _vdb_frame_range(frames: str) -> range | None:
     """The numbers of "FIRST:LAST" or "FIRST:LAST:STEP", LAST included; None for other text."""
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})(?::(\d{1,9}))?", frames)
     if match is None or (step := int(match[3] or 1)) < 1 or int(match[1]) > int(match[2]):
@@ -64,14 +64,15 @@ def _frame_range(frames: str) -> range | None:
     return range(int(match[1]), int(match[2]) + 1, step)
 
 
-Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _frame_range(v) is not None, "FIRST:LAST, as 0:19")]
+Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _vdb_frame_range(v) is not None, "FIRST:LAST, as 0:19")]
 Frames = Annotated[
-    str, Accepts(lambda v: v == "all" or _frame_range(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2")
+    str,
+    Accepts(lambda v: v == "all" or _vdb_frame_range(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2"),
 ]
 
 
 @dataclass(frozen=True)
-class VolumeSettings:
+class VdbSceneSettings:
     """Settings of a volume scene.
 
     Attributes:
@@ -81,7 +82,7 @@ class VolumeSettings:
         span: "FIRST:LAST" by number, the frames for training and evaluation; times, box, exposure and images stay those
             of all ``frames``. None: all.
         chunks: number of chunks of time, each trained in its own run; "auto": see
-            :func:`count_chunks`; None or 1: one run.
+            :func:`count_time_chunks`; None or 1: one run.
         grids: meaning -> name in the files.
         look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
         size: width and height of the images in pixels; ``samples``: rays per pixel side.
@@ -143,7 +144,7 @@ def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the 
         ConfigError: another form than "all", "FIRST:LAST" or "FIRST:LAST:STEP".
         DataError: none of the frames exists.
     """
-    wanted = _frame_range(coerce(frames, Frames, "scene.frames"))
+    wanted = _vdb_frame_range(coerce(frames, Frames, "scene.frames"))
     if wanted is None:
         return list(numbers)
     chosen = [n for n in numbers if n in wanted]
@@ -156,10 +157,10 @@ def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the 
 
 
 @dataclass(frozen=True)
-class _PreparedScene:
+class _PreparedVdbScene:
     """Everything that is known before anything is rendered."""
 
-    settings: VolumeSettings
+    settings: VdbSceneSettings
     name: str
     source: DataSource
     capture: Capture
@@ -167,7 +168,7 @@ class _PreparedScene:
 
     def span_ends(self) -> tuple[int, int] | None:
         """First and last number of the chosen frames within ``scene.span``; None for all of them."""
-        wanted = None if self.settings.span is None else _frame_range(self.settings.span)
+        wanted = None if self.settings.span is None else _vdb_frame_range(self.settings.span)
         if wanted is None:
             return None
         numbers = [frame.number for frame in self.capture.frames if frame.number in wanted]
@@ -178,10 +179,10 @@ class _PreparedScene:
             )
         return numbers[0], numbers[-1]
 
-    def rendered_frames(self, context: SceneContext) -> RenderedFrames:
+    def rendered_frames(self, context: SceneContext) -> CapturedVdbFrames:
         cache = self.settings.cache
         store = Store.local(context.cache_dir) if cache is None else open_store(cache, context.cache_dir / "copies")
-        return RenderedFrames(self.capture, store)
+        return CapturedVdbFrames(self.capture, store)
 
 
 def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
@@ -191,7 +192,7 @@ def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dat
         ConfigError: unknown setting or impossible value.
         DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
     """
-    scene = _prepare_scene(settings, context)
+    scene = _prepare_vdb_scene(settings, context)
     _report_chosen_extinctions(scene)
     span = scene.span_ends()
     images = scene.rendered_frames(context).render_missing(context.progress)
@@ -200,28 +201,28 @@ def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dat
     return volume_dataset(scene.name, scene.source, scene.capture, images, scene.held_out, up, used)
 
 
-def open_rendered_frames(
+def open_captured_vdb_frames(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
-) -> RenderedFrames:
+) -> CapturedVdbFrames:
     """The scene's images as work to be done; raises as :func:`load_volume_scene`.
 
     Args:
         known: of the same scene's ground truth in another process, which has surveyed the files.
     """
-    return _prepare_scene(settings, context, known).rendered_frames(context)
+    return _prepare_vdb_scene(settings, context, known).rendered_frames(context)
 
 
 def open_volume_source(settings: Mapping[str, Any], context: SceneContext) -> CaptureDensity:
     """The scene's files without any image; raises as :func:`load_volume_scene`."""
-    scene = _prepare_scene(settings, context)
+    scene = _prepare_vdb_scene(settings, context)
     span = scene.span_ends()
     return CaptureDensity(scene.capture if span is None else scene.capture.select_frames(*span))
 
 
-def _prepare_scene(
+def _prepare_vdb_scene(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
-) -> _PreparedScene:
-    options = validate(VolumeSettings, settings, "scene")
+) -> _PreparedVdbScene:
+    options = validate(VdbSceneSettings, settings, "scene")
     options.resolve_optics()  # report typing errors before anything is simulated
     if options.vdb is not None:
         folder, name = options.vdb, options.vdb.name
@@ -244,22 +245,24 @@ def _prepare_scene(
         if options.vdb is not None:
             derived = data_dependent_optics(optics, reader.extinction, survey)
             optics = replace(optics, **{key: value for key, value in derived.items() if key not in options.optics})
-        normalisation, measured = SceneNormalisation.from_bounds(survey.box), survey.extents
+        normalisation, measured = CaptureNormalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
     else:
         derived = {key: known["look"][key] for key in DATA_DEPENDENT}
         optics = replace(optics, **{**derived, "flame_range": tuple(derived["flame_range"])})
         reader = replace(reader, names=known["grids"])
         center, bounds = tuple(known["normalisation"]["center"]), np.array(known["bounds"])
-        normalisation = SceneNormalisation(center, known["normalisation"]["scale"])
-    train, test = hemisphere_cameras(options.size, options.cameras, up=options.up, field_of_view=options.field_of_view)
+        normalisation = CaptureNormalisation(center, known["normalisation"]["scale"])
+    train, test = hemisphere_capture_cameras(
+        options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
+    )
     views = ([*train, *test], options.samples)
     capture = Capture(frames, reader, optics, *views, normalisation, bounds, context.device, measured=measured)
     source: DataSource = "simulated" if options.vdb is None else "real"
-    return _PreparedScene(options, name, source, capture, range(len(train), len(train) + len(test)))
+    return _PreparedVdbScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 
 
-def _report_chosen_extinctions(scene: _PreparedScene) -> None:
+def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
     """Print one line with the extinctions that were chosen instead of the preset's."""
     capture = scene.capture
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
@@ -286,18 +289,18 @@ _FRAMES_PER_OVERLAP, _MAX_OVERLAP = 8, 3
 where little moves; frames in two chunks cost both of them."""
 
 
-def split_into_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
+def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
     """The chunks of ``scene.chunks``; None for one run. Renders all frames, as the chunks share one exposure.
 
     Raises:
         ConfigError: more chunks than the frames allow; and as :func:`load_volume_scene`.
     """
-    scene = _prepare_scene({name: value for name, value in config["scene"].items() if name != "name"}, context)
+    scene = _prepare_vdb_scene({name: value for name, value in config["scene"].items() if name != "name"}, context)
     options, capture = scene.settings, scene.capture
     frames, camera = capture.frames[:: options.train_every], capture.cameras[0]
     views = len(frames) * (len(capture.cameras) - len(scene.held_out))
     image_bytes = views * camera.width * camera.height * 4 * 2  # RGBA in half floats
-    count = count_chunks(options.chunks, len(frames), image_bytes, options.memory_bytes * TRAINING_MEMORY)
+    count = count_time_chunks(options.chunks, len(frames), image_bytes, options.memory_bytes * TRAINING_MEMORY)
     if count == 1:
         return None
     store = scene.rendered_frames(context).render_missing(context.progress)
@@ -307,7 +310,7 @@ def split_into_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunk
     overlaps = tuple((times[begin - extra], times[begin + extra - 1]) for begin in begins[1:-1])
     parts = [frames[max(begin - extra, 0) : end + extra] for begin, end in itertools.pairwise(begins)]
     # primitives are divided by extinction, like the starting points of one run
-    weights = [sum(total_extinction(capture, store, frame) for frame in part) for part in parts]
+    weights = [sum(total_extinction_of_vdb_frame(capture, store, frame) for frame in part) for part in parts]
     used = [number for number in range(count) if weights[number] > 0]  # a chunk without matter cannot be trained
     if not used:
         return None
@@ -320,10 +323,10 @@ def split_into_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunk
         changes = {"scene.chunks": None, "scene.span": f"{first}:{last}", **_rescale_time(capture, part, config)}
         name = f"frames_{first:0{width}}-{last:0{width}}"
         chunks.append(Chunk(name, changes, weights[number] / sum(weights), len(part) / total_frames))
-    return Chunks(tuple(chunks), lambda models: join_chunks(models, used, overlaps))
+    return Chunks(tuple(chunks), lambda models: join_time_chunks(models, used, overlaps))
 
 
-def count_chunks(requested: int | str | None, frames: int, image_bytes: int, memory: float) -> int:
+def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int, memory: float) -> int:
     """Number of chunks: the requested one, or for "auto" enough that none has more than :data:`MAX_FRAMES` frames and
     the images of each fit in memory, but not so many that one has fewer than :data:`MIN_FRAMES`.
 
@@ -360,7 +363,7 @@ def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[
     return settings
 
 
-def join_chunks(models: Sequence[Primitives], numbers: Sequence[int], overlaps: ChunkOverlaps) -> Primitives:
+def join_time_chunks(models: Sequence[Primitives], numbers: Sequence[int], overlaps: ChunkOverlaps) -> Primitives:
     """Join the models of chunks: at every time their extinctions and sources, weighted by their chunks' weights.
 
     Args:

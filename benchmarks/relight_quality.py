@@ -26,7 +26,7 @@ from shared.tables import DOCS, Run, Table, between_markers, group_runs, spread_
 from shared.trials import Trial, begin, measure_paces, run_all
 
 from neuprim.core.compute.threads import cpu_name
-from neuprim.tasks.relight import baseline_scores
+from neuprim.tasks.relight import lighting_baseline_scores
 
 RECORD = RESULTS / "relight_quality.json"
 WORDS = ("task=relight", "scene=lit_solids", "scene.size=128")
@@ -92,7 +92,7 @@ def main() -> None:
         trials = {name: Trial("", (*WORDS, *VARIANTS[name]), args.steps, interventions=None) for name in args.variants}
         reference = Trial("", (*WORDS, *FORMS[DEFAULT]), args.steps, interventions=None)
         paces = measure_paces(RECORD, reference, trials, 480)
-        found = {"steps": args.steps, "baselines": baseline_scores(begin(reference).dataset)}
+        found = {"steps": args.steps, "baselines": lighting_baseline_scores(begin(reference).dataset)}
         runs = []
         for seed in range(args.seeds):
             for name, trial in trials.items():

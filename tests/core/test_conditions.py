@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.core.conditions import FRAMES, count_common_frames, export_frames, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.tasks.relight.lighting import orbit_in_frames, parse_lights
+from neuprim.tasks.relight.lighting import light_orbit_in_frames, parse_light_positions
 
 
 def number(text: str) -> list[Tensor]:
@@ -163,7 +163,7 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
 
 
 TIME = ConditionSpec("time", (), "s", (0.0, 1.0), number)
-LIGHT = ConditionSpec("light", (3,), "scene units", (-1e6, 1e6), parse_lights, in_frames=orbit_in_frames)
+LIGHT = ConditionSpec("light", (3,), "scene units", (-1e6, 1e6), parse_light_positions, in_frames=light_orbit_in_frames)
 
 
 def lengths(time: str, light: str) -> tuple[int, int]:

@@ -30,8 +30,8 @@ from neuprim.scenes.lit import (
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shapes import Solid, ball, chamfered_box, parse_srgb, uniform_colour
 from neuprim.tasks import relight
-from neuprim.tasks.relight.datasets import load_lit_solids as load
-from neuprim.tasks.relight.datasets import load_olat, read_pixel_classes
+from neuprim.tasks.relight.datasets import load_lit_solids_for_relighting as load
+from neuprim.tasks.relight.datasets import load_olat, read_lit_pixel_classes
 from neuprim.tasks.relight.lighting import dataset_lighting
 
 GREY = "#808080"
@@ -164,7 +164,7 @@ def test_the_loader_of_the_layout_reads_the_same_pixels_and_lights(context: Scen
     stored = fresh.rgba[..., :3].astype(np.float16).astype(np.float32)
     np.testing.assert_array_equal(dataset.train.pixels(2).rgb.numpy(), stored)
     assert isinstance(dataset.train, ImageViews)
-    np.testing.assert_array_equal(read_pixel_classes(dataset.train, 2).numpy(), fresh.classes)
+    np.testing.assert_array_equal(read_lit_pixel_classes(dataset.train, 2).numpy(), fresh.classes)
 
 
 def test_the_data_set_says_what_it_is(context: SceneContext) -> None:

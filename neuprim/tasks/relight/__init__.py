@@ -32,10 +32,10 @@ from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightHarmonics, LightNetwork
 from neuprim.tasks.relight.lighting import (
     dataset_lighting,
+    light_orbit_in_frames,
     lights_from_environment,
-    orbit_in_frames,
-    parse_intensities,
-    parse_lights,
+    parse_light_intensities,
+    parse_light_positions,
     summarize_lights,
     typical_light,
 )
@@ -66,7 +66,7 @@ def _check_relight_model(model: Mapping[str, Any]) -> None:
         raise ConfigError(f"model.colour: {error}") from error
 
 
-def _tunable_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+def _tunable_relight_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     if model["colour"].get("form") == "harmonics":
         return {**DENSITY_TRADE, "model.colour.degree": (1, 2, 3, 5)}
     return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": VISIBILITY}
@@ -93,7 +93,7 @@ def _load_relight_scene(function: str, settings: Mapping[str, Any], context: Sce
 _MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
 
 
-def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
+def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
     """Pixels of a test view that show matter; None for images without alpha."""
     alpha = dataset.test.pixels(index).alpha
     return None if alpha is None else alpha > _MIN_ALPHA
@@ -107,22 +107,24 @@ def relight_metrics(
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
         result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
-    return result if known.classes is None else result | pixel_class_errors(rendered, truth, known.classes(index))
+    return (
+        result if known.classes is None else result | relight_pixel_class_errors(rendered, truth, known.classes(index))
+    )
 
 
 def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
     """Exposure, falloff, scores of images without a model, and pixel classes in percent of the pixels with matter."""
     known = dataset_lighting(dataset)
     result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff}
-    result["baselines"] = baseline_scores(dataset)
+    result["baselines"] = lighting_baseline_scores(dataset)
     if not flip_available():
         result["flip_missing"] = "pip install 'neuprim[flip]'"
     if known.classes is not None:
-        result["class_percent"] = pixel_class_shares([known.classes(i) for i in range(len(dataset.test))])
+        result["class_percent"] = relight_pixel_class_shares([known.classes(i) for i in range(len(dataset.test))])
     return result
 
 
-def baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
+def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
     """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
 
     def mean_of(guess: Callable[[int], Tensor] | None) -> dict[str, Any]:
@@ -184,7 +186,7 @@ def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> d
     return result
 
 
-def pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
+def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
     """Errors and pixel counts of every class that the (H, W) map ``classes`` has; raises DataError for others."""
     if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
         raise DataError(
@@ -200,7 +202,7 @@ def pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict
     return result
 
 
-def pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
+def relight_pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
     """Share of each class, in percent of the pixels that are not background."""
     counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
     whole = max(float(counts[1:].sum()), 1.0)
@@ -245,7 +247,7 @@ TASK = TaskSpec(
         SceneSpec(
             "lit_solids",
             "built in: solids and a glossy ring under moving point lights, with shadows",
-            partial(_load_relight_scene, "load_lit_solids"),
+            partial(_load_relight_scene, "load_lit_solids_for_relighting"),
         ),
         SceneSpec(
             "olat",
@@ -256,24 +258,24 @@ TASK = TaskSpec(
     build=_build_relight_fields,
     loss=l1,
     check=_check_relight_model,
-    tunable_settings=_tunable_settings,
+    tunable_settings=_tunable_relight_settings,
     conditions=(
         ConditionSpec(
             "light",
             (3,),
             "position, scene units",
             (-1e6, 1e6),
-            parse_lights,
+            parse_light_positions,
             sweep="orbit",
-            in_frames=orbit_in_frames,
-            place=parse_lights,
+            in_frames=light_orbit_in_frames,
+            place=parse_light_positions,
         ),
-        ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_intensities),
+        ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_light_intensities),
     ),
     fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
     environment=lights_from_environment,
     uses=("model.neurons",),
-    mask=matter_mask,
+    mask=relight_matter_mask,
     metrics=relight_metrics,
     diagnose=diagnose_lighting,
     clips=relight_clips,

@@ -44,7 +44,7 @@ def _check_network_count(value: object, low: int, high: float, name: str) -> Non
         raise ValueError(f"{name} {value!r}; expected {expected}")
 
 
-def _check_typical_light(typical: float) -> None:
+def _validate_typical_light(typical: float) -> None:
     if not 0 < typical < math.inf:
         raise ValueError(f"typical light {typical!r}; expected a number above 0")
 
@@ -75,7 +75,7 @@ class LightNetwork(ColourField):
     ) -> None:
         _check_network_count(hidden, 0, 16, "hidden units")
         _check_network_count(channels, 1, math.inf, "colour channels")
-        _check_typical_light(typical)
+        _validate_typical_light(typical)
         if form not in FORMS:
             raise ValueError(f"form {form!r}; expected {' or '.join(FORMS)}")
         if visibility not in VISIBILITY:
@@ -122,7 +122,7 @@ class LightNetwork(ColourField):
         strength = device.to_device_like(conditions["light_intensity"], means).expand(self.channels) / self.typical
         factor = strength.expand(means.shape[0], -1)
         if self.falloff:
-            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
+            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_light_distance(geometry))
         phase = (
             (params["net_view"] * view[:, None]).sum(-1)
             + (params["net_light"] * normalize_direction(to_light, size)[:, None]).sum(-1)
@@ -153,7 +153,7 @@ class LightNetwork(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[LightNetwork, dict[str, Tensor]]:
-        return LightNetwork(**{**self.settings(), "hidden": value}), prune_hidden_units(
+        return LightNetwork(**{**self.settings(), "hidden": value}), prune_light_network_units(
             params, geometry, value, self.boost, self.form == "multiplicative"
         )
 
@@ -174,7 +174,7 @@ class LightNetwork(ColourField):
 # ---------------------------------------------------------------- pruning
 
 
-def prune_hidden_units(
+def prune_light_network_units(
     params: Params, geometry: Geometry, keep: int, boost: float, multiplicative: bool
 ) -> dict[str, Tensor]:
     """The tensors of a :class:`LightNetwork` with ``keep`` units per primitive: those that change the colour most.
@@ -225,7 +225,7 @@ class LightHarmonics(ColourField):
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         _check_network_count(degree, 0, 8, "spherical-harmonics degree")
-        _check_typical_light(typical)
+        _validate_typical_light(typical)
         self.degree, self.channels, self.falloff, self.typical = degree, channels, bool(falloff), float(typical)
 
     def settings(self) -> dict[str, Any]:
@@ -255,16 +255,18 @@ class LightHarmonics(ColourField):
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]
         to_light = device.to_device_like(conditions["light"], color) - geometry.means
-        squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_distance(geometry))
+        squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_light_distance(geometry))
         if self.degree:
-            bands = real_harmonics(normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree)
+            bands = real_light_harmonics(
+                normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree
+            )
             color = color + (bands[:, 1:, None] * params["light_sh"]).sum(1)
         strength = device.to_device_like(conditions["light_intensity"], color) / self.typical
         strength = strength / (squared if self.falloff else 1.0)
         return Constant(color.clamp_min(0.0) * strength)
 
 
-def real_harmonics(directions: Tensor, degree: int) -> Tensor:
+def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
     """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l.
 
     By recurrence of the associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m,
@@ -305,6 +307,6 @@ def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
 
-def min_squared_distance(geometry: Geometry) -> Tensor:
+def min_squared_light_distance(geometry: Geometry) -> Tensor:
     """(N, 1) smallest squared distance to a light for falloff."""
     return (_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square()

@@ -43,7 +43,7 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, Range, validate
 from neuprim.scenes.lit import NEAR_LIGHTS, PARTS, LitSettings, generate_lit_solids
-from neuprim.tasks.relight.lighting import Lighting, percentile_exposure
+from neuprim.tasks.relight.lighting import Lighting, olat_percentile_exposure
 
 _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
 
@@ -79,7 +79,7 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     details = SceneDetails(
         up=torch.tensor([0.0, 0.0, 1.0]),
         to_linear=True,
-        exposure=(lambda views: percentile_exposure(views, str(folder)))
+        exposure=(lambda views: olat_percentile_exposure(views, str(folder)))
         if options.exposure == "auto"
         else options.exposure,
         extra=Lighting(options.falloff),
@@ -115,7 +115,7 @@ def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
-            _existing_file(folder / "/".join(parts[i:])) for i in range(len(parts))
+            _existing_olat_file(folder / "/".join(parts[i:])) for i in range(len(parts))
         )  # an absolute path stays one when joined
         found = next((file for file in tails if file is not None), None)
         if found is not None or not record.has("file_path"):
@@ -126,10 +126,10 @@ def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
     suffix = "." + record.text("file_ext").removeprefix(".")
     if suffix not in IMAGE_SUFFIXES:
         raise record.fail("file_ext", "one of .png, .jpg, .jpeg, .webp, .exr")
-    return _existing_file(folder / (name.removesuffix(suffix).replace("\\", "/") + suffix))
+    return _existing_olat_file(folder / (name.removesuffix(suffix).replace("\\", "/") + suffix))
 
 
-def _existing_file(path: Path) -> Path | None:
+def _existing_olat_file(path: Path) -> Path | None:
     try:
         return path if path.is_file() else None
     except OSError:  # a name longer than the file system can hold
@@ -178,7 +178,7 @@ class LitSolidsSettings(LitSettings):
     hold_out: HoldOut = 0  # n: every n-th training view is the test split, for tuning; 0 for the split that is drawn
 
 
-def load_lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
+def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=lit_solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
     options = validate(LitSolidsSettings, settings, "scene")
     drawn = LitSettings(**{f.name: getattr(options, f.name) for f in fields(LitSettings)})
@@ -193,26 +193,26 @@ def load_lit_solids(settings: Mapping[str, Any], context: SceneContext) -> Datas
         background=torch.zeros(3),
         bounds=torch.tensor([[-1.0, -1.0, -0.65], [1.0, 1.0, 1.0]]),
         downsampling=f"rendered at {drawn.size}x{drawn.size}, {rays}x{rays} rays per pixel",
-        extra=_lit_solids_lighting(dataset, folder),
+        extra=_lit_solids_olat_lighting(dataset, folder),
     )
 
 
-def _lit_solids_lighting(dataset: Dataset, folder: Path) -> Lighting:
+def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
     """Pixel classes, parts of the test split, two baselines without a model, and a film of the light going round."""
     test = dataset.test
     assert isinstance(test, ImageViews)  # as posed_images makes them
-    baselines = {"no_cast_shadows": partial(_read_companion_image, test, "unshadowed.exr")}
-    if _companion_path(test, "nearest.exr", 0).is_file():  # not where training views are held out
-        baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_companion_image, test, "nearest.exr")
+    baselines = {"no_cast_shadows": partial(_read_lit_companion_image, test, "unshadowed.exr")}
+    if _lit_companion_path(test, "nearest.exr", 0).is_file():  # not where training views are held out
+        baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_lit_companion_image, test, "nearest.exr")
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))
     circle = ImageViews([image_frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
-    return Lighting("inverse_square", partial(read_pixel_classes, test), PARTS, baselines, (film,))
+    return Lighting("inverse_square", partial(read_lit_pixel_classes, test), PARTS, baselines, (film,))
 
 
-def read_pixel_classes(views: ImageViews, index: int) -> Tensor:
+def read_lit_pixel_classes(views: ImageViews, index: int) -> Tensor:
     """(H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
-    path = _companion_path(views, "classes.png", index)
+    path = _lit_companion_path(views, "classes.png", index)
     try:
         with Image.open(path, formats=("PNG",)) as image:
             return torch.from_numpy(np.array(image))
@@ -220,12 +220,12 @@ def read_pixel_classes(views: ImageViews, index: int) -> Tensor:
         raise DataError(f"{path}: damaged ({error}); delete its folder to draw the scene again") from None
 
 
-def _read_companion_image(views: ImageViews, ending: str, index: int) -> Tensor:
+def _read_lit_companion_image(views: ImageViews, ending: str, index: int) -> Tensor:
     """(H, W, 3) a further image of a view, linear light over the exposure."""
     camera = views.view(index).camera
-    return read_image(_companion_path(views, ending, index), (camera.width, camera.height))[..., :3].float()
+    return read_image(_lit_companion_path(views, ending, index), (camera.width, camera.height))[..., :3].float()
 
 
-def _companion_path(views: ImageViews, ending: str, index: int) -> Path:
+def _lit_companion_path(views: ImageViews, ending: str, index: int) -> Path:
     file = views.file(index)
     return file.with_name(f"{file.stem}_{ending}")

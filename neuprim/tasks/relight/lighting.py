@@ -54,7 +54,7 @@ def dataset_lighting(dataset: Dataset) -> Lighting:
     return get_extra(dataset, Lighting) or Lighting()
 
 
-def percentile_exposure(views: ImageViews, where: str) -> float:
+def olat_percentile_exposure(views: ImageViews, where: str) -> float:
     """The 99.5th percentile of all premultiplied values, in half precision; raises DataError if it is zero."""
     # counts per bit pattern, as patterns of non-negative half floats ascend with their values
     counts = torch.zeros(1 << 15, dtype=torch.int64)
@@ -87,12 +87,12 @@ def typical_light(dataset: Dataset, falloff: bool) -> float:
 # ---------------------------------------------------------------- the command line
 
 
-def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
+def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]:
     """Parse ``--light``: (3,) scene positions of "x,y,z" in world units, or "orbit[:DISTANCE:POLAR:FRAMES]" about z."""
     expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
     kind, *parts = text.split(":")
     if kind != "orbit":
-        return [(world or World()).scene_points(_parse_three_numbers(text, "light", expected)).float()]
+        return [(world or World()).scene_points(_parse_light_numbers(text, "light", expected)).float()]
     try:
         values = [float(p) for p in parts] + list(_ORBIT[len(parts) :])
         distance, polar, frames = values[0], values[1], int(values[2])
@@ -105,7 +105,7 @@ def parse_lights(text: str, world: World | None = None) -> list[Tensor]:
     return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
 
 
-def orbit_in_frames(text: str, count: int) -> str | None:
+def light_orbit_in_frames(text: str, count: int) -> str | None:
     """``"orbit:4"`` in 24 frames -> ``"orbit:4:40:24"``; None unless it is an orbit without a number of frames."""
     parts = text.split(":")
     if parts[0] != "orbit" or len(parts) > 3:
@@ -113,10 +113,10 @@ def orbit_in_frames(text: str, count: int) -> str | None:
     return ":".join([*parts, *(f"{x:g}" for x in _ORBIT[len(parts) - 1 : 2]), str(count)])
 
 
-def parse_intensities(text: str) -> list[Tensor]:
+def parse_light_intensities(text: str) -> list[Tensor]:
     """Parse ``--light-intensity``: (3,) float32 from "r,g,b" or one number, 0 or more."""
     expected = "expected r,g,b or one number, 0 or more"
-    found = _parse_three_numbers(
+    found = _parse_light_numbers(
         f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected
     ).float()
     if bool((found < 0).any()):
@@ -124,7 +124,7 @@ def parse_intensities(text: str) -> list[Tensor]:
     return [found]
 
 
-def _parse_three_numbers(text: str, name: str, expected: str) -> Tensor:
+def _parse_light_numbers(text: str, name: str, expected: str) -> Tensor:
     try:
         values = [float(p) for p in text.split(",")]
     except ValueError:

@@ -18,8 +18,8 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.population import split_primitives
 from neuprim.tasks.relight import visibility
-from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_harmonics
-from neuprim.tasks.relight.lighting import parse_intensities, parse_lights
+from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_light_harmonics
+from neuprim.tasks.relight.lighting import parse_light_intensities, parse_light_positions
 from neuprim.tasks.relight.visibility import BIAS, SOFTNESS, light_visibility
 from tests import scenes
 from tests.lit_models import COUNT, light, model
@@ -201,7 +201,7 @@ def test_a_flat_floor_does_not_shadow_itself(polar: float) -> None:
 def test_the_recurrence_agrees_with_the_renderers_harmonics() -> None:
     d = torch.randn(50, 3, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     d = d / d.norm(dim=1, keepdim=True)
-    mine, theirs = real_harmonics(d, 3), sh.sh_basis(d, 3)
+    mine, theirs = real_light_harmonics(d, 3), sh.sh_basis(d, 3)
     assert torch.allclose(mine.abs(), theirs.abs(), atol=1e-6)  # signs are a convention
 
 
@@ -210,16 +210,16 @@ def test_harmonics_are_orthonormal() -> None:
     i = torch.arange(n, dtype=torch.float64) + 0.5
     z, phi = 1 - 2 * i / n, i * math.pi * (1 + 5**0.5)
     d = torch.stack([(1 - z * z).sqrt() * phi.cos(), (1 - z * z).sqrt() * phi.sin(), z], -1)
-    y = real_harmonics(d, 5)
+    y = real_light_harmonics(d, 5)
     assert torch.allclose(y.T @ y * (4 * math.pi / n), torch.eye(36, dtype=torch.float64), atol=1e-3)
 
 
 def test_lights_on_the_command_line() -> None:
-    assert parse_lights("1,2,3")[0].tolist() == [1, 2, 3]
-    round_ = parse_lights("orbit:2:90:4")
+    assert parse_light_positions("1,2,3")[0].tolist() == [1, 2, 3]
+    round_ = parse_light_positions("orbit:2:90:4")
     assert len(round_) == 4 and round_[1].tolist() == pytest.approx([0, 2, 0], abs=1e-6)
-    assert len(parse_lights("orbit")) == 60
-    assert parse_intensities("2")[0].tolist() == [2, 2, 2]
+    assert len(parse_light_positions("orbit")) == 60
+    assert parse_light_intensities("2")[0].tolist() == [2, 2, 2]
 
 
 @pytest.mark.parametrize(
@@ -227,7 +227,7 @@ def test_lights_on_the_command_line() -> None:
 )
 def test_impossible_lights(text: str) -> None:
     with pytest.raises(ConfigError, match="expected x,y,z or orbit"):
-        parse_lights(text)
+        parse_light_positions(text)
 
 
 def test_gradients_reach_every_parameter() -> None:

@@ -13,7 +13,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.metrics import mean_metrics, psnr
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks import relight
-from neuprim.tasks.relight import pixel_class_errors, pixel_class_shares, relight_scores
+from neuprim.tasks.relight import relight_pixel_class_errors, relight_pixel_class_shares, relight_scores
 
 
 def images(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -36,7 +36,10 @@ def test_classes_pool_by_their_pixels() -> None:
     rendered, truth = images()
     first, second = torch.zeros(16, 16, dtype=torch.uint8), torch.full((16, 16), 2, dtype=torch.uint8)
     first[:4], second[:2] = 2, 0
-    entries = [pixel_class_errors(rendered, truth, first), pixel_class_errors(rendered + 0.1, truth, second)]
+    entries = [
+        relight_pixel_class_errors(rendered, truth, first),
+        relight_pixel_class_errors(rendered + 0.1, truth, second),
+    ]
     assert set(entries[0]) == {"mse_background", "pixels_background", "mse_cast_shadow", "pixels_cast_shadow"}
     pooled = mean_metrics(entries)
     squares = torch.cat(
@@ -44,16 +47,16 @@ def test_classes_pool_by_their_pixels() -> None:
     )  # one pool over both views
     assert pooled["psnr_pooled_cast_shadow"] == pytest.approx(-10 * torch.log10(squares.mean()).item(), abs=1e-4)
     assert pooled["pixels_cast_shadow"] == 64 + 224
-    shares = pixel_class_shares([first, second])
+    shares = relight_pixel_class_shares([first, second])
     assert shares == {"lit": 0.0, "cast_shadow": 100.0, "attached_shadow": 0.0, "highlight": 0.0}
 
 
 def test_wrong_class_maps_are_refused() -> None:
     rendered, truth = images()
     with pytest.raises(DataError, match="pixel classes"):
-        pixel_class_errors(rendered, truth, torch.zeros(8, 16, dtype=torch.uint8))
+        relight_pixel_class_errors(rendered, truth, torch.zeros(8, 16, dtype=torch.uint8))
     with pytest.raises(DataError, match="values up to 5"):
-        pixel_class_errors(rendered, truth, torch.full((16, 16), len(PIXEL_CLASSES), dtype=torch.uint8))
+        relight_pixel_class_errors(rendered, truth, torch.full((16, 16), len(PIXEL_CLASSES), dtype=torch.uint8))
 
 
 def test_flip_joins_the_scores_where_it_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:

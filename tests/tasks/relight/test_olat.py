@@ -99,7 +99,7 @@ def test_the_plainest_variant(folder: Path, context: SceneContext) -> None:
     assert all(v.dtype == torch.float32 and v.shape == (3,) for v in view.conditions.values())
     focal = 0.5 * SIZE / math.tan(0.4)
     assert (view.camera.fx, view.camera.fy, view.camera.cx) == (pytest.approx(focal), pytest.approx(focal), SIZE / 2)
-    mask = relight.matter_mask(dataset, 0)
+    mask = relight.relight_matter_mask(dataset, 0)
     assert mask is not None and not mask[0, 0] and mask[5, 5]
 
 

@@ -34,7 +34,7 @@ from shared.records import RESULTS, read_record, update_record
 from shared.tables import DOCS, Run, Table, between_markers, make_table
 
 from neuprim.config import ConfigWithTask, compose, load_config_task
-from neuprim.config.command_settings import TargetSettings
+from neuprim.config.command_settings import SearchTarget
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
@@ -114,7 +114,7 @@ def search(name: str, data: Sequence[str], work: Path, seed: int) -> list[dict[s
     for psnr in scene.targets:
         out = work / f"{name}-{psnr:g}-{seed}"
         config = compose([*words_of(name, data, out), f"model.primitives={scene.start}", f"seed={seed}"])
-        record = run_target(config, TargetSettings(psnr=psnr), scene.budget, tell)
+        record = run_target(config, SearchTarget(psnr=psnr), scene.budget, tell)
         full = [a for a in record.attempts if a.purpose == "full"]
         chosen = next(a for a in full if a.folder == record.chosen)
         runs.append(

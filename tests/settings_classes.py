@@ -22,6 +22,7 @@ REQUIRED: dict[str, Any] = {
     "task": {"name": "static"},
     "scene": {"name": "solids"},
     "preset": "quick",
+    "made_by": {"neuprim": "0.1.0", "task": {"name": "static", "package": "neuprim", "version": "0.1.0"}},
 }
 """What a dataclass needs beside its defaults."""
 

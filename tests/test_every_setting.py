@@ -22,7 +22,6 @@ GROUPS = {
     "ModelSettings": "model",
     "TrainSettings": "train",
     "PopulationSettings": "train.population",
-    "SolverSettings": "solver",
     "Optics": "scene.optics",
     "Light": "scene.optics.light",
     "LauncherSettings": "launcher",
@@ -54,7 +53,6 @@ def test_they_are_found() -> None:
         "VdbSceneSettings",
         "OlatSettings",
         "SolidsSettings",
-        "SolverSettings",
         "Optics",
     }
     assert all(dataclasses.is_dataclass(cls) for cls in CLASSES) and len(FIELDS) > 100

@@ -18,7 +18,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.config.command_settings import LauncherSettings, TargetSettings, ViewerSettings
+    from neuprim.config.command_settings import LauncherSettings, SearchTarget, ViewerSettings
     from neuprim.config.overrides import ConfigArguments
     from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
     from neuprim.runs.launch.jobs import JobResult
@@ -153,7 +153,7 @@ def run_one(
 
 
 def _search_target(
-    config: RunConfig, target: TargetSettings, budget: float, launcher: LauncherSettings, typed: ConfigArguments
+    config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: ConfigArguments
 ) -> int:
     """Search for a model that reaches a target; print what was achieved and the run's directory."""
     from neuprim.cli.progress import RunProgress

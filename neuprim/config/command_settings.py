@@ -65,7 +65,7 @@ class ViewerSettings:
 
 
 @dataclass(frozen=True)
-class TargetSettings:
+class SearchTarget:
     """What a model is to reach: ``target.psnr=30``.
 
     With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and ``megabytes`` and ``fps`` are
@@ -121,10 +121,10 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
     return (settings if coerce(shown, bool, "viewer") else None), others
 
 
-def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[TargetSettings, float] | None, list[str]]:
+def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
     """Return the target and its budget in seconds, None where neither is asked for, and the other overrides."""
     budget, _, rest = take_settings(overrides, "budget", _Budget)
-    whole, target, others = take_settings(rest, "target", TargetSettings)
+    whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
         return None, others
     if whole is not None:

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal, NamedTuple
 
-from neuprim.config.command_settings import TargetSettings
+from neuprim.config.command_settings import SearchTarget
 from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord
 
 ALLOWANCE, MIN_MARGIN = 0.1, 0.05
@@ -221,7 +221,7 @@ class SizePredictor:
         steps: primitives -> steps of a full run.
     """
 
-    target: TargetSettings
+    target: SearchTarget
     record: TargetRecord
     steps: Callable[[int], float]
 
@@ -351,7 +351,7 @@ def format_forecast(name: str, value: float, doubt: float) -> str:
     return f"{name} {value:.4f} ± {(high - low) / 2:.2g}"
 
 
-def exceeded_limit(target: TargetSettings, attempt: Attempt, packed: int | None = None) -> str | None:
+def exceeded_limit(target: SearchTarget, attempt: Attempt, packed: int | None = None) -> str | None:
     """Return which limit of a target a model exceeds; None if none."""
     size = attempt.packed if packed is None else packed
     if target.megabytes is not None and size > 1e6 * target.megabytes:

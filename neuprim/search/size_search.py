@@ -11,7 +11,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from neuprim.config import RunConfig, load_config_task
-from neuprim.config.command_settings import TargetSettings
+from neuprim.config.command_settings import SearchTarget
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
@@ -122,7 +122,7 @@ class SizeSearch:
     """One search; resumes from its record."""
 
     config: RunConfig
-    target: TargetSettings
+    target: SearchTarget
     dataset: Dataset
     record: TargetRecord
     runner: TrialRunner

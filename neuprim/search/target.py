@@ -17,7 +17,7 @@ from typing import Any
 import torch
 
 from neuprim.config import ConfigWithTask, RunConfig, find_config_plugins, load_config_task
-from neuprim.config.command_settings import LauncherSettings, TargetSettings
+from neuprim.config.command_settings import LauncherSettings, SearchTarget
 from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import Quantizers
 from neuprim.core.data import Dataset
@@ -55,7 +55,7 @@ _MEASURES = ("psnr", "ssim")
 
 def run_target(
     config: RunConfig,
-    target: TargetSettings,
+    target: SearchTarget,
     budget: float,
     events: Events = ignore_run_event,
     clock: Callable[[], float] = time.monotonic,

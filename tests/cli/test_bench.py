@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -113,12 +114,7 @@ def test_it_estimates_runs_and_compares(
     words = ["bench", "paper", *names, *SMALL]
     assert main([*words, "--estimate"]) == 0
     out = capsys.readouterr().out
-    for text in (
-        "200, chair: ",
-        "ms a step at the start, 12 steps",
-        "2 runs, about 0 s of training on this machine, and",
-    ):
-        assert text in out
+    assert re.search(r"200, chair: \d+ ms a step at the start, 12 steps\n2 runs, about \d+ s of training", out)
     assert not Path("outputs").exists()
     assert main(words) == 0
     out = capsys.readouterr().out

@@ -10,7 +10,7 @@ import pytest
 from neuprim.config.command_settings import (
     LOOPBACK,
     LauncherSettings,
-    TargetSettings,
+    SearchTarget,
     ViewerSettings,
     parse_duration_setting,
     take_launcher_overrides,
@@ -43,12 +43,12 @@ PROCESSES = "launcher=processes"
         (
             take_target_overrides,
             ["target.psnr=30", "target.megabytes=1.5", BUDGET],
-            (TargetSettings(psnr=30, megabytes=1.5), 600.0),
+            (SearchTarget(psnr=30, megabytes=1.5), 600.0),
         ),
         (
             take_target_overrides,
             ["target.fps=30", "budget=1h", "target.fps=60", "budget=1.5m"],
-            (TargetSettings(fps=60), 90.0),
+            (SearchTarget(fps=60), 90.0),
         ),
     ],
 )

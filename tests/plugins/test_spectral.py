@@ -231,7 +231,7 @@ def test_without_a_display_it_is_said_what_is_shown(
     request = InspectRequest(out, ("primitives",), grid=8, out=tmp_path / "page.html")
     inspect_run(request, lambda event: lines.append(event.text))
     assert f"shown: {SHOWN}" in lines
-    monkeypatch.setattr(mesh, "_sample", lambda *a: pytest.fail("too late"))
+    monkeypatch.setattr(mesh, "_sample_exported_density", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):
         export_run(out, "mesh", words=["wavelength_shift=0"])
 

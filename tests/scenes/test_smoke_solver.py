@@ -11,7 +11,7 @@ from neuprim.scenes.smoke.smoke_scenes import TurbulenceNoise
 from neuprim.scenes.smoke.solver import (
     Faces,
     GasForcing,
-    GasSettings,
+    GasProperties,
     GasState,
     SmokeBox,
     advance_gas,
@@ -111,7 +111,7 @@ def test_hot_gas_rises_and_soot_falls() -> None:
     box = SmokeBox((20, 20, 30), 1 / 20)
     hot = blob(box, (0.0, 0.0, 0.7), 0.15)
     nothing = torch.zeros(box.shape)
-    settings = GasSettings(buoyancy=3.0, weight=3.0, confinement=0.0, cooling=0.0, dissipation=0.0)
+    settings = GasProperties(buoyancy=3.0, weight=3.0, confinement=0.0, cooling=0.0, dissipation=0.0)
     for density, temperature, sign in ((nothing, hot, 1), (hot, nothing, -1)):
         state = GasState(box.air_at_rest(), density, temperature, nothing)
         for _ in range(8):
@@ -124,7 +124,7 @@ def test_hot_gas_rises_and_soot_falls() -> None:
 def test_fuel_burns_to_heat_and_soot() -> None:
     box = BOX
     full, nothing = torch.ones(box.shape), torch.zeros(box.shape)
-    settings = GasSettings(
+    settings = GasProperties(
         buoyancy=0.0, weight=0.0, confinement=0.0, cooling=0.0, dissipation=0.0, burn=2.0, heat=0.8, soot=0.5
     )
     state = GasState(box.air_at_rest(), nothing, nothing, full)

@@ -10,7 +10,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.config.command_settings import TargetSettings
+from neuprim.config.command_settings import SearchTarget
 from neuprim.search import size_search
 from neuprim.search.size_forecast import SizePredictor
 from neuprim.search.size_search import SizeSearch
@@ -109,7 +109,7 @@ class SimulatedRunner(TrialRunner):
 
 
 def simulate_search(
-    curves: dict[str, Curves], target: TargetSettings, start: int, seed: int = 0, more: Callable[..., Any] | None = None
+    curves: dict[str, Curves], target: SearchTarget, start: int, seed: int = 0, more: Callable[..., Any] | None = None
 ) -> tuple[Attempt, SimulatedRunner]:
     """Search with simulated trainings; returns the chosen full run."""
     train = SimpleNamespace(iterations=3000)

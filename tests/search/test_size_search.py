@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from neuprim.config.command_settings import TargetSettings
+from neuprim.config.command_settings import SearchTarget
 from neuprim.search.size_forecast import (
     SizeCurve,
     SizePredictor,
@@ -51,7 +51,7 @@ def test_replays_of_the_recorded_grids_find_the_smallest_model(smallest: Any) ->
     for name, start in STARTS.items():
         grid, curves = RESULTS[name]["grid"], from_grid(RESULTS[name]["grid"])
         for run in RESULTS[name]["runs"]:
-            chosen, _ = simulate_search(curves, TargetSettings(psnr=run["target"]), start, run["seed"])
+            chosen, _ = simulate_search(curves, SearchTarget(psnr=run["target"]), start, run["seed"])
             assert chosen.measured("psnr") >= run["target"], name
             ratios.append((chosen.packed / smallest(grid, run["target"]), name, run["target"], run["seed"]))
     assert len(ratios) == 15 and sum(ratio <= 1.15 for ratio, *_ in ratios) >= 13, ratios
@@ -60,18 +60,18 @@ def test_replays_of_the_recorded_grids_find_the_smallest_model(smallest: Any) ->
 @pytest.mark.parametrize("start", [20, 160, 3000])
 def test_the_start_does_not_decide(smallest: Any, start: int) -> None:
     grid = RESULTS["solids"]["grid"]
-    chosen, runner = simulate_search(from_grid(grid), TargetSettings(psnr=26.0), start)
+    chosen, runner = simulate_search(from_grid(grid), SearchTarget(psnr=26.0), start)
     assert chosen.packed / smallest(grid, 26.0) <= 1.25 and runner.seconds_spent <= 60.0
 
 
 def test_an_unreachable_target_is_reported_before_full_runs() -> None:
-    _, runner = simulate_search(from_grid(RESULTS["solids"]["grid"]), TargetSettings(psnr=60.0), 160)
+    _, runner = simulate_search(from_grid(RESULTS["solids"]["grid"]), SearchTarget(psnr=60.0), 160)
     reported = next(i for i, note in enumerate(runner.notes) if "target.psnr=60 is out of reach" in note)
     assert reported < next(i for i, note in enumerate(runner.notes) if note.startswith("full run"))
 
 
 def test_limits_alone_are_used_up() -> None:
-    chosen, _ = simulate_search(from_grid(RESULTS["chair"]["grid"]), TargetSettings(megabytes=0.03), 400)
+    chosen, _ = simulate_search(from_grid(RESULTS["chair"]["grid"]), SearchTarget(megabytes=0.03), 400)
     assert 0.6 * 30000 <= chosen.packed <= 30000
 
 
@@ -121,48 +121,48 @@ def test_times_are_lines_that_neither_fall_nor_start_below_zero() -> None:
 # ---------------------------------------------------------------- the record, read with a target
 
 
-def predictor(target: TargetSettings, *attempts: Attempt, turns: Sequence[SettingChange] = ()) -> SizePredictor:
+def predictor(target: SearchTarget, *attempts: Attempt, turns: Sequence[SettingChange] = ()) -> SizePredictor:
     record = TargetRecord({}, {}, length=200, attempts=list(attempts), turns=list(turns))
     return SizePredictor(target, record, lambda n: 800.0)
 
 
 def test_full_runs_correct_the_forecasts_of_other_sizes() -> None:
     trials = [attempt(n, steps, q) for n, q in ((100, 24.0), (200, 26.0)) for steps, q in ((100, q - 1), (200, q))]
-    before = dict(predictor(TargetSettings(psnr=26.0), *trials).margins())
+    before = dict(predictor(SearchTarget(psnr=26.0), *trials).margins())
     full = attempt(100, 800, before[100] + 26.0 - 2.0, "full")
-    after = dict(predictor(TargetSettings(psnr=26.0), *trials, full).margins())
+    after = dict(predictor(SearchTarget(psnr=26.0), *trials, full).margins())
     assert after[100] == pytest.approx(before[100] - 2.0) and after[200] == pytest.approx(before[200] - 2.0)
 
 
 def test_between_full_runs_that_bracket_the_target_only_these_count() -> None:
     trials = [attempt(n, 200, 20.0 + n / 100) for n in (100, 200, 300, 400)]
     full = [attempt(100, 800, 25.0, "full"), attempt(400, 800, 27.0, "full")]
-    assert [n for n, _ in predictor(TargetSettings(psnr=26.0), *trials, *full).margins()] == [100, 400]
+    assert [n for n, _ in predictor(SearchTarget(psnr=26.0), *trials, *full).margins()] == [100, 400]
 
 
 def test_the_least_measure_counts() -> None:
-    both = predictor(TargetSettings(psnr=30.0, ssim=0.9), attempt(100, 800, 31.0, "full"))
+    both = predictor(SearchTarget(psnr=30.0, ssim=0.9), attempt(100, 800, 31.0, "full"))
     assert both.margin({"psnr": 31.0, "ssim": 0.8}) == pytest.approx(to_decibels("ssim", 0.8) - 10)
-    assert both.measures == ("psnr", "ssim") and predictor(TargetSettings(megabytes=1)).margin({"psnr": 31.0}) == 31.0
+    assert both.measures == ("psnr", "ssim") and predictor(SearchTarget(megabytes=1)).margin({"psnr": 31.0}) == 31.0
 
 
 def test_trainings_before_a_changed_setting_pay_its_loss() -> None:
     turn = SettingChange("model.neurons", 4, 2, {"psnr": 0.5}, 0.8, True)
     plain, changed = attempt(100, 800, 30.0, "full"), attempt(200, 800, 31.0, "full", words={"model.neurons": 2})
     other = attempt(300, 800, 33.0, "full", words={"model.neurons": 1})
-    margins = dict(predictor(TargetSettings(psnr=29.0), plain, changed, other, turns=[turn]).margins())
+    margins = dict(predictor(SearchTarget(psnr=29.0), plain, changed, other, turns=[turn]).margins())
     assert margins == {100: pytest.approx(0.5), 200: pytest.approx(2.0)}
 
 
 def test_limits_of_bytes_and_speed() -> None:
     trials = [attempt(n, 200, 20.0, ms_per_frame=n / 100) for n in (100, 1000)]
-    assert predictor(TargetSettings(megabytes=0.011), *trials).limit() == pytest.approx(483, abs=3)
-    assert predictor(TargetSettings(fps=100), *trials).limit() == pytest.approx(1000, abs=2)
-    assert predictor(TargetSettings(psnr=1), *trials).limit() is None
-    assert "MB are more" in str(exceeded_limit(TargetSettings(megabytes=0.01), trials[1]))
+    assert predictor(SearchTarget(megabytes=0.011), *trials).limit() == pytest.approx(483, abs=3)
+    assert predictor(SearchTarget(fps=100), *trials).limit() == pytest.approx(1000, abs=2)
+    assert predictor(SearchTarget(psnr=1), *trials).limit() is None
+    assert "MB are more" in str(exceeded_limit(SearchTarget(megabytes=0.01), trials[1]))
     assert (
-        "frames per second" in str(exceeded_limit(TargetSettings(fps=1000), trials[1]))
-        and exceeded_limit(TargetSettings(fps=90), trials[1]) is None
+        "frames per second" in str(exceeded_limit(SearchTarget(fps=1000), trials[1]))
+        and exceeded_limit(SearchTarget(fps=90), trials[1]) is None
     )
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import pytest
 
 from neuprim.config import ConfigWithTask, RunConfig, compose
-from neuprim.config.command_settings import LauncherSettings, TargetSettings
+from neuprim.config.command_settings import LauncherSettings, SearchTarget
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.fit import Event, Note, Step
 from neuprim.runs.launch.jobs import JobResult
@@ -81,7 +81,7 @@ def config(out: Path, *more: str) -> RunConfig:
 
 def search(out: Path, psnr: float, *more: str, clock: Clock | None = None) -> tuple[TargetRecord, Clock]:
     clock = clock or Clock()
-    return run_target(config(out, *more), TargetSettings(psnr=psnr), BUDGET, clock.hear, clock), clock
+    return run_target(config(out, *more), SearchTarget(psnr=psnr), BUDGET, clock.hear, clock), clock
 
 
 @pytest.fixture(scope="module")
@@ -122,7 +122,7 @@ def test_another_target_keeps_the_trainings(met: Met, tmp_path: Path) -> None:
     out, record, _ = met
     copy, clock = tmp_path / "copy", Clock()
     shutil.copytree(out, copy)
-    again = run_target(config(copy, "resume=true"), TargetSettings(megabytes=0.004), BUDGET, clock.hear, clock)
+    again = run_target(config(copy, "resume=true"), SearchTarget(megabytes=0.004), BUDGET, clock.hear, clock)
     assert trainings(again)[:3] == trainings(record)[:3] and any("are kept" in note for note in clock.notes)
     assert again.asked == {"megabytes": 0.004, "budget": BUDGET} and again.achieved["packed_bytes"] <= 4000
     assert again.warning is None
@@ -161,7 +161,7 @@ def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: py
     monkeypatch.setattr(target, "_publish_target", lambda runner, predictor: None)
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
     settings = LauncherSettings("processes")
-    record = run_target(config(tmp_path / "run"), TargetSettings(psnr=20.0), BUDGET, clock.hear, clock, settings)
+    record = run_target(config(tmp_path / "run"), SearchTarget(psnr=20.0), BUDGET, clock.hear, clock, settings)
     assert asked[:2] == [1, 2], "the pace alone, then pairs"
     assert all(a.outcome is not None for a in record.attempts) and record.finished("full")
     assert not (tmp_path / "run" / ".lock").exists()
@@ -213,7 +213,7 @@ def test_what_cannot_be_searched_is_refused(met: Met, tmp_path: Path) -> None:
     expected = r"budget=20s: a full run of 40 primitives would have \d+ steps; expected 256 or more, or \d+ s"
     clock = Clock()
     with pytest.raises(ConfigError, match=expected):
-        run_target(config(tmp_path / "short"), TargetSettings(psnr=20.0), 20.0, clock.hear, clock)
+        run_target(config(tmp_path / "short"), SearchTarget(psnr=20.0), 20.0, clock.hear, clock)
     with pytest.raises(DataError, match="3 training views; a target needs 4 or more"):
         search(tmp_path / "few", 20.0, "scene.train_views=3")
     with pytest.raises(ConfigError, match=r"target.json: begun with another model"):

@@ -31,7 +31,7 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
 from neuprim.core.validation import Range
 from neuprim.scenes.image_set import Progress, write_cached_folder
-from neuprim.scenes.smoke.solver import GasForcing, GasSettings, GasSource, GasState, SmokeBox, advance_gas
+from neuprim.scenes.smoke.solver import GasForcing, GasProperties, GasSource, GasState, SmokeBox, advance_gas
 
 SOLVER_VERSION = 1
 """Part of the cache's key: raise it with every change to the solver, the scenes' sources or the files' layout."""
@@ -134,7 +134,7 @@ class SmokeScene:
     timesteps: int
     frame_time: float
     grids: tuple[str, ...]
-    solver: GasSettings
+    solver: GasProperties
     forcing: Callable[[SmokeStage, float], GasForcing]
 
     @property
@@ -172,7 +172,7 @@ SMOKE_FIRE = SmokeScene(
     100,
     1 / 25,
     ("density", "temperature", "flames"),
-    GasSettings(
+    GasProperties(
         buoyancy=4.0, weight=0.2, confinement=0.5, cooling=0.7, dissipation=0.35, burn=1.9, heat=0.7, soot=0.8,
         expansion=1.5, drag=0.1,
     ),
@@ -212,7 +212,7 @@ COLORFUL_SMOKE = SmokeScene(
     128,
     1 / 30,
     ("density", "temperature", "color"),
-    GasSettings(buoyancy=1.6, weight=0.05, confinement=0.4, cooling=0.4, dissipation=0.22, drag=0.15),
+    GasProperties(buoyancy=1.6, weight=0.05, confinement=0.4, cooling=0.4, dissipation=0.22, drag=0.15),
     _force_colorful_smoke,
 )
 
@@ -264,7 +264,7 @@ GROUND_EXPLOSION = SmokeScene(
     130,
     1 / 36,
     ("density", "temperature", "flames"),
-    GasSettings(
+    GasProperties(
         buoyancy=3.6, weight=0.35, confinement=0.35, cooling=0.7, radiation=0.3, dissipation=0.25, burn=0.75, heat=0.3,
         soot=0.8, expansion=2.0, drag=0.25,
     ),
@@ -320,7 +320,7 @@ DUST_TORNADO = SmokeScene(
     100,
     1 / 24,
     ("density", "temperature"),
-    GasSettings(buoyancy=0.3, weight=0.15, confinement=0.45, cooling=0.3, dissipation=0.3, drag=0.1),
+    GasProperties(buoyancy=0.3, weight=0.15, confinement=0.45, cooling=0.3, dissipation=0.3, drag=0.1),
     _force_dust_tornado,
 )
 

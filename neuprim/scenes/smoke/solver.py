@@ -130,7 +130,7 @@ def _to_faces(centred: Tensor) -> Faces:
 
 
 @dataclass(frozen=True)
-class GasSettings:
+class GasProperties:
     """What the gas is like.
 
     Attributes:
@@ -223,7 +223,7 @@ class GasForcing(NamedTuple):
     fade: Tensor | None = None
 
 
-def advance_gas(state: GasState, settings: GasSettings, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
+def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
     """As many equal steps over ``time`` seconds as the fastest gas needs."""
     fastest = max(float(component.abs().max()) for component in state.velocity)
     count = min(max(math.ceil(fastest * time / box.cell / settings.cfl), 1), settings.most_steps)
@@ -232,7 +232,7 @@ def advance_gas(state: GasState, settings: GasSettings, box: SmokeBox, forcing: 
     return state
 
 
-def step_gas(state: GasState, settings: GasSettings, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
+def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
     """The gas ``time`` seconds later; its velocity is free of divergence, to rounding."""
     before = _to_centres(state.velocity)
     wind = before
@@ -274,7 +274,7 @@ def step_gas(state: GasState, settings: GasSettings, box: SmokeBox, forcing: Gas
 
 
 def _burn_fuel(
-    density: Tensor, temperature: Tensor, fuel: Tensor, settings: GasSettings, time: float
+    density: Tensor, temperature: Tensor, fuel: Tensor, settings: GasProperties, time: float
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), so flames end sharply; then the gas cools."""
     burnt = fuel.clamp_max(settings.burn * time)
@@ -286,7 +286,7 @@ def _burn_fuel(
 
 
 def _gas_acceleration(
-    velocity: Tensor, density: Tensor, temperature: Tensor, settings: GasSettings, box: SmokeBox
+    velocity: Tensor, density: Tensor, temperature: Tensor, settings: GasProperties, box: SmokeBox
 ) -> Tensor:
     """(3, X, Y, Z) acceleration: buoyancy, weight, and vorticity confinement e h (N x w) with w = curl u and N =
     grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001), which gives small eddies back what interpolation takes."""

@@ -61,7 +61,7 @@ def test_any_part_at_a_time_gives_the_same_bits(name: str, most: int, monkeypatc
 
 def test_blocks_may_come_in_any_order(monkeypatch: pytest.MonkeyPatch) -> None:
     """The last first, each as if it were alone."""
-    whole, genuine, blocks = filled(), density_grid_warp.launch, []
+    whole, genuine, blocks = filled(), density_grid_warp.launch_kernel, []
 
     def one_by_one(kernel: Any, dim: Any, inputs: Sequence[Any], where: torch.device, block: int) -> None:
         starts = inputs[0].tensor

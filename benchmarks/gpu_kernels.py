@@ -60,7 +60,7 @@ Row = dict[str, Any]
 def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     """(name, kernel, threads of a block) of a form, or of every frame."""
     if name == EVERY:
-        yield "prepare", prepare.prepare_kernel(False), PER_BLOCK
+        yield "prepare", prepare.project_primitives_kernel(False), PER_BLOCK
         yield "prepare, backward", prepare_backward._prepare_backward_kernel(False), PER_BLOCK
         yield "rows in float64", prepare.wide_kernel(False), PER_BLOCK
         yield "network units", colour_net._colour_net_kernels(False)[0], PER_BLOCK

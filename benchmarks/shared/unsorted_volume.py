@@ -22,7 +22,7 @@ from neuprim.core.model.geometry import PrimitiveChords, quaternion_to_matrix
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import render_lowered
 from neuprim.core.render.near_plane import resolve_near
-from neuprim.core.render.reference.backend import pixel_directions, screen_boxes
+from neuprim.core.render.reference.backend import pixel_ray_directions, screen_boxes
 from neuprim.core.settings import RenderSettings, SortOrder
 
 Keep = Literal["opacity", "density"]
@@ -79,7 +79,7 @@ class _Volume:
 
     def draw(self, background: Tensor) -> Tensor:
         camera, channels = self.camera, self.channels
-        directions = pixel_directions(camera)
+        directions = pixel_ray_directions(camera)
         boxes = screen_boxes(self.lowered.geometry, camera, self.settings.near_plane)
         image = torch.zeros(camera.height, camera.width, channels + 1, dtype=torch.float64)
         for y in range(0, camera.height, _BLOCK):

@@ -244,9 +244,9 @@ def _describe_package(name: str, needed: list[tuple[Requirement, str]]) -> str:
 def _list_devices() -> Rows:
     import torch
 
-    from neuprim.core.render.backends import gpu_unavailable
+    from neuprim.core.render.backends import gpu_backends_unavailable
 
-    missing = gpu_unavailable()
+    missing = gpu_backends_unavailable()
     rows = [("used by runs", "yes" if missing is None else f"no: {missing}")]
     if torch.version.cuda is None:
         return [("none", f"torch {torch.__version__} is a CPU build"), *rows]

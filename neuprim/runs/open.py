@@ -20,7 +20,7 @@ from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.backends import best_render_device, computing_device, with_available_device
+from neuprim.core.render.backends import best_render_backend_device, computing_device, with_available_render_backend
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.density_truth import VolumeSource
 from neuprim.plugins.attribution import attribute_errors
@@ -86,7 +86,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     task = ConfigWithTask.of(config).task
     warn_of_other_neuprim(config.made_by, config.source)
     model, header = load_model(model_file(run), task)
-    config = replace(config, renderer=with_available_device(config.renderer))
+    config = replace(config, renderer=with_available_render_backend(config.renderer))
     stored = StoredRun(config, task, run, model, header, task)
     if any(spec.place for spec in task.conditions) and not stored.world.identity:
         task = replace(task, conditions=tuple(spec.within(stored.world) for spec in task.conditions))
@@ -151,7 +151,7 @@ def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> Tra
 
 def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
     """The model on the device where views like this one are best drawn."""
-    return model.to(best_render_device(model, settings, view.camera, view.conditions))
+    return model.to(best_render_backend_device(model, settings, view.camera, view.conditions))
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:

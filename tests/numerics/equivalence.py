@@ -17,7 +17,7 @@ from neuprim.core.model.fields import CustomColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.backends import REFERENCE
 from neuprim.core.render.output import Contributions
-from neuprim.core.render.reference.backend import pixel_directions
+from neuprim.core.render.reference.backend import pixel_ray_directions
 from tests import scenes
 from tests.backends import by
 from tests.numerics.cases import Case
@@ -87,7 +87,7 @@ def entries(t: dict[str, Tensor], camera: Camera, near: float) -> Tensor:
     """(N, H, W) camera-z at which each pixel's ray enters each ellipsoid, float64: ``near`` where that plane cuts it,
     inf if missed."""
     g = scenes.lowered({k: v.detach().double() for k, v in t.items()}).geometry
-    d = pixel_directions(camera)
+    d = pixel_ray_directions(camera)
     world = d @ camera.viewmat.detach().double()[:3, :3]
     to_sphere = g.rotations / g.scales[:, None, :]
     p = ((camera.position.detach().double() - g.means)[:, None] @ to_sphere)[:, 0]

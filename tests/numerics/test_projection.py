@@ -12,7 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.reference.backend import pixel_directions, screen_boxes
+from neuprim.core.render.reference.backend import pixel_ray_directions, screen_boxes
 from tests import scenes
 from tests.backends import FAST, by
 
@@ -21,7 +21,7 @@ NEAR = 0.01
 
 def hits(g: Geometry, row: int, camera: Camera, near: float = NEAR) -> Tensor:
     """(H, W) whether the ray through each pixel centre meets ellipsoid ``row`` in front of the near plane, float64."""
-    d = pixel_directions(camera)
+    d = pixel_ray_directions(camera)
     world = d @ camera.viewmat[:3, :3]
     to_sphere = (quaternion_to_matrix(g.quats[row]) / g.scales[row]).T
     p, v = to_sphere @ (camera.position - g.means[row]), world @ to_sphere.T

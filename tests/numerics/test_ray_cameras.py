@@ -13,7 +13,7 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
-from neuprim.core.render.reference.backend import _PreparedPrimitives, frame_rays, pixel_directions
+from neuprim.core.render.reference.backend import _PreparedPrimitives, frame_rays, pixel_ray_directions
 from tests import scenes
 
 EYE = torch.eye(4, dtype=torch.float64)
@@ -31,7 +31,7 @@ def ball(center: tuple[float, float, float], radius: float, density: float) -> d
 
 
 def same_rays(camera: Camera) -> RayCamera:
-    return RayCamera(camera.viewmat, pixel_directions(camera))
+    return RayCamera(camera.viewmat, pixel_ray_directions(camera))
 
 
 def orders_agree(t: dict[str, Tensor], camera: Camera) -> bool:
@@ -70,7 +70,7 @@ def test_a_pinhole_s_own_rays_draw_the_pinhole_s_image() -> None:
         for v in (camera, same_rays(camera))
     )
     assert z is not None and distance is not None and z.max() > 1
-    assert torch.allclose(distance * pixel_directions(camera)[..., 2], z, rtol=1e-12)
+    assert torch.allclose(distance * pixel_ray_directions(camera)[..., 2], z, rtol=1e-12)
 
 
 @pytest.mark.parametrize("kind", ["equirectangular", "fisheye"])

@@ -12,7 +12,7 @@ from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
-from neuprim.core.render.reference.backend import pixel_directions
+from neuprim.core.render.reference.backend import pixel_ray_directions
 from tests import scenes
 from tests.backends import BACKENDS, by
 from tests.numerics.cases import case
@@ -99,7 +99,7 @@ def test_a_colour_network_is_its_formula(sort: str) -> None:
     for settings in (s, replace(s, near=2.9), replace(s, samples=2)):
         a, b = (render_lowered(x, camera, settings).rgb for x in (low, other))
         assert a.max() > 0.2 and (a - b).abs().max() < 1e-12
-    rays = RayCamera(camera.viewmat, pixel_directions(camera))
+    rays = RayCamera(camera.viewmat, pixel_ray_directions(camera))
     assert choose_backend(low, RenderSettings(), rays).name == "reference"
     near = replace(s, near=1e-6)
     a, b = render_lowered(low, rays, near).rgb, render_lowered(low, camera, near).rgb

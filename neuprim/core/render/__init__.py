@@ -18,7 +18,7 @@ from neuprim.core.model.fields import Constant, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
-from neuprim.core.render.draw import draw_on_device, draw_samples, draw_shaded
+from neuprim.core.render.draw import draw_on_device, draw_pixel_samples, draw_shaded_view
 from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
 from neuprim.core.settings import RenderSettings
@@ -69,7 +69,7 @@ def render(
     with limit_threads(settings.threads) if settings.threads else nullcontext():
         lowered = model.lower(camera, conditions or {}, settings)
         lowered.check_frame(camera.viewmat, background)
-        return _draw_checked(lowered, camera, settings, background)
+        return _render_checked_view(lowered, camera, settings, background)
 
 
 def render_lowered(
@@ -77,7 +77,7 @@ def render_lowered(
 ) -> RenderOutput:
     """Draw a model whose conditions are folded in already; the same errors as :func:`render`."""
     lowered.check(camera.viewmat, background)
-    return _draw_checked(lowered, camera, settings, background)
+    return _render_checked_view(lowered, camera, settings, background)
 
 
 def _draw_checked(
@@ -94,7 +94,7 @@ def _draw_checked(
     if background is not None:
         background = background.to(lowered.geometry.means.device, non_blocking=background.is_cpu)
     if lowered.shade is not None:
-        draw = draw_shaded(draw)
+        draw = draw_shaded_view(draw)
     if settings.samples == 1:
         output = draw(lowered, camera, background, settings)
     elif isinstance(camera, RayCamera):
@@ -102,7 +102,7 @@ def _draw_checked(
             f"renderer.samples={settings.samples}: only pinhole cameras are sampled; give a RayCamera more directions"
         )
     else:
-        output = draw_samples(draw, lowered, camera, background, settings)
+        output = draw_pixel_samples(draw, lowered, camera, background, settings)
     output.stats.rows = lowered.rows
     return output
 

@@ -96,11 +96,11 @@ def unsupported_by_kernels(lowered: LoweredPrimitives, camera: AnyCamera | None)
 
 
 @functools.cache
-def _warp_missing() -> str | None:
+def _cuda_backend_missing() -> str | None:
     return None if importlib.util.find_spec("warp") else "Warp is not installed: pip install 'neuprim[cuda]'"
 
 
-def _gpu_name() -> str:
+def _cuda_backend_name() -> str:
     return "cuda (no GPU)" if hardware.cuda_unavailable() else f"cuda ({torch.cuda.get_device_name()})"
 
 
@@ -116,8 +116,8 @@ TABLE: tuple[Backend, ...] = (
         "cuda",
         _backend_loader("cuda"),
         unsupported_by_kernels,
-        _gpu_name,
-        _warp_missing,
+        _cuda_backend_name,
+        _cuda_backend_missing,
         checks=True,
         devices=(hardware.CUDA, hardware.CPU),
         slabs=_backend_loader("cuda", "render_slabs"),
@@ -174,7 +174,7 @@ def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tu
     return own + candidate_backends(settings)
 
 
-def gpu_unavailable() -> str | None:
+def gpu_backends_unavailable() -> str | None:
     """Return why nothing is drawn on a GPU here; None if something is."""
     reason = hardware.cuda_unavailable()
     rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CUDA]
@@ -195,10 +195,10 @@ def check_backend_device(settings: RenderSettings) -> None:
         )
 
 
-def check_render_device(settings: RenderSettings) -> None:
+def check_render_backend(settings: RenderSettings) -> None:
     """Raise :class:`BackendUnavailable` for a GPU that is not there."""
     if settings.device == hardware.CUDA:
-        reason = gpu_unavailable() if settings.backend == AUTO else hardware.cuda_unavailable()
+        reason = gpu_backends_unavailable() if settings.backend == AUTO else hardware.cuda_unavailable()
         if reason is not None:
             raise BackendUnavailable(f"renderer.device={hardware.CUDA}: {reason}; expected {hardware.CPU} or {AUTO}")
     elif settings.device == AUTO and settings.backend != AUTO:
@@ -211,23 +211,23 @@ def check_render_device(settings: RenderSettings) -> None:
             )
 
 
-def with_available_device(settings: RenderSettings) -> RenderSettings:
+def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
     """Return the settings for drawing a finished run, perhaps on a machine without the run's GPU."""
-    gone = settings.device == hardware.CUDA and gpu_unavailable() is not None and settings.backend == AUTO
+    gone = settings.device == hardware.CUDA and gpu_backends_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 
 
-def best_render_device(
+def best_render_backend_device(
     model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions
 ) -> torch.device:
     """Return the device where a run keeps its tensors to draw frames like this one."""
-    check_render_device(settings)
+    check_render_backend(settings)
     if settings.device != AUTO:
         return hardware.current_device(settings.device)
     if settings.backend != AUTO:  # a first frame without a GPU says why it is not drawn
         on_gpu = find_backend(settings.backend).devices[0] == hardware.CUDA and hardware.cuda_unavailable() is None
         return hardware.current_device(hardware.CUDA if on_gpu else hardware.CPU)
-    if gpu_unavailable() is None:
+    if gpu_backends_unavailable() is None:
         rows = model.rows(torch.arange(min(model.count, _FEW), device=model.device))
         lowered = Primitives(model.density, model.colour, rows).lower(camera, conditions, shaded=False)
         if any(b.cannot_draw(lowered, camera) is None for b in TABLE if b.devices[0] == hardware.CUDA):
@@ -240,7 +240,7 @@ def computing_device(settings: RenderSettings) -> torch.device:
     kind: str = settings.device
     if kind == AUTO:
         kind = hardware.CUDA if settings.backend == AUTO else find_backend(settings.backend).devices[0]
-    missing = kind == hardware.CUDA and gpu_unavailable() is not None
+    missing = kind == hardware.CUDA and gpu_backends_unavailable() is not None
     return hardware.current_device(hardware.CPU if missing else kind)
 
 
@@ -249,7 +249,7 @@ def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera:
 
     Raises BackendUnavailable if the named one cannot, and ConfigError if there is none of the name.
     """
-    check_render_device(settings)
+    check_render_backend(settings)
     reasons = []
     for backend in candidate_backends(settings, lowered.kind):
         device = backend.drawing_device(settings)

@@ -26,19 +26,19 @@ def draw_samples(
     """Draw ``settings.samples`` squared rays per pixel: means of rgb and alpha, and of depth weighted by alpha."""
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
-    alpha = _average_samples(fine.alpha, n)
-    depth = None if fine.depth is None else mean_depth(_average_samples(fine.depth * fine.alpha, n), alpha)
+    alpha = _average_pixel_samples(fine.alpha, n)
+    depth = None if fine.depth is None else mean_depth(_average_pixel_samples(fine.depth * fine.alpha, n), alpha)
     fine.stats.samples = n  # contributions are per pixel; pairs and extra count the work really done
-    return RenderOutput(_average_samples(fine.rgb, n), alpha, depth, fine.stats)
+    return RenderOutput(_average_pixel_samples(fine.rgb, n), alpha, depth, fine.stats)
 
 
-def _average_samples(image: Tensor, n: int) -> Tensor:
+def _average_pixel_samples(image: Tensor, n: int) -> Tensor:
     """Means over n x n pixels of (n H, n W) or (n H, n W, C)."""
     h, w = image.shape[0] // n, image.shape[1] // n
     return image.reshape(h, n, w, n, *image.shape[2:]).mean((1, 3))
 
 
-def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
+def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
     """Return the (H, W, 3) float64 scene points at a depth image (H, W); no gradient."""
     depth = depth.detach().double()
     view = device.to_device_like(camera.viewmat.detach(), depth)
@@ -51,7 +51,7 @@ def unproject_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
     return (local - view[:3, 3]) @ view[:3, :3]
 
 
-def draw_shaded(draw: Draw) -> Draw:
+def draw_shaded_view(draw: Draw) -> Draw:
     """Return a draw function that multiplies the frame, not its background, by ``lowered.shade`` at the mean depth."""
 
     def shaded(
@@ -62,7 +62,7 @@ def draw_shaded(draw: Draw) -> Draw:
         assert output.depth is not None
         hit = output.alpha.detach() > 0
         factor = torch.ones_like(output.alpha, requires_grad=False)
-        points = unproject_depth(output.depth, camera)[hit]
+        points = unproject_rendered_depth(output.depth, camera)[hit]
         values = lowered.shade(points)
         factor[hit] = check_primitive_field_result(values, (len(points),), f"{lowered.owner('colour')}: shade").to(
             factor

@@ -17,7 +17,7 @@ from neuprim.core.errors import ConfigError, FormError
 from neuprim.core.model.fields import Conditions, Constant, LoweredColour
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.draw import unproject_depth
+from neuprim.core.render.draw import unproject_rendered_depth
 
 _CLEAR = 2e-4  # a transmittance above has no clamped primitive: one, at alpha_max = 0.9999, would halve it
 _WEAKEN = 1 / 8
@@ -75,7 +75,9 @@ class LayerFrame:
         if found.pixels is not None:
             assert self.drawn.depth is not None
             hit = self.drawn.alpha > 0
-            factor[hit] = factor[hit] * found.pixels(unproject_depth(self.drawn.depth, self.camera)[hit]).to(factor)
+            factor[hit] = factor[hit] * found.pixels(unproject_rendered_depth(self.drawn.depth, self.camera)[hit]).to(
+                factor
+            )
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def composite(self, colour: LoweredColour) -> Tensor:

@@ -39,7 +39,7 @@ def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tup
     return depths.min().item(), depths.median().item()
 
 
-def scene_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
+def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
     """Return the data set's extent, or the median depth of points (N, 3) where that is 100 times as large."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth

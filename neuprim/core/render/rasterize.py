@@ -71,7 +71,7 @@ def rasterize(
         palette = colour.rgb
     if background is None:
         background = torch.zeros(palette.shape[1], device=palette.device)
-    tensors = (camera.viewmat, background, palette, *primitive_tensors(lowered), *net)
+    tensors = (camera.viewmat, background, palette, *rasterizer_tensors(lowered), *net)
     stats = RenderStats(name, lowered.geometry.count)
     request = RasterRequest.of(lowered, camera, settings, stats, needs_grad(*tensors))
     rgb, transmittance, zsum = apply_autograd(operation, request, *tensors)
@@ -81,13 +81,13 @@ def rasterize(
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 
-def remember_input_types(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Keep dtypes and devices for :func:`input_gradients`, and let gradients that nobody asks for be None."""
+def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
+    """Keep dtypes and devices for :func:`rasterizer_input_gradients`; gradients that nobody asks for may be None."""
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
     ctx.set_materialize_grads(False)  # a depth image without a gradient costs the backward pass nothing
 
 
-def input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
+def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
     """Return what ``backward`` returns: a gradient for each input, from that of (R | t), (3, 4), and the others."""
     full = None
     if view is not None:

@@ -16,7 +16,7 @@ from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.render.near_plane import scene_extent
+from neuprim.core.render.near_plane import near_plane_extent
 from neuprim.core.train.settings import ModelSettings
 
 _USUAL_OPACITY = 0.5
@@ -61,7 +61,7 @@ def initial_model(
             f"{GIVE_POINTS}"
         )
     cameras = [dataset.train.view(i).camera for i in range(len(dataset.train))]
-    extent = scene_extent(dataset.extent, cloud.means, cameras)
+    extent = near_plane_extent(dataset.extent, cloud.means, cameras)
     if len(cloud.means) == 1:
         scales = torch.full((1,), 0.1 * extent)
     else:

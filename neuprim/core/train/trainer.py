@@ -24,8 +24,8 @@ from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.render.backends import best_render_device
-from neuprim.core.render.near_plane import resolve_near, scene_extent
+from neuprim.core.render.backends import best_render_backend_device
+from neuprim.core.render.near_plane import near_plane_extent, resolve_near
 from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.losses import MaxScreenSize, PointResult, point_loss, scale_anisotropy
@@ -102,7 +102,8 @@ class Trainer:
     that they are the same on every device.
 
     Attributes:
-        extent: the unit of position rates and size limits, see :func:`~neuprim.core.render.near_plane.scene_extent`.
+        extent: the unit of position rates and size limits, see
+            :func:`~neuprim.core.render.near_plane.near_plane_extent`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
         fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they
             are.
@@ -127,8 +128,8 @@ class Trainer:
         cameras = [train.view(i).camera for i in range(len(train))]
         self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
-        self.extent = scene_extent(dataset.extent, model.params["means"], cameras)
-        self.device = best_render_device(model, self.renderer, cameras[0], train.view(0).conditions)
+        self.extent = near_plane_extent(dataset.extent, model.params["means"], cameras)
+        self.device = best_render_backend_device(model, self.renderer, cameras[0], train.view(0).conditions)
         model.params = model.to(self.device).params
         self.prefetcher: Prefetcher | None = None
         if self.device.type == device.CUDA:

@@ -15,7 +15,7 @@ from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.reference.backend import pixel_directions
+from neuprim.core.render.reference.backend import pixel_ray_directions
 from neuprim.core.train.population import split_primitives
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
@@ -59,7 +59,7 @@ def test_closed_form_equals_quadrature(neurons: int, distance: float) -> None:
         t["means"] *= 0.2
         camera = scenes.camera(9, 7, distance=distance, fov=50, shift=(1.3, -0.7))
         alpha = render_lowered(scenes.lowered(t), camera, EXACT).alpha.reshape(-1)
-        local = pixel_directions(camera).reshape(-1, 3)
+        local = pixel_ray_directions(camera).reshape(-1, 3)
         depth = quadrature(t, camera.position, local @ camera.viewmat[:3, :3], EXACT.near / local[:, 2])
         expected = (-torch.expm1(-depth.clamp_min(0))).clamp_max(EXACT.alpha_max)
         assert (alpha - expected).abs().max() <= 1e-12

@@ -90,7 +90,7 @@ def test_auto_is_the_first_that_can_draw_the_frame(fake: Fake) -> None:
     assert render_lowered(low, camera, RenderSettings()).stats.backend == "fake" and fake.frames == 1
     fake.broken = "no such device"
     assert choose_backend(low, RenderSettings(), camera).name == "cpu"
-    here = ["cpu", "reference"] if backends.gpu_unavailable() else ["cuda", "cpu", "reference"]
+    here = ["cpu", "reference"] if backends.gpu_backends_unavailable() else ["cuda", "cpu", "reference"]
     assert [b.name for b in backends.available_backends()] == here
     assert backends.backend_names() == ("fake", "cuda", "cpu", "reference")
 
@@ -131,7 +131,8 @@ def test_gradients_of_intrinsics_are_asked_of_the_row(fake: Fake, monkeypatch: p
 
 def test_the_table_imports_no_backend() -> None:
     """Numba alone takes a second to import."""
-    program = "import sys, neuprim.core.render.backends as b, neuprim.cli; b.available_backends(); b.gpu_unavailable()"
+    program = "import sys, neuprim.core.render.backends as b, neuprim.cli; b.available_backends()"
+    program += "; b.gpu_backends_unavailable()"
     program += "; print('numba' in sys.modules, 'warp' in sys.modules)"
     found = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert found.stdout.split() == ["False", "False"]

@@ -10,7 +10,7 @@ import torch
 from neuprim.core.cameras.projections import RayCamera
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.draw import unproject_depth
+from neuprim.core.render.draw import unproject_rendered_depth
 from tests import scenes
 from tests.backends import BACKENDS, by
 
@@ -61,7 +61,7 @@ def test_gradients_are_those_of_the_product(backend: str) -> None:
         else:
             plain = render_lowered(scene, camera, replace(settings, depth=True))
             assert plain.depth is not None
-            points = unproject_depth(plain.depth, camera)
+            points = unproject_rendered_depth(plain.depth, camera)
             factor = torch.where(plain.alpha > 0, torch.sigmoid(points[..., 0]).to(plain.rgb), 1.0).detach()
             rgb = plain.rgb * factor[..., None]
         (rgb * weights.to(rgb)).sum().backward()
@@ -91,4 +91,6 @@ def test_ray_cameras_are_shaded_at_a_distance() -> None:
     length = rays.norm(dim=-1)
     camera = RayCamera(pinhole.viewmat, rays / length[..., None])
     depth = torch.rand(pinhole.height, pinhole.width, generator=torch.Generator().manual_seed(0)).double() + 1.0
-    assert torch.allclose(unproject_depth(depth * length, camera), unproject_depth(depth, pinhole), atol=1e-12)
+    assert torch.allclose(
+        unproject_rendered_depth(depth * length, camera), unproject_rendered_depth(depth, pinhole), atol=1e-12
+    )

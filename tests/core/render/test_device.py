@@ -17,7 +17,7 @@ from neuprim.core.compute.device import HOST
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.model.fields import CustomDensity
 from neuprim.core.render import RenderSettings, backends, render_lowered
-from neuprim.core.render.backends import best_render_device, choose_backend, computing_device
+from neuprim.core.render.backends import best_render_backend_device, choose_backend, computing_device
 from neuprim.runs.fit import prepare_training
 from tests import scenes
 from tests.core import tiny
@@ -70,7 +70,7 @@ def test_without_a_gpu_everything_is_computed_on_the_cpu(monkeypatch: pytest.Mon
     monkeypatch.setattr(device, "cuda_unavailable", lambda: MISSING)
     assert tiny.trainer(tiny.two_primitives(), 1).device == HOST
     assert {computing_device(RenderSettings(backend=name)) for name in ("auto", "cuda", "reference")} == {HOST}
-    assert backends.with_available_device(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
+    assert backends.with_available_render_backend(RenderSettings(device="cuda", near=0.5)) == RenderSettings(near=0.5)
 
 
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
@@ -120,10 +120,10 @@ def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.M
         (RenderSettings(backend="card"), CARD),
         (setting(CARD.type), CARD),
     ):
-        assert best_render_device(model, settings, camera, {}) == wanted, settings
+        assert best_render_backend_device(model, settings, camera, {}) == wanted, settings
     row = replace(backends.TABLE[0], unsupported=lambda low, camera: "this model")
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
-    assert best_render_device(model, RenderSettings(), camera, {}) == HOST
+    assert best_render_backend_device(model, RenderSettings(), camera, {}) == HOST
 
 
 def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:

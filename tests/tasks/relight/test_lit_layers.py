@@ -10,7 +10,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.fields import RayNet
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.draw import unproject_depth
+from neuprim.core.render.draw import unproject_rendered_depth
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
@@ -60,7 +60,7 @@ def test_shadows_of_pixels_multiply() -> None:
     assert visibility[one.drawn.alpha > 0].min() < 0.6
     assert (unshadowed * visibility[..., None] - one.drawn.rgb).abs().max() < 1e-5
     V = light_visibility(one.lowered.geometry, one.lowered.density, one.conditions["light"], EXACT)
-    expected = V(unproject_depth(one.drawn.depth, CAMERA).reshape(-1, 3)).reshape(visibility.shape)
+    expected = V(unproject_rendered_depth(one.drawn.depth, CAMERA).reshape(-1, 3)).reshape(visibility.shape)
     assert (visibility - torch.where(one.drawn.alpha > 0, expected, 0.0)).abs().max() < 1e-6
 
 

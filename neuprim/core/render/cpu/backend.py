@@ -17,9 +17,9 @@ from neuprim.core.model.checks import check_primitive_colours_finite, non_finite
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.backward import ImageGradient, backward_tiles, sum_gradient_rows
+from neuprim.core.render.cpu.backward import ImageGradient, backward_tiles, sum_tile_pair_gradients
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
-from neuprim.core.render.cpu.colour_net import ColourNet, colour_net_backward, prepare_colour_net
+from neuprim.core.render.cpu.colour_net import ColourNet, colour_net_backward, prepare_rasterizer_colour_net
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import SavedForBackward, TileImage, composite_tiles
 from neuprim.core.render.cpu.prepare import (
@@ -37,10 +37,10 @@ from neuprim.core.render.rasterize import (
     NET,
     PARAMETERS,
     RasterRequest,
-    input_gradients,
-    primitive_tensors,
     rasterize,
-    remember_input_types,
+    rasterizer_input_gradients,
+    rasterizer_tensors,
+    remember_rasterizer_inputs,
 )
 from neuprim.core.settings import RenderSettings
 
@@ -73,7 +73,7 @@ def _cpu_array(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.detach().resolve_neg().numpy())
 
 
-def _arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
+def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
     """By name and in one dtype, the widest, so that a mix does not compile kernels of its own."""
     arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
@@ -90,7 +90,7 @@ def _ray_norms(width: int, height: int, fx: float, fy: float, cx: float, cy: flo
     return result
 
 
-def _camera_view(camera: Camera, viewmat: Tensor, near: float, turns: float) -> View:
+def _rasterizer_view(camera: Camera, viewmat: Tensor, near: float, turns: float) -> View:
     matrix = viewmat.detach().double().numpy()
     R, t = np.ascontiguousarray(matrix[:3, :3]), np.ascontiguousarray(matrix[:3, 3])
     fx, fy, cx, cy = (float(x) for x in (camera.fx, camera.fy, camera.cx, camera.cy))
@@ -101,12 +101,12 @@ def _prepare_frame(
     request: RasterRequest, viewmat: Tensor, tensors: Sequence[Tensor], images: tuple[Array, int] | None = None
 ) -> _PreparedFrame:
     camera, settings = request.camera, request.settings
-    arrays, threads = _arrays_by_name(tensors), settings.threads
+    arrays, threads = _rasterizer_arrays_by_name(tensors), settings.threads
     parameters = PrimitiveArrays(*(arrays[name] for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
     projected = Projected.allocate(count, K)
     view, least = (
-        _camera_view(camera, viewmat, settings.near_plane, request.turns),
+        _rasterizer_view(camera, viewmat, settings.near_plane, request.turns),
         P.min_visible_depth(settings.alpha_min),
     )
     parallel_for(
@@ -117,7 +117,7 @@ def _prepare_frame(
         raise non_finite_primitive_error({name: torch.from_numpy(array) for name, array in arrays.items()}, int(bad[0]))
     in_float64, net_rows = projected.in_float64, None
     if "Wx" in arrays:
-        net_rows, fast = prepare_colour_net(np.arange(count), arrays, False, threads)
+        net_rows, fast = prepare_rasterizer_colour_net(np.arange(count), arrays, False, threads)
         in_float64 = in_float64 | fast
     slots, which = np.full(count, -1, np.int32), np.flatnonzero(in_float64 & (projected.status == P.VISIBLE))
     slots[which] = np.arange(len(which), dtype=np.int32)
@@ -128,7 +128,7 @@ def _prepare_frame(
     net = None
     if net_rows is not None:
         hidden = arrays["Wx"].shape[1]
-        net = ColourNet(net_rows, prepare_colour_net(which, arrays, True, threads)[0], hidden + hidden % 2)
+        net = ColourNet(net_rows, prepare_rasterizer_colour_net(which, arrays, True, threads)[0], hidden + hidden % 2)
     lists = bin_primitives(projected, camera.width, camera.height, threads, images)
     request.stats.extra["float64"], request.stats.pairs = len(which), lists.pairs
     frame = FrameArrays(
@@ -185,7 +185,7 @@ class _Rasterize(torch.autograd.Function):
             lanes, saved.depths = [n for n, _ in drawn], [depths for _, depths in drawn]
         request.stats.extra["forward_lanes"] = sum(lanes)
         ctx.frame, ctx.colors, ctx.image, ctx.saved = frame, colors, image, saved
-        remember_input_types(ctx, (viewmat, background, palette, *tensors))
+        remember_rasterizer_inputs(ctx, (viewmat, background, palette, *tensors))
         return torch.from_numpy(image.rgb), torch.from_numpy(image.transmittance), torch.from_numpy(image.zsum)
 
     @staticmethod
@@ -203,10 +203,10 @@ class _Rasterize(torch.autograd.Function):
         gradient = ImageGradient(
             transmittance=image.transmittance,
             last=image.last,
-            rgb=_float32_image(g_rgb),
-            g_transmittance=_float32_image(g_T + g_rgb @ torch.from_numpy(image.background)),
-            z=_float32_image(g_z) if with_depth and g_z is not None else np.zeros((1, 1), np.float32),
-            error=np.zeros((h, w), np.float32) if asked is None else _float32_image(asked.error.detach()),
+            rgb=_float32_render_image(g_rgb),
+            g_transmittance=_float32_render_image(g_T + g_rgb @ torch.from_numpy(image.background)),
+            z=_float32_render_image(g_z) if with_depth and g_z is not None else np.zeros((1, 1), np.float32),
+            error=np.zeros((h, w), np.float32) if asked is None else _float32_render_image(asked.error.detach()),
             pair_rows=pair_rows,
             with_depth=with_depth,
         )
@@ -224,7 +224,7 @@ class _Rasterize(torch.autograd.Function):
         request.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
         lists, primitives = frame.lists, (count, _PRIMITIVES_PER_CHUNK, threads)
-        parallel_for(sum_gradient_rows, *primitives, lists.first, lists.slots, pair_rows, grads, touched)
+        parallel_for(sum_tile_pair_gradients, *primitives, lists.first, lists.slots, pair_rows, grads, touched)
         parameters = frame.parameters
         out = PrimitiveArrays(*(np.zeros(x.shape, np.float32) for x in parameters))
         g_view = np.zeros((count if ctx.needs_input_grad[1] else 0, 3, 4), np.float64)
@@ -247,10 +247,10 @@ class _Rasterize(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             background = (g_rgb * torch.from_numpy(image.transmittance)[..., None]).sum((0, 1))
         results = (np.ascontiguousarray(grads[:, base : base + C]), *out, *g_net)
-        return input_gradients(ctx, view, (background, *map(torch.from_numpy, results)))
+        return rasterizer_input_gradients(ctx, view, (background, *map(torch.from_numpy, results)))
 
 
-def _float32_image(tensor: Tensor) -> Array:
+def _float32_render_image(tensor: Tensor) -> Array:
     return np.ascontiguousarray(tensor.resolve_neg().numpy(), np.float32)
 
 
@@ -267,7 +267,7 @@ def render_slabs(
     """Return opacity and depth of each slab, prepared as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means = lowered.geometry.means
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))
-    frame = _prepare_frame(request, camera.viewmat, primitive_tensors(lowered), (slabs.numpy(), count))
+    frame = _prepare_frame(request, camera.viewmat, rasterizer_tensors(lowered), (slabs.numpy(), count))
     shape, saved = (count, camera.height, camera.width), SavedForBackward.allocate(0)
     T, z = np.empty(shape, np.float32), np.empty(shape, np.float32)
     rgb, last = np.empty((*shape[1:], 1), np.float32), np.empty(shape[1:], np.int32)  # not used

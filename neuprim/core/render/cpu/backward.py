@@ -32,11 +32,11 @@ from neuprim.core.render.cpu.gradients import (
     neuron_gradients,
 )
 from neuprim.core.render.cpu.tiles import (
-    aligned_zeros,
+    aligned_tile_zeros,
     compact_lanes,
     lane_chords,
     pair_window,
-    prefetch_depths,
+    prefetch_lane_depths,
     prefetch_pair,
     row_spans,
 )
@@ -196,7 +196,7 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 
 @inline
-def _compact_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
+def _compact_lane_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
     """Move the lanes with a gradient together, zeros behind them; returns their number. Many lanes have none."""
     count = 0
     for k in range(0, n, P.TILE):
@@ -264,11 +264,11 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
     scratch = L.BACKWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = aligned_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    lanes, wide_lanes = aligned_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
-    slopes, pixels = aligned_zeros(neurons * L.NEURON_SCRATCH), aligned_zeros((6 + C) * P.PIXELS + 2 * P.TILE)
-    weights, rays, totals = aligned_zeros(P.TILE), aligned_zeros(P.TILE), aligned_zeros((2 + C) * P.TILE)
-    ends, begins, lives = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32), aligned_zeros(P.TILE)
+        waves = aligned_tile_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    lanes, wide_lanes = aligned_tile_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+    slopes, pixels = aligned_tile_zeros(neurons * L.NEURON_SCRATCH), aligned_tile_zeros((6 + C) * P.PIXELS + 2 * P.TILE)
+    weights, rays, totals = aligned_tile_zeros(P.TILE), aligned_tile_zeros(P.TILE), aligned_tile_zeros((2 + C) * P.TILE)
+    ends, begins, lives = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32), aligned_tile_zeros(P.TILE)
     S, D, V = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(slopes).reshape((neurons, L.NEURON_SCRATCH))
     state, w, cg, sums = borrow_array(pixels), borrow_array(weights), borrow_array(rays), borrow_array(totals)
     bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)
@@ -285,7 +285,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
             q = first + deepest - 1 - back
             if back + 1 < deepest:
                 prefetch_pair(np.int64(ids[q - 1]), frame)
-                prefetch_depths(depths, np.int64(first_lane[q - 1]), np.int64(first_lane[q]))
+                prefetch_lane_depths(depths, np.int64(first_lane[q - 1]), np.int64(first_lane[q]))
             i = ids[q]
             p, out = rows[i], pair_rows[q]
             rank = f(q - first + 1)
@@ -345,7 +345,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
                 for c in range(C):
                     out[color_at + c] = _sum_row(sums, (2 + c) * P.TILE)
             if later:
-                n16 = ((_compact_gradients(S, n16, neurons > AT_ONCE) + 15) // 16) * 16
+                n16 = ((_compact_lane_gradients(S, n16, neurons > AT_ONCE) + 15) // 16) * 16
                 evaluated += n16
             if later and neurons <= AT_ONCE:
                 gradients_at_once(S, n16, frame, pair, edge, out)
@@ -367,7 +367,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
 
 
 @exact_kernel
-def sum_gradient_rows(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
+def sum_tile_pair_gradients(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
     """grads[i] = sum of primitive i's pair rows, in pair order, for primitives ``start:stop``."""
     for i in range(start, stop):
         g = grads[i]

@@ -62,7 +62,7 @@ def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
 
 
 @inline_source
-def edge_weight(D, edge):  # type: ignore[no-untyped-def]
+def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
     """FADE of a whole chord, the mean of (1 - |y|^2)^p, and its derivative by D; 1 and 0 for a hard edge."""
     inner = max(D, f(0))
     if len(edge) == 0:

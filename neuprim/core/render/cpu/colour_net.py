@@ -16,7 +16,7 @@ from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.float64 import phase_float64
+from neuprim.core.render.cpu.float64 import chord_phase_float64
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 
 f = np.float32
@@ -70,7 +70,7 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
             fast[n] |= square > P.FLOAT64_TURNS**2
 
 
-def prepare_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
+def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
     """Return the network rows of primitives ``which``, float64 if ``wide``, and which of them have a fast unit."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
@@ -135,7 +135,7 @@ def colour_net_backward(  # type: ignore[no-untyped-def]
 
 
 @inline
-def _rgb_unit(p, o):  # type: ignore[no-untyped-def]
+def _ray_rgb_unit(p, o):  # type: ignore[no-untyped-def]
     return (
         p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], p[o + P.NET_OUT], p[o + P.NET_OUT + 1],
         p[o + P.NET_OUT + 2],
@@ -143,10 +143,10 @@ def _rgb_unit(p, o):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _add_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
+def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
     """RAY_COLOUR += output of two units, three channels; with ``slopes`` also their cos and d cos/d turn."""
-    ax, ay, az, ab, a0, a1, a2 = _rgb_unit(p, o)
-    bx, by, bz, bb, b0, b1, b2 = _rgb_unit(p, o2)
+    ax, ay, az, ab, a0, a1, a2 = _ray_rgb_unit(p, o)
+    bx, by, bz, bb, b0, b1, b2 = _ray_rgb_unit(p, o2)
     for k in range(n):
         qx, qy, qz = S[L.QX + k], S[L.QY + k], S[L.QZ + k]
         u = qx * ax + qy * ay + qz * az + ab
@@ -181,7 +181,7 @@ def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
 def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
     """The same from a float64 row and float64 chord middles."""
     for k in range(n):
-        r = phase_float64(D, k, p, o)
+        r = chord_phase_float64(D, k, p, o)
         z = r * r
         V0[L.NET_COS + k] = cos_turns(z)
         V0[L.NET_SIN + k] = -TAU * TAU * r * sinc_turns(z)
@@ -213,7 +213,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
     elif C == 3:
         for j in range(0, net.hidden, 2):
             o = (P.NET_OUT + 3) * j
-            _add_rgb_units(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, slopes)
+            _add_ray_rgb_units(S, V[j], V[j + 1], n, p, o, o + P.NET_OUT + 3, slopes)
     else:
         for j in range(net.hidden):
             _unit_waves(S, V[j], n, p, (P.NET_OUT + C) * j)
@@ -223,8 +223,8 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
     """Gradients of two units, three channels, and their share of dL/dQ."""
-    ax, ay, az, _, a0, a1, a2 = _rgb_unit(p, o)
-    bx, by, bz, _, b0, b1, b2 = _rgb_unit(p, o2)
+    ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
+    bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
     r0, r1, r2, r3, r4, r5, r6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
     for k in range(n):

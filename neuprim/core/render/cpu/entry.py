@@ -19,7 +19,7 @@ from neuprim.core.render.cpu.backward import lane_opacities, lane_optical_depths
 from neuprim.core.render.cpu.colour_net import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import chord_gradient, lanes_with_slopes, neuron_gradients
-from neuprim.core.render.cpu.tiles import box_pixels, compact_lanes, field_values, pair_window, row_spans
+from neuprim.core.render.cpu.tiles import box_pixels, chord_field_values, compact_lanes, pair_window, row_spans
 
 f = np.float32
 
@@ -129,7 +129,7 @@ def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge): 
             continue
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
-        field_values(S, D, n16, bounds, frame, pair, False, True, edge)
+        chord_field_values(S, D, n16, bounds, frame, pair, False, True, edge)
         lane_optical_depths(S, n16, edge)
         lane_opacities(S, n16, frame.alpha_min, frame.alpha_max)
         if net is not None:

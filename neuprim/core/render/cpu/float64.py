@@ -85,14 +85,14 @@ def chords_float64(S, X, n, bounds, frame, pair, with_mid, backward):  # type: i
 
 
 @inline
-def phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
+def chord_phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle of the unit at ``o`` of a float64 row, reduced to half a turn."""
     u = X[k + _Q0] * p[o + P.WX] + X[k + _Q1] * p[o + P.WY] + X[k + _Q2] * p[o + P.WZ] + p[o + P.PHASE]
     return f(u - np.rint(u))
 
 
 @inline
-def _reduced_phases(X, k, p, o):  # type: ignore[no-untyped-def]
+def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
     """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
@@ -106,7 +106,7 @@ def _hard_neurons(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
         for k in range(n):
-            r, s, v = _reduced_phases(X, k, p, o)
+            r, s, v = _reduced_chord_phases(X, k, p, o)
             sinc, c = sinc_turns(s * s), cos_turns(r * r)
             if V is not None:
                 slope = dsinc_turns(s * s) * f(2) * s
@@ -121,7 +121,7 @@ def _hard_neurons(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _bessel(z, j):  # type: ignore[no-untyped-def]
+def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
     """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
     if abs(z) < 2.0:
         square, power = 0.5 * z * z, 1.0
@@ -140,9 +140,9 @@ def _bessel(z, j):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _moments(z, j, M):  # type: ignore[no-untyped-def]
+def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
     """M[n] = C_n for even n, S_n for odd n, n = 0..5."""
-    _bessel(z, j)
+    _chord_bessel(z, j)
     M[0], M[1] = j[0], j[1]
     M[2], M[3] = (j[0] - 2.0 * j[2]) / 3.0, (3.0 * j[1] - 2.0 * j[3]) / 5.0
     M[4] = (7.0 * j[0] - 20.0 * j[2] + 8.0 * j[4]) / 35.0
@@ -182,8 +182,8 @@ def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
             continue
         for m in range(neurons):
             o = P.NEURONS + P.PER_NEURON * m
-            r, _, v = _reduced_phases(X, k, p, o)
-            _moments(_PI2 * v, j, M)
+            r, _, v = _reduced_chord_phases(X, k, p, o)
+            _chord_moments(_PI2 * v, j, M)
             c, s, a = np.float64(cos_turns(r * r)), np.float64(TAU * r * sinc_turns(r * r)), p[o + P.AMPLITUDE]
             even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]
             total += a * (c * even - s * odd)

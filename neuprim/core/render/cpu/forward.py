@@ -17,10 +17,10 @@ from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.colour_net import ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.tiles import (
-    aligned_zeros,
+    aligned_tile_zeros,
     box_pixels,
+    chord_field_values,
     compact_lanes,
-    field_values,
     pair_window,
     prefetch_pair,
     row_spans,
@@ -63,7 +63,7 @@ class SavedForBackward:
 
 
 @inline
-def _live_bits(rows_live):  # type: ignore[no-untyped-def]
+def _live_tile_row_bits(rows_live):  # type: ignore[no-untyped-def]
     bits = np.int64(0)
     for y in range(P.TILE):
         bits |= np.int64(rows_live[y] > f(0)) << y
@@ -216,12 +216,12 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
     scratch = L.FORWARD_SCRATCH
     if net is not None:
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
-        waves = aligned_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
-    lanes, wide_lanes = aligned_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
+        waves = aligned_tile_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
+    lanes, wide_lanes = aligned_tile_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
     pixels, weights, lives = (
-        aligned_zeros((4 + C) * P.PIXELS + 2 * P.TILE),
-        aligned_zeros(P.TILE),
-        aligned_zeros(P.TILE),
+        aligned_tile_zeros((4 + C) * P.PIXELS + 2 * P.TILE),
+        aligned_tile_zeros(P.TILE),
+        aligned_tile_zeros(P.TILE),
     )
     ends, begins = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32)
     S, D, state, w = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(pixels), borrow_array(weights)
@@ -251,10 +251,10 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
             row_spans(frame.spans[i], pair, rows_live, bounds)
             n = compact_lanes(S, state, offset, bounds, pair.y0, pair.y1)
             if keep:
-                live[q], first_lane[q] = _live_bits(rows_live), evaluated
+                live[q], first_lane[q] = _live_tile_row_bits(rows_live), evaluated
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
-                field_values(S, D, n16, bounds, frame, pair, with_depth, False, edge)
+                chord_field_values(S, D, n16, bounds, frame, pair, with_depth, False, edge)
                 _store_opacities(S, n16, frame, edge, keep, depths, evaluated)
                 evaluated += n16
                 if net is not None:

@@ -14,7 +14,7 @@ from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import (
     add_ray_gradient,
     chord_backward,
-    edge_weight,
+    chord_edge_fade,
     half_chord_slope,
     intersect_chord,
     load_ray,
@@ -85,7 +85,7 @@ def _gradients_without_neurons(S, n, frame, pair, edge, out):  # type: ignore[no
         du, dv, slide, ex, ey, ez, px, py, pz, D, ia, tm, h, uncut, mid, half = intersect_chord(
             S[L.PIXEL + k], fx0, fy0, row
         )
-        fade, by_d = edge_weight(D, edge)
+        fade, by_d = chord_edge_fade(D, edge)
         g = f(2) * S[L.GRAD + k]
         total += g * half * fade
         gmx, gmy, gmz, gex, gey, gez = chord_backward(
@@ -118,7 +118,7 @@ def _gradients_of_two_neurons(products):  # type: ignore[no-untyped-def]
             vx, vy, vz = ex * half, ey * half, ez * half
             c, s, d, c1, s1, d1 = products(edge, qx, qy, qz, vx, vy, vz, first, second)
             field = offset + c * aa + c1 * ba
-            fade, by_d = edge_weight(D, edge)
+            fade, by_d = chord_edge_fade(D, edge)
             g = f(2) * S[L.GRAD + k]
             gf = g * half * fade
             total += gf
@@ -179,7 +179,7 @@ def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no
 
 
 @inline
-def _field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
+def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
     """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, with FIELD from the optical depth; sums for b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
@@ -195,7 +195,7 @@ def _field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def
     out[P.G_OFFSET], out[P.G_LOG_M] = offset, log_m
 
 
-def _two_neurons(products):  # type: ignore[no-untyped-def]
+def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
     """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); None: products from V0 and V1."""
 
     @inline
@@ -231,14 +231,18 @@ def _two_neurons(products):  # type: ignore[no-untyped-def]
     return add
 
 
-_two_slow, _two_medium, _two_fast = _two_neurons(_slow), _two_neurons(_medium), _two_neurons(_fast)
-_two_float64 = _two_neurons(None)
+_two_slow, _two_medium, _two_fast = (
+    _two_neuron_lane_gradients(_slow),
+    _two_neuron_lane_gradients(_medium),
+    _two_neuron_lane_gradients(_fast),
+)
+_two_float64 = _two_neuron_lane_gradients(None)
 
 
 @inline
 def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, out):  # type: ignore[no-untyped-def]
     """Gradients of b2, log m and every neuron of a pair, and dL/dQ and dL/d(half e) of its lanes."""
-    _field_gradient(S, n, out, edge, in_float64)
+    _chord_field_gradient(S, n, out, edge, in_float64)
     for m in range(0, neurons, 2):
         kind = kinds[m // 2]
         if in_float64:

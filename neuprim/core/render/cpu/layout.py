@@ -15,13 +15,13 @@ SLOW_TURNS, MEDIUM_TURNS = 0.4999, 1.4999
 LANES = 288  # 256 pixels of a tile, padded so that a vector may run over the end
 
 
-def _padded(floats: int) -> int:
+def _padded_row_width(floats: int) -> int:
     return -(-floats // 16) * 16
 
 
 def row_width(neurons: int) -> int:
     """Return the floats per primitive row for K padded neurons, a multiple of 16."""
-    return _padded(NEURONS + PER_NEURON * neurons)
+    return _padded_row_width(NEURONS + PER_NEURON * neurons)
 
 
 def net_row_width(hidden: int, channels: int) -> int:
@@ -31,7 +31,7 @@ def net_row_width(hidden: int, channels: int) -> int:
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
     """Return the floats per gradient row for K padded neurons, C colours and H padded units, a multiple of 16."""
-    return _padded(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
+    return _padded_row_width(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 
 def lane_array(number: int) -> int:

@@ -89,7 +89,7 @@ def _scratch(K):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _is_too_faint(most, edge, least):  # type: ignore[no-untyped-def]
+def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
     """Whether no chord can reach the depth ``least``: no half chord is longer than the longest semi-axis."""
     return most <= 0.0 or most * NORMS[edge] <= least
 
@@ -121,7 +121,7 @@ def _dot_product(a, b):  # type: ignore[no-untyped-def]
 
 
 @strict
-def camera_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
+def project_primitive_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
     """Fill camera-axes orientation B, axes s/m, centre c and anchor (depth, pixel x, y); returns (m, 1/|q|).
 
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
@@ -155,7 +155,7 @@ def _fill_wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no
     near, turns, K = view.near, view.turns, W1.shape[1]
     B, axes, c, local, anchor, w = work[0:3], work[3], work[4], work[5:8], work[8], work[9]
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    m, _ = camera_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
+    m, _ = project_primitive_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
     tc = anchor[0] / m
     u, v = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy
     w[0], w[1], w[2] = tc * u - c[0] / m, tc * v - c[1] / m, tc - c[2] / m
@@ -196,7 +196,7 @@ def _fill_wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no
 
 
 @strict
-def _is_finite_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
+def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
     """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
@@ -210,7 +210,7 @@ def _is_finite_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _silhouette_extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no-untyped-def]
+def _silhouette_screen_extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no-untyped-def]
     """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels.
 
     Tangents as in ``screen_boxes`` of the reference, in units of m; ``s22``: S_zz of the whole ellipsoid.
@@ -275,10 +275,10 @@ def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type
         most = np.float64(b2[i])
         for k in range(K):
             most += abs(np.float64(w2[i, k]))
-        if _is_too_faint(most, edge, least):  # whatever its place
+        if _is_too_faint_to_draw(most, edge, least):  # whatever its place
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
             in_float64[i], depth[i] = False, 0.0
-            status[i] = P.CULLED if _is_finite_primitive(i, parameters, most) else P.NON_FINITE
+            status[i] = P.CULLED if _is_finite_undrawn_primitive(i, parameters, most) else P.NON_FINITE
             continue
         m, finite, biggest = _fill_wide_row(i, parameters, view, scratch, order, row)
         for n in range(kinds.shape[1]):
@@ -317,8 +317,8 @@ def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type
             square = _visible_square(most, _longest_half_chord(c, m, reach, row, view, e0, ex, ey), edge, least)
             if square == 0.0:
                 continue
-            x0, x1 = _silhouette_extent(c, m, B, axes, view.fx, view.cx, 0, s22, square)
-            y0, y1 = _silhouette_extent(c, m, B, axes, view.fy, view.cy, 1, s22, square)
+            x0, x1 = _silhouette_screen_extent(c, m, B, axes, view.fx, view.cx, 0, s22, square)
+            y0, y1 = _silhouette_screen_extent(c, m, B, axes, view.fy, view.cy, 1, s22, square)
             x0, x1 = max(0.0, np.ceil(x0 - 0.5)), min(float(view.width), np.floor(x1 - 0.5) + 1)
             y0, y1 = max(0.0, np.ceil(y0 - 0.5)), min(float(view.height), np.floor(y1 - 0.5) + 1)
             # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width by HX,
@@ -392,7 +392,7 @@ def prepare_backward(start, stop, parameters, view, projected, grads, touched, o
         if not touched[i]:
             continue
         g = grads[i]
-        m, inverse = camera_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
+        m, inverse = project_primitive_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
         tc = anchor[0] / m
         ref[0], ref[1], ref[2] = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy, 1.0
         for j in range(3):

@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 from neuprim.core.compute.kernels import copy16, inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.chord import edge_weight, half_chord_slope, intersect_chord, load_ray
+from neuprim.core.render.cpu.chord import chord_edge_fade, half_chord_slope, intersect_chord, load_ray
 from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.trigonometry import cos_turns, profiles_fast, profiles_medium, profiles_slow
 
@@ -83,7 +83,7 @@ def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 
 @inline
-def aligned_zeros(floats):  # type: ignore[no-untyped-def]
+def aligned_tile_zeros(floats):  # type: ignore[no-untyped-def]
     """Zeros that begin a cache line; numba aligns to 32 bytes, and a vector across two lines costs twice."""
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
@@ -119,7 +119,7 @@ def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
 
 
 @inline
-def prefetch_depths(depths, first, stop):  # type: ignore[no-untyped-def]
+def prefetch_lane_depths(depths, first, stop):  # type: ignore[no-untyped-def]
     """Ask memory for the optical depths of a pair's lanes ``first:stop``."""
     for at in range(first, stop, 16):
         _prefetch(depths.ctypes.data + 4 * at)
@@ -185,7 +185,7 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
         S[L.HALF + k] = half
         S[L.FIELD + k] = offset
         if len(edge) > 0:
-            fade, by_d = edge_weight(D, edge)
+            fade, by_d = chord_edge_fade(D, edge)
             S[L.FADE + k] = fade
             if backward:
                 S[L.BY_D + k] = by_d
@@ -230,7 +230,7 @@ _values_slow, _values_medium, _values_fast = (
 
 
 @inline
-def field_values(S, D, n, bounds, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+def chord_field_values(S, D, n, bounds, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chords and FIELD of ``n`` lanes of a pair, in float64 where float32 is too coarse; see :func:`lane_chords`."""
     i = pair.i
     if frame.slots[i] >= 0:

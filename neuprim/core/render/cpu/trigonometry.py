@@ -130,7 +130,7 @@ def dsinc_turns(z):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _sinc_medium(t):  # type: ignore[no-untyped-def]
+def _chord_sinc_medium(t):  # type: ignore[no-untyped-def]
     """sinc(2 pi v) from t = v^2 2/1.5^2 - 1, |v| <= 1.5."""
     low = ((((_M5 * t + _M4) * t + _M3) * t + _M2) * t + _M1) * t + _M0
     high = (((_M10 * t + _M9) * t + _M8) * t + _M7) * t + _M6
@@ -139,8 +139,8 @@ def _sinc_medium(t):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _dsinc_medium(t):  # type: ignore[no-untyped-def]
-    """d sinc / d(v^2) of :func:`_sinc_medium`."""
+def _chord_dsinc_medium(t):  # type: ignore[no-untyped-def]
+    """d sinc / d(v^2) of :func:`_chord_sinc_medium`."""
     return ((((((((_N9 * t + _N8) * t + _N7) * t + _N6) * t + _N5) * t + _N4) * t + _N3) * t + _N2) * t + _N1) * t + _N0
 
 
@@ -162,17 +162,22 @@ def _hard_slopes_slow(v, w):  # type: ignore[no-untyped-def]
 @inline
 def _hard_sincs_medium(v, w):  # type: ignore[no-untyped-def]
     """|v|, |w| <= 3/2."""
-    return _sinc_medium(v * v * _TO_UNIT - _ONE), _sinc_medium(w * w * _TO_UNIT - _ONE)
+    return _chord_sinc_medium(v * v * _TO_UNIT - _ONE), _chord_sinc_medium(w * w * _TO_UNIT - _ONE)
 
 
 @inline
 def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
     y, z = v * v * _TO_UNIT - _ONE, w * w * _TO_UNIT - _ONE
-    return _sinc_medium(y), _dsinc_medium(y) * _TWO * v, _sinc_medium(z), _dsinc_medium(z) * _TWO * w
+    return (
+        _chord_sinc_medium(y),
+        _chord_dsinc_medium(y) * _TWO * v,
+        _chord_sinc_medium(z),
+        _chord_dsinc_medium(z) * _TWO * w,
+    )
 
 
 @inline
-def _reduced_rates(v, w):  # type: ignore[no-untyped-def]
+def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
     """v and w reduced to half a turn, whether they were within, and reciprocals (1 where within) by one division."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
@@ -184,7 +189,7 @@ def _reduced_rates(v, w):  # type: ignore[no-untyped-def]
 @inline
 def _hard_sincs_fast(v, w):  # type: ignore[no-untyped-def]
     """Any v and w: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
-    r, s, a, b, iv, iw = _reduced_rates(v, w)
+    r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
     x, y = sinc_turns(r * r), sinc_turns(s * s)
     return x if a else x * r * iv, y if b else y * s * iw
 
@@ -192,7 +197,7 @@ def _hard_sincs_fast(v, w):  # type: ignore[no-untyped-def]
 @inline
 def _hard_slopes_fast(v, w):  # type: ignore[no-untyped-def]
     """d sinc/dv = (cos - sinc)/v beyond half a turn."""
-    r, s, a, b, iv, iw = _reduced_rates(v, w)
+    r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
     y, z = r * r, s * s
     x, u = sinc_turns(y), sinc_turns(z)
     sx, su = x if a else x * r * iv, u if b else u * s * iw
@@ -220,7 +225,7 @@ def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
     return polynomial
 
 
-def _split_polynomial(coefficients: tuple[float, ...]) -> Kernel:
+def _split_chord_polynomial(coefficients: tuple[float, ...]) -> Kernel:
     """The same as two shorter chains, whose latencies overlap; ten coefficients."""
     low, high = _horner_polynomial(coefficients[:5]), _horner_polynomial(coefficients[5:])
 
@@ -232,7 +237,7 @@ def _split_polynomial(coefficients: tuple[float, ...]) -> Kernel:
     return polynomial
 
 
-def _slow_profiles(p: int) -> tuple[Kernel, Kernel]:
+def _slow_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
     value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
 
     @inline
@@ -247,8 +252,8 @@ def _slow_profiles(p: int) -> tuple[Kernel, Kernel]:
     return profiles, slopes
 
 
-def _medium_profiles(p: int) -> tuple[Kernel, Kernel]:
-    value, slope = _split_polynomial(_MEDIUM[p]), _split_polynomial(_MEDIUM_SLOPE[p])
+def _medium_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
+    value, slope = _split_chord_polynomial(_MEDIUM[p]), _split_chord_polynomial(_MEDIUM_SLOPE[p])
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -262,7 +267,7 @@ def _medium_profiles(p: int) -> tuple[Kernel, Kernel]:
     return profiles, slopes
 
 
-def _fast_profiles(p: int) -> tuple[Kernel, Kernel]:
+def _fast_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
     value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
     first = p == 1
 
@@ -282,12 +287,12 @@ def _fast_profiles(p: int) -> tuple[Kernel, Kernel]:
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
-        r, s, a, b, iv, iw = _reduced_rates(v, w)
+        r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
         return one(v, a, r, iv)[0], one(w, b, s, iw)[0]
 
     @inline
     def slopes(v, w):  # type: ignore[no-untyped-def]
-        r, s, a, b, iv, iw = _reduced_rates(v, w)
+        r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
         x, dx = one(v, a, r, iv)
         y, dy = one(w, b, s, iw)
         return x, dx, y, dy
@@ -296,7 +301,7 @@ def _fast_profiles(p: int) -> tuple[Kernel, Kernel]:
 
 
 _soft_slow, _soft_medium, _soft_fast = (
-    (kind(1), kind(2)) for kind in (_slow_profiles, _medium_profiles, _fast_profiles)
+    (kind(1), kind(2)) for kind in (_slow_chord_profiles, _medium_chord_profiles, _fast_chord_profiles)
 )
 profiles_slow = dispatch_by_length(_hard_sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
 profiles_medium = dispatch_by_length(_hard_sincs_medium, _soft_medium[0][0], _soft_medium[1][0])

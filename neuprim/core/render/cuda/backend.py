@@ -23,9 +23,9 @@ from neuprim.core.render.cuda.colour_net import (
     fill_wide_net,
     float64_hues_kernel,
     float64_net_kernel,
+    net_gradient_row_width,
     net_pairs_kernel,
-    net_width,
-    prepare_colour_net,
+    prepare_rasterizer_colour_net,
 )
 from neuprim.core.render.cuda.float64 import float64_opacity_kernel, float64_pairs_kernel
 from neuprim.core.render.cuda.forward import composite_kernel, forward_kernel, uncomposite_kernel
@@ -37,10 +37,10 @@ from neuprim.core.render.rasterize import (
     NET,
     PARAMETERS,
     RasterRequest,
-    input_gradients,
-    primitive_tensors,
     rasterize,
-    remember_input_types,
+    rasterizer_input_gradients,
+    rasterizer_tensors,
+    remember_rasterizer_inputs,
 )
 from neuprim.core.settings import RenderSettings
 
@@ -71,7 +71,7 @@ class _Rasterize(torch.autograd.Function):
         drawn = composite_frame(frame, form, net, behind, settings, request.differentiable)
         stats.extra["hits"] = drawn.hits.shape[0]
         ctx.request, ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.background = request, frame, form, net, drawn, behind
-        remember_input_types(ctx, (viewmat, background, palette, *tensors))
+        remember_rasterizer_inputs(ctx, (viewmat, background, palette, *tensors))
         h, w = camera.height, camera.width
         z = drawn.zsum.view(h, w) if settings.depth else drawn.zsum
         return drawn.rgb.view(h, w, form.channels), drawn.transmittance.view(h, w), z
@@ -101,7 +101,7 @@ class _Rasterize(torch.autograd.Function):
             error = asked.error.to(device, torch.float32).reshape(-1).contiguous()
         z = g_z.reshape(-1).float().contiguous() if settings.depth and g_z is not None else None
         gradient = ImageGradient(rgb, T.contiguous(), z, error)
-        grads, net_grads = gradient_rows(frame, form, net, drawn, settings, gradient)
+        grads, net_grads = rasterizer_gradient_rows(frame, form, net, drawn, settings, gradient)
         base = L.G_NEURONS + L.PER_NEURON * form.neurons
         colours = grads[:, base : base + form.channels]
         if net_grads is not None:
@@ -114,7 +114,7 @@ class _Rasterize(torch.autograd.Function):
         if net is not None and net_grads is not None:
             g_net = colour_net_backward(net, frame.parameters, grads, net_grads, own)
         background = (rgb * drawn.transmittance[:, None]).sum(0) if ctx.needs_input_grad[2] else None
-        return input_gradients(ctx, view, (background, colours.clone(), *own, *g_net))
+        return rasterizer_input_gradients(ctx, view, (background, colours.clone(), *own, *g_net))
 
 
 def render(
@@ -129,7 +129,7 @@ def render_slabs(
 ) -> tuple[Tensor, Tensor]:
     """Return opacity and depth of each slab, in one frame; see :func:`neuprim.core.render.render_slabs`."""
     means, settings = lowered.geometry.means, replace(settings, depth=True)
-    tensors = primitive_tensors(lowered)
+    tensors = rasterizer_tensors(lowered)
     blank = torch.zeros(len(means), 1, device=means.device)
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cuda", len(means)))
     try:
@@ -288,7 +288,7 @@ def composite_frame(
             L.WARP,
         )
         if net is not None and net.hidden:
-            wide_net, first = array(net.wide, wp.vec4d), L.colour_column(form.neurons)
+            wide_net, first = array(net.wide, wp.vec4d), L.rasterizer_colour_column(form.neurons)
             launch_kernel(
                 float64_hues_kernel(form.channels),
                 few,
@@ -335,7 +335,7 @@ def composite_frame(
     return drawn
 
 
-def gradient_rows(
+def rasterizer_gradient_rows(
     frame: Frame,
     form: KernelForm,
     net: ColourNet | None,
@@ -343,7 +343,7 @@ def gradient_rows(
     settings: RenderSettings,
     gradient: ImageGradient,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return (N, gradient_width) gradient rows, and (N, net_width) of networks; uses up the slots' contents."""
+    """Return (N, gradient_width) rows, and (N, net_gradient_row_width) of networks; uses up the slots' contents."""
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     a = _KernelArrays(frame, net, settings, drawn.spans, drawn.offsets)
@@ -382,7 +382,7 @@ def gradient_rows(
     grads = _sum_pair_rows(frame, pair_rows)
     if net is None:
         return grads, None
-    net_rows = torch.empty(pairs, net_width(form), device=device)
+    net_rows = torch.empty(pairs, net_gradient_row_width(form), device=device)
     slots = (reached, hits, hues, g_rgb, _warp_array(net_rows.view(-1)))
     launch_kernel(
         net_pairs_kernel(form), (pairs, L.WARP), (a.rows, a.units, *a.covered, floor, a.size, *slots), device, L.WARP

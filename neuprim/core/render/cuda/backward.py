@@ -16,14 +16,14 @@ from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Shorts2d, Ve
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import (
-    column_of,
     gradient_row_sums,
     gradient_row_type,
-    hit_at,
     int_at,
-    number_at,
-    number_of_row,
-    set_hit,
+    load_rasterizer_row_column,
+    pixel_float_at,
+    pixel_hit_at,
+    pixel_row_float,
+    set_pixel_hit,
     span_of,
 )
 from neuprim.core.render.cuda.chord import (
@@ -37,14 +37,14 @@ from neuprim.core.render.cuda.chord import (
     xyz,
 )
 from neuprim.core.render.cuda.layout import KernelForm
-from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, edge_profiles, sin_turns
+from neuprim.core.render.cuda.trigonometry import TAU, chord_edge_profiles, cos_turns, sin_turns
 
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
     C, H = form.channels, form.hidden
-    colours, width = L.colour_column(form.neurons), L.row_columns(form.neurons, C)
+    colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
@@ -72,7 +72,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
                 p = first + count - 1 - back
                 slot = slot_of_pixel(span_of(spans, p, at[1]), int_at(offsets, p), at[0])
                 if slot >= 0:
-                    hit = hit_at(hits, slot)
+                    hit = pixel_hit_at(hits, slot)
                     alpha = hit[0]
                     out = wp.vec2()
                     if alpha > 0.0:
@@ -85,7 +85,9 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
                                 by_weight += wp.max(hues[slot, k], 0.0) * own[k]
                             else:
                                 if wp.static(k % 4 == 0):
-                                    hue = column_of(rows, i, wp.static(width), wp.static(colours + k // 4))
+                                    hue = load_rasterizer_row_column(
+                                        rows, i, wp.static(width), wp.static(colours + k // 4)
+                                    )
                                 by_weight += hue[wp.static(k % 4)] * own[k]
                         if wp.static(depth):
                             by_weight += g_z[n] * depths[slot]
@@ -94,7 +96,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
                             slope = (1.0 - alpha) * hit[1] * by_weight - behind
                         behind += weight * by_weight
                         out = wp.vec2(slope, weight)
-                    set_hit(hits, slot, out)
+                    set_pixel_hit(hits, slot, out)
 
     return backward_pixels
 
@@ -103,10 +105,10 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
     """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
     K, P, C = form.neurons, form.edge, form.channels
-    W, width = L.row_columns(K, C), L.gradient_width(K, C)
+    W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
-    _, pair = edge_profiles(P)
-    amplitudes = L.amplitude_column(K)
+    _, pair = chord_edge_profiles(P)
+    amplitudes = L.rasterizer_amplitude_column(K)
     vecK = wp.types.vector(length=max(K, 1), dtype=wp.float32)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
     mean = float(NORMS[P])
@@ -150,7 +152,7 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
                 begin = offsets[n]
                 count = offsets[n + 1] - begin
                 for s in range(lane, count, wp.static(L.WARP)):
-                    hit = hit_at(hits, begin + s)
+                    hit = pixel_hit_at(hits, begin + s)
                     if hit[1] > 0.0:
                         at = pixel_of_slot(own, 0, s)
                         X = (corner & 65535) * L.TILE + at[0]
@@ -160,9 +162,9 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
                         py = float(Y) + 0.5
                         norm = mean * wp.length(wp.vec3((px - lens[2]) / lens[0], (py - lens[3]) / lens[1], 1.0))
                         g_weight += hit[1]
-                        g_error += hit[1] * number_at(error, pixel)
+                        g_error += hit[1] * pixel_float_at(error, pixel)
                         for k in range(wp.static(C)):
-                            g_colour[k] += hit[1] * number_of_row(g_rgb, pixel, wp.static(C), k)
+                            g_colour[k] += hit[1] * pixel_row_float(g_rgb, pixel, wp.static(C), k)
                         c = intersect_chord(load_ray(row, 0), px, py)
                         q = c.x + (c.h - c.half) * c.e
                         scale = float(norm)  # I = scale half field
@@ -208,7 +210,7 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
                         g_half = wp.dot(gv, c.e) + gs * field
                         g_mid = wp.dot(gq, c.e)
                         if wp.static(depth):
-                            g_mid += hit[1] * number_at(g_z, pixel) * row[0, L.REST][1]
+                            g_mid += hit[1] * pixel_float_at(g_z, pixel) * row[0, L.REST][1]
                         gD = float(0.0)
                         by_depth = 0.5 * c.h / D
                         if wp.static(P == 0):

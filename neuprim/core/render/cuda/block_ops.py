@@ -31,7 +31,7 @@ _ANY = """
 
 
 @wp.func_native(_ANY)
-def any_thread(yes: int) -> int:
+def any_tile_thread(yes: int) -> int:
     """Whether any thread of the block says so."""
 
 
@@ -90,7 +90,7 @@ def gradient_row_sums(width: int) -> Callable[..., Any]:
 
 
 @wp.func_native("return numbers.data[at];")
-def number_at(numbers: Floats, at: int) -> float: ...
+def pixel_float_at(numbers: Floats, at: int) -> float: ...
 
 
 @wp.func_native("return numbers.data[at];")
@@ -98,7 +98,7 @@ def int_at(numbers: Ints, at: int) -> int: ...
 
 
 @wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
-def number_of_row(numbers: Floats, row: int, width: int, column: int) -> float:
+def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float:
     """Of rows of ``width`` numbers."""
 
 
@@ -108,13 +108,13 @@ def span_of(spans: Shorts2d, pair: int, y: int) -> int:
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")
-def column_of(rows: Vec4s2d, row: int, width: int, column: int) -> wp.vec4:
+def load_rasterizer_row_column(rows: Vec4s2d, row: int, width: int, column: int) -> wp.vec4:
     """Of primitives' rows of ``width`` columns."""
 
 
 @wp.func_native("return hits.data[slot];")
-def hit_at(hits: Vec2s, slot: int) -> wp.vec2: ...
+def pixel_hit_at(hits: Vec2s, slot: int) -> wp.vec2: ...
 
 
 @wp.func_native("hits.data[slot] = hit;")
-def set_hit(hits: Vec2s, slot: int, hit: wp.vec2): ...
+def set_pixel_hit(hits: Vec2s, slot: int, hit: wp.vec2): ...

@@ -61,7 +61,7 @@ class ColourNet:
     Wx: Tensor  # (N, H, 3)
     bias: Tensor  # (N, H)
     Wout: Tensor  # (N, C, H)
-    rows: Tensor  # (N, H net_columns(C), 4) float32, see net_columns
+    rows: Tensor  # (N, H rasterizer_net_columns(C), 4) float32, see rasterizer_net_columns
     fast: Tensor  # (N,) bool, where a unit turns too fast for float32
     wide: Tensor  # (M, H, 4) float64 (WX, WY, WZ, PHASE) of the primitives that are drawn in float64
 
@@ -160,7 +160,9 @@ def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
     return (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
 
-def prepare_colour_net(log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor) -> ColourNet:
+def prepare_rasterizer_colour_net(
+    log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor
+) -> ColourNet:
     """Rows of all primitives; ``wide`` is empty, see :func:`fill_wide_net`."""
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
@@ -168,7 +170,7 @@ def prepare_colour_net(log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tens
     log_scales, quats, Wx, bias, Wout = (x.detach().to(dtype).contiguous() for x in tensors)
     (N, H, _), C, device = Wx.shape, Wout.shape[1], Wx.device
     real, vec3, vec4 = _kernel_types(double)
-    rows = torch.empty(N, H * L.net_columns(C), 4, device=device)
+    rows = torch.empty(N, H * L.rasterizer_net_columns(C), 4, device=device)
     fast = torch.empty(N, H, dtype=torch.bool, device=device)
     launch_kernel(
         _colour_net_kernels(double)[0], (N, H),
@@ -224,7 +226,7 @@ def colour_net_backward(
     return g_Wx, g_bias, g_Wout
 
 
-def net_width(form: KernelForm) -> int:
+def net_gradient_row_width(form: KernelForm) -> int:
     """Columns of a network's gradient row."""
     return L.gradient_width(0, form.channels, form.hidden)
 
@@ -233,8 +235,8 @@ def net_width(form: KernelForm) -> int:
 def net_pairs_kernel(form: KernelForm) -> Any:
     """A warp a pair: gradients of its network, and the ray's share through the chord's middle."""
     C, H, P = form.channels, form.hidden, form.edge
-    each, width = L.net_columns(C), net_width(form)
-    columns, net_columns = L.row_columns(form.neurons, C), max(H * each, 1)
+    each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
+    columns, net_columns = L.rasterizer_row_columns(form.neurons, C), max(H * each, 1)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 
@@ -328,7 +330,7 @@ def float64_hues_kernel(channels: int) -> Any:
                 for j in range(hidden):
                     w = net[r, j]
                     u = wp.dot(c.q, wp.vec3d(w[0], w[1], w[2])) + w[3]
-                    mixed = mixes[i, j * wp.static(L.net_columns(channels)) + 1 + k // 4][k % 4]
+                    mixed = mixes[i, j * wp.static(L.rasterizer_net_columns(channels)) + 1 + k // 4][k % 4]
                     hue += d(mixed) * wp.cos(_TWO_PI * (u - wp.rint(u)))
                 hues[begin + s, k] = float(hue)
 
@@ -339,7 +341,7 @@ def float64_hues_kernel(channels: int) -> Any:
 def float64_net_kernel(form: KernelForm) -> Any:
     """:func:`net_pairs_kernel` for in_float64 pairs, in float64."""
     C = form.channels
-    each, width = L.net_columns(C), net_width(form)
+    each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
 

@@ -44,7 +44,7 @@ class Chord64:
 
 
 @wp.func
-def _vector(wide: Doubles2d, r: int, c: int):
+def _wide_row_vector(wide: Doubles2d, r: int, c: int):
     return wp.vec3d(wide[r, c], wide[r, c + 1], wide[r, c + 2])
 
 
@@ -55,9 +55,9 @@ def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
     zero, one = d(0.0), d(1.0)
     c.du = d(X) + d(0.5) - wide[r, W.UX]
     c.dv = d(Y) + d(0.5) - wide[r, W.UY]
-    G = c.du * _vector(wide, r, W.EX) + c.dv * _vector(wide, r, W.EY)
-    c.e = _vector(wide, r, W.E0) + G
-    m = _vector(wide, r, W.XA) + wide[r, W.TC] * G
+    G = c.du * _wide_row_vector(wide, r, W.EX) + c.dv * _wide_row_vector(wide, r, W.EY)
+    c.e = _wide_row_vector(wide, r, W.E0) + G
+    m = _wide_row_vector(wide, r, W.XA) + wide[r, W.TC] * G
     c.ia = one / wp.dot(c.e, c.e)
     c.tm = -wp.dot(m, c.e) * c.ia
     c.x = m + c.tm * c.e
@@ -85,7 +85,7 @@ class Weight:
 
 
 @wp.func
-def edge_polynomial64(c: Chord64, edge: int):
+def chord_edge_polynomial64(c: Chord64, edge: int):
     """(D - a (shift + half u)^2)^p."""
     w = Weight()
     two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
@@ -112,7 +112,7 @@ def edge_polynomial64(c: Chord64, edge: int):
 
 
 @wp.func
-def _bessel(z: wp.float64):
+def _chord_bessel(z: wp.float64):
     """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
     j = vec6d()
     if wp.abs(z) < d(2.0):
@@ -136,9 +136,9 @@ def _bessel(z: wp.float64):
 
 
 @wp.func
-def moments(z: wp.float64):
+def chord_moments(z: wp.float64):
     """C_0, S_1, C_2, S_3, C_4, S_5."""
-    j = _bessel(z)
+    j = _chord_bessel(z)
     two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
     M[0] = j[0]
@@ -151,7 +151,7 @@ def moments(z: wp.float64):
 
 
 @wp.func
-def phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
+def chord_phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
     """At the chord's middle, in radians, of less than half a turn."""
     u = wp.dot(c.q, w) + phase
     return d(_TWO_PI) * (u - wp.rint(u))
@@ -241,15 +241,15 @@ def float64_opacity_kernel(depth: bool) -> Any:
                 at = pixel_of_slot(spans, n, s)
                 X, Y = tx + at[0], ty + at[1]
                 c = intersect_chord64(wide, r, X, Y)
-                w = edge_polynomial64(c, edge)
+                w = chord_edge_polynomial64(c, edge)
                 alpha = float(0.0)
                 if c.half > d(0.0) and w.mean > d(0.0):
                     total = w.mean * wide[r, W.OFFSET]
                     for k in range(neurons):
                         o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
-                        v = _vector(wide, r, o)
-                        phase = phase64(c, v, wide[r, o + W.PHASE])
-                        m = weighted_moments64(w, moments(rate64(c, v)))
+                        v = _wide_row_vector(wide, r, o)
+                        phase = chord_phase64(c, v, wide[r, o + W.PHASE])
+                        m = weighted_moments64(w, chord_moments(rate64(c, v)))
                         total += wide[r, o + W.AMPLITUDE] * (wp.cos(phase) * m.even - wp.sin(phase) * m.odd)
                     I = d(2.0) * total * c.half * ray_norm(lens, X, Y)
                     if I > d(0.0):
@@ -300,7 +300,7 @@ def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
                         for k in range(wp.static(C)):
                             total[wp.static(L.G_NEURONS + 5 * K + k)] += hit[1] * g_rgb[pixel, k]
                         c = intersect_chord64(wide, r, X, Y)
-                        w = edge_polynomial64(c, P)
+                        w = chord_edge_polynomial64(c, P)
                         g = two * d(hit[0]) * ray_norm(lens, X, Y)  # dL/d(mean half)
                         gh = g * c.half
                         mean = w.mean * wide[r, W.OFFSET]
@@ -312,9 +312,9 @@ def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
                         for k in range(neurons):
                             o = wp.static(W.NEURONS) + wp.static(W.PER_NEURON) * k
                             og = wp.static(L.G_NEURONS) + wp.static(W.PER_NEURON) * k
-                            v = _vector(wide, r, o)
-                            phase = phase64(c, v, wide[r, o + W.PHASE])
-                            M = moments(rate64(c, v))
+                            v = _wide_row_vector(wide, r, o)
+                            phase = chord_phase64(c, v, wide[r, o + W.PHASE])
+                            M = chord_moments(rate64(c, v))
                             m = weighted_moments64(w, M)
                             cosine, sine, amplitude = wp.cos(phase), wp.sin(phase), wide[r, o + W.AMPLITUDE]
                             one = cosine * m.even - sine * m.odd

@@ -14,10 +14,10 @@ from typing import Any
 from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Longs, Shorts2d, Vec2s, Vec4s2d, wp
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.block_ops import any_thread, hit_at, int_at, set_hit, span_of
+from neuprim.core.render.cuda.block_ops import any_tile_thread, int_at, pixel_hit_at, set_pixel_hit, span_of
 from neuprim.core.render.cuda.chord import intersect_chord, load_ray, neuron_phase, pixel_of_lane, slot_of_pixel, xyz
 from neuprim.core.render.cuda.layout import CUT_AT, KernelForm
-from neuprim.core.render.cuda.trigonometry import cos_turns, edge_profiles, opacity_of_depth
+from neuprim.core.render.cuda.trigonometry import chord_edge_profiles, cos_turns, opacity_of_depth
 
 
 @wp.func
@@ -42,11 +42,11 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
-    width = L.row_columns(K, C)
-    amplitudes, colours = L.amplitude_column(K), L.colour_column(K)
-    value, _ = edge_profiles(P)
+    width = L.rasterizer_row_columns(K, C)
+    amplitudes, colours = L.rasterizer_amplitude_column(K), L.rasterizer_colour_column(K)
+    value, _ = chord_edge_profiles(P)
     H = form.hidden
-    each = L.net_columns(C)
+    each = L.rasterizer_net_columns(C)
     net_width = max(H * each, 1)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
     mean = float(NORMS[P])
@@ -102,11 +102,11 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
                         if wp.static(keep):
                             known = staged[j, L.REST][3]
                         if known > 0.0:
-                            alpha = hit_at(hits, slot)[0]
+                            alpha = pixel_hit_at(hits, slot)[0]
                             if wp.static(depth):
                                 mid = depths[slot]
                             if wp.static(listing):
-                                entry = hit_at(hits, slot)[1]
+                                entry = pixel_hit_at(hits, slot)[1]
                             if wp.static(H > 0):
                                 for k in range(wp.static(C)):
                                     tint[k] = hues[slot, k]
@@ -173,9 +173,9 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
                                 depths[slot] = mid
                         T -= weight
                     if wp.static(keep):
-                        set_hit(hits, slot, wp.vec2(alpha, before))
+                        set_pixel_hit(hits, slot, wp.vec2(alpha, before))
             done = base + count
-            if any_thread(int(T >= limits[2])) == 0:
+            if any_tile_thread(int(T >= limits[2])) == 0:
                 break
         if X < size[0] and Y < size[1]:
             n = Y * size[0] + X
@@ -198,7 +198,7 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
 
 
 @wp.func
-def _first_hit(keys: Longs, count: int, pixel: int):
+def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
     """The first of the sorted keys that belongs to this pixel or a later one."""
     low, high = int(0), int(count)
     while low < high:
@@ -214,7 +214,7 @@ def _first_hit(keys: Longs, count: int, pixel: int):
 def composite_kernel(form: KernelForm, depth: bool) -> Any:
     """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last."""
     C, H = form.channels, form.hidden
-    colours = L.colour_column(form.neurons)
+    colours = L.rasterizer_colour_column(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
@@ -225,11 +225,11 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
     ):  # fmt: skip
         """``begins[pixel]`` receives where its hits begin in ``order``."""
         n = wp.tid()
-        first = _first_hit(keys, count, n)
+        first = _first_hit_of_pixel(keys, count, n)
         begins[n] = first
         T, z = float(1.0), float(0.0)
         color = colour_type()
-        for k in range(first, _first_hit(keys, count, n + 1)):
+        for k in range(first, _first_hit_of_pixel(keys, count, n + 1)):
             slot = int(order[k])
             alpha = hits[slot][0]
             if T < limits[2]:
@@ -260,7 +260,7 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
 def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
     """Back to front: (alpha, T) becomes (dL/dI, weight), as in ``pixels_kernel``."""
     C, H = form.channels, form.hidden
-    colours = L.colour_column(form.neurons)
+    colours = L.rasterizer_colour_column(form.neurons)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def uncomposite(

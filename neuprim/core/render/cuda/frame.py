@@ -13,7 +13,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.compute.warp import array, launch_kernel, wp
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.binning import TileLists, bin_primitives, count_tiles
-from neuprim.core.render.cuda.prepare import prepare_kernel, wide_kernel
+from neuprim.core.render.cuda.prepare import project_primitives_kernel, wide_kernel
 from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.render.layout import SPAN_WIDTH, min_visible_depth
 from neuprim.core.render.rasterize import RasterRequest
@@ -72,10 +72,10 @@ class Frame:
     @property
     def inputs(self) -> tuple[Any, ...]:
         """The parameters as Warp arrays."""
-        return parameter_arrays(self.parameters)
+        return rasterizer_parameter_arrays(self.parameters)
 
 
-def parameter_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
+def rasterizer_parameter_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
     """Return parameters, or their gradients, as Warp arrays of numbers and vectors."""
     double = parameters[0].dtype == torch.float64
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
@@ -112,10 +112,14 @@ def prepare_frame(
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
 
-    rows, spans, boxes = empty(N, L.row_columns(K, C), 4), empty(N, SPAN_WIDTH), empty(N, 4, dtype=torch.int32)
+    rows, spans, boxes = (
+        empty(N, L.rasterizer_row_columns(K, C), 4),
+        empty(N, SPAN_WIDTH),
+        empty(N, 4, dtype=torch.int32),
+    )
     depth, status, counts = empty(N, dtype=torch.float64), empty(N, dtype=torch.uint8), empty(2, N, dtype=torch.int32)
     bad = torch.full((1,), N, dtype=torch.int32, device=device)
-    inputs, colours = parameter_arrays(parameters), array(palette.detach().float().contiguous(), wp.float32)
+    inputs, colours = rasterizer_parameter_arrays(parameters), array(palette.detach().float().contiguous(), wp.float32)
     view = (array(matrix, wp.float64), projection.intrinsics)
     least = min_visible_depth(settings.alpha_min)
     size = (camera.width, camera.height, projection.near, projection.turns, request.edge, least, K, C)
@@ -129,7 +133,9 @@ def prepare_frame(
         array(bad, wp.int32),
     )
     asked = None if forced is None else array(forced.contiguous(), wp.bool)
-    launch_kernel(prepare_kernel(double), N, (*inputs, colours, asked, *view, *size, *filled), device, PER_BLOCK)
+    launch_kernel(
+        project_primitives_kernel(double), N, (*inputs, colours, asked, *view, *size, *filled), device, PER_BLOCK
+    )
     counted = count_tiles(counts, bad)
     if counted.bad >= 0:
         raise NotFinitePrimitive(counted.bad)

@@ -46,19 +46,19 @@ class KernelForm:
     hidden: int = -1
 
 
-def amplitude_column(neurons: int) -> int:
+def rasterizer_amplitude_column(neurons: int) -> int:
     """First column of the neurons' amplitudes, four in each."""
     return NEURONS + neurons
 
 
-def colour_column(neurons: int) -> int:
+def rasterizer_colour_column(neurons: int) -> int:
     """First column of the colours, four channels in each."""
-    return amplitude_column(neurons) + -(-neurons // 4)
+    return rasterizer_amplitude_column(neurons) + -(-neurons // 4)
 
 
-def row_columns(neurons: int, channels: int) -> int:
+def rasterizer_row_columns(neurons: int, channels: int) -> int:
     """float4 columns of a primitive's row."""
-    return colour_column(neurons) + -(-channels // 4)
+    return rasterizer_colour_column(neurons) + -(-channels // 4)
 
 
 def wide_width(neurons: int) -> int:
@@ -66,7 +66,7 @@ def wide_width(neurons: int) -> int:
     return layout.NEURONS + PER_NEURON * neurons
 
 
-def net_columns(channels: int) -> int:
+def rasterizer_net_columns(channels: int) -> int:
     """float4 columns per unit of a colour network: (WX, WY, WZ, PHASE), then its output weights, four in each."""
     return 1 + -(-channels // 4)
 

@@ -17,9 +17,9 @@ from neuprim.core.render.cuda.projection import (
     ProjectedPrimitive,
     Ray,
     View,
-    load_view,
+    load_projection_view,
     project_primitive,
-    round_to_float32,
+    round_projected_to_float32,
     whiten_rays,
 )
 
@@ -60,21 +60,21 @@ def _store_vector(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64
 
 
 @wp.func
-def _largest_component(v: wp.vec3d):
+def _largest_ray_component(v: wp.vec3d):
     return wp.max(wp.max(wp.abs(v[0]), wp.abs(v[1])), wp.abs(v[2]))
 
 
 @wp.func
-def _covariance(p: ProjectedPrimitive, i: int, j: int):
+def _projected_covariance(p: ProjectedPrimitive, i: int, j: int):
     """Entry (i, j) of the covariance in camera axes, in units of m^2."""
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
 @wp.func
-def _silhouette_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
+def _silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
     """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
-    sii, siz = square * _covariance(p, axis, axis), square * _covariance(p, axis, 2)
+    sii, siz = square * _projected_covariance(p, axis, axis), square * _projected_covariance(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
     root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - szz
     return wp.vec2d(
@@ -111,11 +111,11 @@ def _silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, sq
         yc = -d1 / d2
         peak = d0 + d1 * yc
         if peak > d(0.0):
-            o.skew = round_to_float32(-q4 / q3)
-            o.xc = round_to_float32(-(q1 + q4 * yc) / q3)
-            o.yc = round_to_float32(yc)
-            o.hx = round_to_float32(wp.sqrt(peak) / -q3)
-            o.hy = round_to_float32(wp.sqrt(-peak / d2))
+            o.skew = round_projected_to_float32(-q4 / q3)
+            o.xc = round_projected_to_float32(-(q1 + q4 * yc) / q3)
+            o.yc = round_projected_to_float32(yc)
+            o.hx = round_projected_to_float32(wp.sqrt(peak) / -q3)
+            o.hy = round_projected_to_float32(wp.sqrt(-peak / d2))
             # the pixel offsets that meet the silhouette on the screen
             ux, uy, half = p.anchor[1], p.anchor[2], d(0.5)
             tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
@@ -134,7 +134,7 @@ def _silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, sq
 
 
 @wp.func
-def _whitened_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
+def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
     """A neuron's frequencies on whitened axes, in turns."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
@@ -160,7 +160,7 @@ def _longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float6
 
 
 @wp.func
-def _choose_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
+def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
     """An array would be a stack: its index is not known to the compiler."""
     number = hard
     if edge == 1:
@@ -171,24 +171,24 @@ def _choose_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float6
 
 
 @wp.func
-def _is_too_faint(most: wp.float64, edge: int, least: wp.float64):
+def _is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
     """Whether no chord can reach the depth ``least``, however long."""
-    return most <= d(0.0) or most * _choose_by_edge(edge, _N0, _N1, _N2) <= least
+    return most <= d(0.0) or most * _chord_bound_by_edge(edge, _N0, _N1, _N2) <= least
 
 
 @wp.func
 def _visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
     """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
-    square, share = d(0.0), least / (most * _choose_by_edge(edge, _N0, _N1, _N2) * bound)
-    if share <= _choose_by_edge(edge, _W0, _W1, _W2):
+    square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
+    if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
         square = d(1.0)
     elif share < d(1.0):
-        square = round_to_float32(d(1.0) - wp.exp(wp.log(share) * _choose_by_edge(edge, _P0, _P1, _P2)))
+        square = round_projected_to_float32(d(1.0) - wp.exp(wp.log(share) * _chord_bound_by_edge(edge, _P0, _P1, _P2)))
     return square
 
 
 @functools.cache
-def prepare_kernel(double: bool) -> Any:
+def project_primitives_kernel(double: bool) -> Any:
     """Fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
 
     ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first
@@ -208,7 +208,7 @@ def prepare_kernel(double: bool) -> Any:
         most = d(b2[i])
         for k in range(neurons):
             most += d(wp.abs(w2[i, k]))
-        if _is_too_faint(most, edge, least):  # whatever its place
+        if _is_too_faint_to_draw(most, edge, least):  # whatever its place
             state = int(_CULLED)
             given, turn = wp.vec3d(means[i]) + wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
             given_sum = most + given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
@@ -225,13 +225,13 @@ def prepare_kernel(double: bool) -> Any:
             counts[0, i] = 0
             counts[1, i] = 0
             return
-        v = load_view(matrix, intrinsics, near)
+        v = load_projection_view(matrix, intrinsics, near)
         p = project_primitive(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
         r = whiten_rays(p, v)
         m, z, ux, uy = p.m, p.centre[2], p.anchor[1], p.anchor[2]
         offset = d(b2[i])
         biggest = wp.max(
-            wp.max(_largest_component(r.xa), _largest_component(r.e0)),
+            wp.max(_largest_ray_component(r.xa), _largest_ray_component(r.e0)),
             wp.max(wp.max(r.tc, wp.abs(r.near)), wp.max(m, wp.abs(offset))),
         )
         total = r.tc + r.near + m + offset
@@ -239,7 +239,11 @@ def prepare_kernel(double: bool) -> Any:
             total += r.e0[a] + r.ex[a] + r.ey[a] + r.xa[a]
         fastest = d(0.0)
         for k in range(neurons):
-            wave, phase, amplitude = _whitened_frequency(wp.vec3d(W1[i, k]), p, turns), turns * d(b1[i, k]), d(w2[i, k])
+            wave, phase, amplitude = (
+                _projected_frequency(wp.vec3d(W1[i, k]), p, turns),
+                turns * d(b1[i, k]),
+                d(w2[i, k]),
+            )
             speed = wp.sqrt(wp.dot(wave, wave))
             fastest = wp.max(fastest, speed)
             biggest = wp.max(biggest, wp.max(speed, wp.abs(amplitude)))
@@ -276,7 +280,7 @@ def prepare_kernel(double: bool) -> Any:
         if forced:
             if forced[i]:
                 in_float64 = 1
-        s22 = _covariance(p, 2, 2)
+        s22 = _projected_covariance(p, 2, 2)
         reach = wp.sqrt(m * m * s22)
         if edge > 0 and z - reach < near + _CUT * reach:  # only there are integrals of cut chords with a soft edge
             in_float64 = 1
@@ -304,8 +308,8 @@ def prepare_kernel(double: bool) -> Any:
                         x1 = x0  # nothing can be seen of it
                     else:
                         across, down = (
-                            _silhouette_extent(p, v, 0, s22, square),
-                            _silhouette_extent(p, v, 1, s22, square),
+                            _silhouette_screen_extent(p, v, 0, s22, square),
+                            _silhouette_screen_extent(p, v, 1, s22, square),
                         )
                         x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
                         y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
@@ -365,7 +369,7 @@ def wide_kernel(double: bool) -> Any:
     ):  # fmt: skip
         n = wp.tid()
         i = which[n]
-        v = load_view(matrix, intrinsics, near)
+        v = load_projection_view(matrix, intrinsics, near)
         p = project_primitive(wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), v)
         r = whiten_rays(p, v)
         _store_wide_vector(wide, n, W.E0, r.e0)
@@ -385,7 +389,7 @@ def wide_kernel(double: bool) -> Any:
         wide[n, W.ANCHOR_Z] = p.anchor[0]
         for k in range(neurons):
             column, phase = W.NEURONS + W.PER_NEURON * k, turns * d(b1[i, k])
-            _store_wide_vector(wide, n, column, _whitened_frequency(wp.vec3d(W1[i, k]), p, turns))
+            _store_wide_vector(wide, n, column, _projected_frequency(wp.vec3d(W1[i, k]), p, turns))
             wide[n, column + W.PHASE] = phase - wp.rint(phase)
             wide[n, column + W.AMPLITUDE] = d(w2[i, k])
 

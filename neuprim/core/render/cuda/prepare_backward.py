@@ -20,8 +20,8 @@ from neuprim.core.compute.warp import (
     wp,
 )
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import Frame, parameter_arrays
-from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, load_view, project_primitive, whiten_rays
+from neuprim.core.render.cuda.frame import Frame, rasterizer_parameter_arrays
+from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, load_projection_view, project_primitive, whiten_rays
 from neuprim.core.render.layout import E0, EX, EY, XA
 
 d, f = wp.float64, wp.float32
@@ -67,7 +67,7 @@ def _prepare_backward_kernel(double: bool) -> Any:
     ):  # fmt: skip
         i = wp.tid()
         if grads[i, _G_WEIGHT] > f(0.0):
-            v = load_view(matrix, intrinsics, near)
+            v = load_projection_view(matrix, intrinsics, near)
             mean, logs, quat = wp.vec3d(means[i]), wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
             p = project_primitive(mean, logs, quat, v)
             r = whiten_rays(p, v)
@@ -141,7 +141,7 @@ def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tu
         (
             *frame.inputs, array(p.matrix, wp.float64), p.intrinsics, p.near, p.turns, frame.neurons,
             array(grads.contiguous(), wp.float32),
-            *parameter_arrays(out), None if g_view is None else array(g_view, wp.float64),
+            *rasterizer_parameter_arrays(out), None if g_view is None else array(g_view, wp.float64),
         ), grads.device, PER_BLOCK,
     )  # fmt: skip
     return out, None if g_view is None else g_view.sum(0).view(3, 4)

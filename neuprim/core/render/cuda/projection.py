@@ -58,13 +58,13 @@ class Ray:
 
 
 @wp.func
-def round_to_float32(x: wp.float64):
+def round_projected_to_float32(x: wp.float64):
     """The nearest float32."""
     return wp.float64(wp.float32(x))
 
 
 @wp.func
-def load_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64):
+def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64):
     """``matrix``: the 16 numbers of a world-to-camera matrix, on the device."""
     v = View()
     v.R = wp.mat33d(matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10])
@@ -96,13 +96,13 @@ def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: Vi
     p.centre = c
     p.B = v.R * p.local
     p.anchor = wp.vec3d(
-        d(0.0), round_to_float32(v.centre[0]), round_to_float32(v.centre[1])
+        d(0.0), round_projected_to_float32(v.centre[0]), round_projected_to_float32(v.centre[1])
     )  # near or behind the camera, or nothing is seen of it
     if c[2] > _ANCHOR_RADII * m and c[2] + m > v.near:
         p.anchor = wp.vec3d(
-            m * round_to_float32(c[2] / m),
-            round_to_float32(v.focal[0] * c[0] / c[2] + v.centre[0]),
-            round_to_float32(v.focal[1] * c[1] / c[2] + v.centre[1]),
+            m * round_projected_to_float32(c[2] / m),
+            round_projected_to_float32(v.focal[0] * c[0] / c[2] + v.centre[0]),
+            round_projected_to_float32(v.focal[1] * c[1] / c[2] + v.centre[1]),
         )
     return p
 

@@ -58,7 +58,7 @@ def sin_turns(r: float):
     return TAU * r * _sinc(r * r)
 
 
-def edge_profiles(edge: int) -> tuple[Function, Function]:
+def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
     """Warp functions v -> B_p and v -> (B_p, B_(p+1)), p = 0, 1, 2, for any v."""
     low, high = _B[edge], _B[edge + 1]
 

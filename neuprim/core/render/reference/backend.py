@@ -93,7 +93,7 @@ def render(
             rays, touched = seen.block(y0, x0, h, w)
             ys, xs = torch.meshgrid(torch.arange(y0, y0 + h), torch.arange(x0, x0 + w), indexing="ij")
             pixels = (ys * camera.width + xs).reshape(-1)
-            out = _trace_block(lowered, frame, rays, touched, pixels, channels, settings, stats)
+            out = _composite_ray_block(lowered, frame, rays, touched, pixels, channels, settings, stats)
             line.append(out.reshape(h, w, channels + 2))
         rows_of_blocks.append(torch.cat(line, 1))
     image = (
@@ -227,7 +227,7 @@ class FrameRays(ABC):
         return rays, self.order[self.touched(y, x, h, w)[self.order]]
 
 
-def pixel_directions(camera: Camera) -> Tensor:
+def pixel_ray_directions(camera: Camera) -> Tensor:
     """(H, W, 3) float64 unit ray directions in camera axes; differentiable in intrinsics that are tensors."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
@@ -240,7 +240,7 @@ class _PinholeRays(FrameRays):
     """Near is a camera-z plane, depth is camera-z, the order is that of the centres' z, the cull exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
-        d = pixel_directions(camera)
+        d = pixel_ray_directions(camera)
         self.rays = ReferenceRays(d, near / d[..., 2], d[..., 2])
         with torch.no_grad():
             self.order = torch.argsort(center[:, 2], stable=True)

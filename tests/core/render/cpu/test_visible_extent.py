@@ -14,7 +14,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.cpu.prepare import _is_too_faint, _visible_square
+from neuprim.core.render.cpu.prepare import _is_too_faint_to_draw, _visible_square
 from neuprim.core.render.layout import MIN_RIM
 from tests import scenes
 from tests.numerics.equivalence import assert_same_frame
@@ -24,7 +24,7 @@ ALPHA_MIN = SETTINGS.alpha_min
 
 
 square = njit(lambda most, longest, edge, least: _visible_square(most, longest, edge, least))
-faint = njit(lambda most, edge, least: _is_too_faint(most, edge, least))
+faint = njit(lambda most, edge, least: _is_too_faint_to_draw(most, edge, least))
 
 
 def half_chords(t: dict[str, Tensor], camera: Camera) -> Tensor:

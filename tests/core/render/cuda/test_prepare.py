@@ -35,7 +35,9 @@ def geometry(frame: Frame) -> Array:
 def neurons(frame: Frame) -> Array:
     """(N, K, 5)."""
     rows, K = numpy(frame.rows), frame.neurons
-    amplitudes = rows[:, L.amplitude_column(K) : L.colour_column(K)].reshape(len(rows), -1)[:, :K, None]
+    amplitudes = rows[:, L.rasterizer_amplitude_column(K) : L.rasterizer_colour_column(K)].reshape(len(rows), -1)[
+        :, :K, None
+    ]
     return np.concatenate([rows[:, L.NEURONS : L.NEURONS + K], amplitudes], 2)
 
 
@@ -59,7 +61,7 @@ def test_rows_are_numbas(name: str, device: str) -> None:
     assert (
         ulps(neurons(frame)[seen], numba.neurons(numba.projected.rows, np.arange(len(seen)))[seen]).max(initial=0) <= 1
     )
-    painted = numpy(frame.rows)[seen, L.colour_column(frame.neurons) :].reshape(seen.sum(), -1)
+    painted = numpy(frame.rows)[seen, L.rasterizer_colour_column(frame.neurons) :].reshape(seen.sum(), -1)
     palette = CASES[name].tensors()["colors"].float().numpy()
     assert (painted[:, : CASES[name].channels] == palette[seen]).all()
     assert (painted[:, CASES[name].channels :] == 0).all()

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.render import layout as P
-from neuprim.core.render.cpu.backend import _camera_view
+from neuprim.core.render.cpu.backend import _rasterizer_view
 from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.prepare import PrimitiveArrays, Projected, View, prepare_primitives, prepare_wide
 from neuprim.core.render.cuda.frame import Frame, prepare_frame
@@ -123,7 +123,7 @@ def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
     count, K = parameters.W1.shape[:2]
     projected, view = (
         Projected.allocate(count, K),
-        _camera_view(case.camera, case.camera.viewmat, case.near, case.turns),
+        _rasterizer_view(case.camera, case.camera.viewmat, case.near, case.turns),
     )
     projected.order[:], projected.rows[:] = 0, 0  # which are not filled for what is too faint
     prepare_primitives(0, count, parameters, view, case.edge, LEAST, projected)

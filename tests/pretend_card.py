@@ -143,7 +143,7 @@ def pretended(monkeypatch: pytest.MonkeyPatch, memory: int = 1 << 30) -> Iterato
         patch.setattr(device, "free_cuda_memory", lambda where: memory)
         patch.setattr(
             device,
-            "copy_from_host",
+            "copy_to_device",
             lambda tensor, where: tensor.to(where) if where != CARD else _OnCard(tensor.clone()),
         )  # in any thread
         patch.setattr(torch, "autocast", lambda *_, **__: nullcontext())  # which knows nothing of this device

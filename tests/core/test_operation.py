@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.operation import apply_autograd
+from neuprim.core.compute.operation import apply_kernel_operation
 
 
 class _Cubed(torch.autograd.Function):
@@ -26,7 +26,7 @@ class _Cubed(torch.autograd.Function):
 
 def test_a_gradient_where_one_is_asked_for() -> None:
     x = torch.tensor([1.0, -2.0], requires_grad=True)
-    found = apply_autograd(_Cubed, x, 2.0)
+    found = apply_kernel_operation(_Cubed, x, 2.0)
     found.sum().backward()
     assert found.tolist() == [2.0, -16.0] and x.grad is not None and x.grad.tolist() == [6.0, 24.0]
 
@@ -34,6 +34,6 @@ def test_a_gradient_where_one_is_asked_for() -> None:
 def test_else_numbers_alone() -> None:
     x = torch.tensor([1.0, -2.0], requires_grad=True)
     with torch.no_grad():
-        silent = apply_autograd(_Cubed, x, 2.0)
-    for found in (silent, apply_autograd(_Cubed, x.detach(), 2.0)):
+        silent = apply_kernel_operation(_Cubed, x, 2.0)
+    for found in (silent, apply_kernel_operation(_Cubed, x.detach(), 2.0)):
         assert found.tolist() == [2.0, -16.0] and not found.requires_grad and found.grad_fn is None

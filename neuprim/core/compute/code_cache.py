@@ -47,7 +47,9 @@ def folder_weakness(folder: Path) -> str:
         there = place.stat()
         if there.st_uid != own and (place == whole or there.st_uid != 0):
             return f"belongs to user {there.st_uid}" if place == whole else f"{place} belongs to user {there.st_uid}"
-        shared = there.st_mode & stat.S_IWOTH or (there.st_mode & stat.S_IWGRP and not _own_group(there.st_gid, own))
+        shared = there.st_mode & stat.S_IWOTH or (
+            there.st_mode & stat.S_IWGRP and not _is_own_cache_group(there.st_gid, own)
+        )
         if shared and (
             place == whole or not there.st_mode & stat.S_ISVTX
         ):  # others' entries of a sticky folder stay where they are
@@ -55,7 +57,7 @@ def folder_weakness(folder: Path) -> str:
     return ""
 
 
-def _own_group(number: int, user: int) -> bool:
+def _is_own_cache_group(number: int, user: int) -> bool:
     """Whether a group is the user's own, as many systems make one of the same name for each, with nobody else in it."""
     import grp
     import pwd

@@ -47,7 +47,7 @@ def current_device(kind: str) -> torch.device:
     return torch.device(kind, torch.cuda.current_device()) if kind == CUDA else torch.device(kind)
 
 
-def copy_from_host(tensor: Tensor, device: torch.device) -> Tensor:
+def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
     """Return the tensor on ``device``. Copies to a GPU go through pinned memory and do not wait."""
     if tensor.device == device:
         return tensor

@@ -36,13 +36,13 @@ def _prefer_wide_vectors() -> None:
         numba.config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
 
 
-def _one_vector_at_a_time() -> None:
+def _forbid_llvm_interleaving() -> None:
     """Ask LLVM not to compute several vectors at a time: loops that sum would spill registers."""
     llvm.set_option("neuprim", "-force-vector-interleave=1")
 
 
 _prefer_wide_vectors()
-_one_vector_at_a_time()
+_forbid_llvm_interleaving()
 
 FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
 """Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
@@ -134,7 +134,7 @@ function."""
 kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)  # A pixel kernel, called from worker threads
 
 
-def dispatch_by_length(*functions: Any) -> Any:
+def compile_dispatch_by_length(*functions: Any) -> Any:
     """One function of (tuple, *arguments) that calls ``functions[len(tuple)]``, chosen during compilation."""
 
     def choose(key: Any, *arguments: Any) -> Any: ...
@@ -160,7 +160,7 @@ versions are not asked."""
 _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
 
-def _lent(context, array):  # type: ignore[no-untyped-def]
+def _borrow_kernel_array(context, array):  # type: ignore[no-untyped-def]
     """The same array without its owner: views of it count no references, which is atomic and slow.
 
     Only for arrays that somebody else keeps; a kernel's own are given back by :func:`release_array` after the last use.
@@ -174,8 +174,8 @@ def _lent(context, array):  # type: ignore[no-untyped-def]
     return array(array), code
 
 
-def _lent_tuple(context, arrays):  # type: ignore[no-untyped-def]
-    """A NamedTuple of :func:`_lent` arrays; its other parts stay as they are."""
+def _borrow_kernel_arrays(context, arrays):  # type: ignore[no-untyped-def]
+    """A NamedTuple of :func:`_borrow_kernel_array` arrays; its other parts stay as they are."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         parts = []
@@ -192,24 +192,26 @@ def _lent_tuple(context, arrays):  # type: ignore[no-untyped-def]
     return arrays(arrays), code
 
 
-def _vector_pointer(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
+def _llvm_vector_pointer(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
     """Where the sixteen floats of an argument begin."""
     data = make_array(signature.args[array])(context, builder, value=arguments[array]).data
     return builder.bitcast(builder.gep(data, [arguments[index]]), _SIXTEEN.as_pointer())
 
 
-def _copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
+def _llvm_copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
     """target[at : at + 16] = source[first : first + 16] of float32 arrays, which LLVM would copy one by one."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
-        read, written = (_vector_pointer(context, builder, signature, arguments, *where) for where in ((2, 3), (0, 1)))
+        read, written = (
+            _llvm_vector_pointer(context, builder, signature, arguments, *where) for where in ((2, 3), (0, 1))
+        )
         builder.store(builder.load(read, align=4), written, align=4)
         return context.get_dummy_value()
 
     return types.void(target, types.intp, source, types.intp), code
 
 
-def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
+def _llvm_compress16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
     """Move those of array[first : first + 16] whose flag is not 0 to array[at:], zeros behind them; returns how many.
 
     All sixteen are read before any is written: ``at`` may be at most ``first`` where more is to be read.
@@ -218,10 +220,11 @@ def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         zeros, i32, i64 = ir.Constant(_SIXTEEN, [0.0] * 16), ir.IntType(32), ir.IntType(64)
         value, flag = (
-            builder.load(_vector_pointer(context, builder, signature, arguments, 0, index), align=4) for index in (2, 3)
+            builder.load(_llvm_vector_pointer(context, builder, signature, arguments, 0, index), align=4)
+            for index in (2, 3)
         )
         kept = builder.fcmp_unordered("!=", flag, zeros)
-        written = _vector_pointer(context, builder, signature, arguments, 0, 1)
+        written = _llvm_vector_pointer(context, builder, signature, arguments, 0, 1)
         count = builder.zext(builder.ctpop(builder.bitcast(kept, ir.IntType(16))), i64)
         if _COMPRESSES:
             kind = ir.FunctionType(_SIXTEEN, [_SIXTEEN, kept.type, _SIXTEEN])
@@ -240,7 +243,7 @@ def _keep16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
     return types.intp(array, types.intp, types.intp, types.intp), code
 
 
-def _returned(context, array):  # type: ignore[no-untyped-def]
+def _release_kernel_array(context, array):  # type: ignore[no-untyped-def]
     """Does nothing, after the last use of what a kernel's own array lent: numba would free it earlier."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -249,8 +252,8 @@ def _returned(context, array):  # type: ignore[no-untyped-def]
     return types.void(array), code
 
 
-borrow_array: Any = intrinsic(_lent)
-borrow_arrays: Any = intrinsic(_lent_tuple)
-release_array: Any = intrinsic(_returned)
-copy16: Any = intrinsic(_copy16)
-compress16: Any = intrinsic(_keep16)
+borrow_array: Any = intrinsic(_borrow_kernel_array)
+borrow_arrays: Any = intrinsic(_borrow_kernel_arrays)
+release_array: Any = intrinsic(_release_kernel_array)
+copy16: Any = intrinsic(_llvm_copy16)
+compress16: Any = intrinsic(_llvm_compress16)

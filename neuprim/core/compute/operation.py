@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 
-class _NoContext:
+class _ForwardKernelContext:
     """Takes what a forward pass saves for a backward pass that will not come."""
 
     def save_for_backward(self, *tensors: Tensor) -> None:
@@ -18,13 +18,13 @@ class _NoContext:
         pass
 
 
-def needs_grad(*arguments: Any) -> bool:
+def kernel_needs_grad(*arguments: Any) -> bool:
     """Whether somebody asks for a gradient with respect to one of them."""
     return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in arguments)
 
 
-def apply_autograd(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
+def apply_kernel_operation(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
     """``operation.apply(*arguments)``, or its forward pass alone where no gradient is asked for."""
-    if needs_grad(*arguments):
+    if kernel_needs_grad(*arguments):
         return operation.apply(*arguments)
-    return operation.forward(_NoContext(), *arguments)
+    return operation.forward(_ForwardKernelContext(), *arguments)

@@ -71,13 +71,13 @@ def array(tensor: Tensor, dtype: Any) -> Any:
 
 
 @functools.cache
-def _dtype_bytes(dtype: Any) -> int:
+def _kernel_dtype_bytes(dtype: Any) -> int:
     return int(wp.types.type_size_in_bytes(dtype))
 
 
 def _fill_descriptor(given: _KernelArray, into: Any) -> None:
     """Write a tensor's address, shape and strides into a descriptor."""
-    tensor, whole = given.tensor, _dtype_bytes(given.dtype)
+    tensor, whole = given.tensor, _kernel_dtype_bytes(given.dtype)
     assert tensor.is_contiguous(), "arrays of kernels are contiguous"
     shape, size = tensor.shape, tensor.element_size()
     ndim = len(shape)
@@ -132,7 +132,7 @@ _streams: dict[tuple[int, int], Any] = {}
 _turn = threading.Lock()  # a recorded launch has one set of arguments
 
 
-def _torch_stream(device: torch.device) -> Any:
+def _device_stream_of_torch(device: torch.device) -> Any:
     """The caller's stream."""
     index = torch.cuda.current_device() if device.index is None else device.index
     key = (index, torch._C._cuda_getCurrentRawStream(index))
@@ -150,7 +150,7 @@ def launch_kernel(
     dims = (dim,) if isinstance(dim, int) else tuple(dim)
     if 0 in dims:
         return
-    stream = _torch_stream(device) if device.type == "cuda" else None
+    stream = _device_stream_of_torch(device) if device.type == "cuda" else None
     key = (kernel, -1 if stream is None else stream.device.ordinal, block)
     with _turn:
         recorded = _recorded.get(key)

@@ -47,8 +47,8 @@ class Pixels:
 
     def to(self, device: torch.device) -> Pixels:
         """Copy to another device without waiting for it."""
-        alpha, mask = (None if x is None else hardware.copy_from_host(x, device) for x in (self.alpha, self.mask))
-        return Pixels(hardware.copy_from_host(self.rgb, device), alpha, mask)
+        alpha, mask = (None if x is None else hardware.copy_to_device(x, device) for x in (self.alpha, self.mask))
+        return Pixels(hardware.copy_to_device(self.rgb, device), alpha, mask)
 
     def over(self, background: Tensor) -> Tensor:
         """Composite over a (C,) colour: (H, W, C). Opaque pixels are returned unchanged."""

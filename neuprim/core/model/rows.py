@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel, strict
-from neuprim.core.compute.operation import apply_autograd, needs_grad
+from neuprim.core.compute.operation import apply_kernel_operation, kernel_needs_grad
 from neuprim.core.compute.threads import parallel_for
 
 _FEW = 4096  # below, without a gradient, torch is done before a kernel would have begun with the last tensor
@@ -19,7 +19,7 @@ _FEW = 4096  # below, without a gradient, torch is done before a kernel would ha
 
 def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
     """Rows (M,) int64, ascending, of ``tensors`` (N, ...), float32 or float64; differentiable, once. Not checked."""
-    if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not needs_grad(*tensors.values())):
+    if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not kernel_needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, apply_autograd(_PrimitiveRows, rows, *tensors.values()), strict=True))
 

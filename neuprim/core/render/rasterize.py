@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.operation import apply_autograd, needs_grad
+from neuprim.core.compute.operation import apply_kernel_operation, kernel_needs_grad
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
@@ -73,8 +73,8 @@ def rasterize(
         background = torch.zeros(palette.shape[1], device=palette.device)
     tensors = (camera.viewmat, background, palette, *rasterizer_tensors(lowered), *net)
     stats = RenderStats(name, lowered.geometry.count)
-    request = RasterRequest.of(lowered, camera, settings, stats, needs_grad(*tensors))
-    rgb, transmittance, zsum = apply_autograd(operation, request, *tensors)
+    request = RasterRequest.of(lowered, camera, settings, stats, kernel_needs_grad(*tensors))
+    rgb, transmittance, zsum = apply_kernel_operation(operation, request, *tensors)
     dtype = lowered.geometry.means.dtype
     alpha = 1 - transmittance
     depth = mean_depth(zsum, alpha).to(dtype) if settings.depth else None

@@ -161,16 +161,16 @@ def point_loss(
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
     where = found.sigma.device
-    wrong = (found.sigma - device.copy_from_host(samples.sigma, where)) / samples.sigma_scale
+    wrong = (found.sigma - device.copy_to_device(samples.sigma, where)) / samples.sigma_scale
     loss = wrong.square().mean()
     parts = {"voxel_sigma": loss.item()}
     if found.source is not None and samples.source is not None:
-        light = ((found.source - device.copy_from_host(samples.source, where)) / samples.source_scale).square().mean()
+        light = ((found.source - device.copy_to_device(samples.source, where)) / samples.source_scale).square().mean()
         parts["voxel_source"] = light.item()
         loss = loss + settings.voxel_colour * light
     for name, (value, scale) in samples.components.items():
         if name in found.components:
-            part = ((found.components[name] - device.copy_from_host(value, where)) / scale).square().mean()
+            part = ((found.components[name] - device.copy_to_device(value, where)) / scale).square().mean()
             loss = loss + _COMPONENT_WEIGHT * part
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
     psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))

@@ -117,7 +117,7 @@ def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: in
         traced = Primitives(model.density, model.colour, params)
         values = volume_values_at(traced, samples.conditions, samples.points, False, threads)
         signs = (2 * torch.randint(0, 2, (len(samples.points),), generator=generator) - 1).float()
-        signs = device.copy_from_host(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
+        signs = device.copy_to_device(signs / samples.sigma_scale / len(signs) ** 0.5, values.sigma.device)
         shares = values.request_shares(signs)
         (values.sigma * signs).sum().backward()
         rows = torch.arange(model.count) if values.rows is None else values.rows.cpu()

@@ -124,8 +124,8 @@ def fill_density_grid(
         neurons: W1 (N, K, 3), b1 (N, K), w2 (N, K) and b2 (N,), the same.
         P: (3, 4) float64, indices to the scene. Q: (3, 4), back.
     """
-    W1, b1, w2, b2 = (device.copy_from_host(x, where) for x in neurons)
-    means, scales, rotations = (device.copy_from_host(x, where) for x in ellipsoids)
+    W1, b1, w2, b2 = (device.copy_to_device(x, where) for x in neurons)
+    means, scales, rotations = (device.copy_to_device(x, where) for x in ellipsoids)
     m = scales.amax(1)
     whiten = (rotations / scales[:, None, :]).transpose(1, 2).contiguous()
     prims = (
@@ -133,8 +133,8 @@ def fill_density_grid(
         array((omega0 * W1 / m[:, None, None]).contiguous(), wp.vec3d), array((omega0 * b1).contiguous(), d),
         array((w2 / m[:, None]).contiguous(), d), array((b2 / m).contiguous(), d),
     )  # fmt: skip
-    rows = array(device.copy_from_host(P.contiguous(), where), wp.vec4d)
-    first_tile, end_tile = _tile_boxes(means, scales, rotations, device.copy_from_host(Q.contiguous(), where), shape)
+    rows = array(device.copy_to_device(P.contiguous(), where), wp.vec4d)
+    first_tile, end_tile = _tile_boxes(means, scales, rotations, device.copy_to_device(Q.contiguous(), where), shape)
     tiles = tuple(-(-n // t) for n, t in zip(shape, _TILE, strict=True))
     planes = max(1, _POINTS // (_TILE[0] * shape[1] * shape[2]))
     grid = np.empty(shape, np.float32)

@@ -110,14 +110,14 @@ def _torch_values(
         if not bool(torch.isfinite(torch.stack([x.double().sum() for x in inputs])).all()):
             raise NonFiniteError(NOT_FINITE)
     row, prim = find_point_pairs(g, cells)
-    x = device.copy_from_host(torch.from_numpy(cells.points), g.means.device)[row]
+    x = device.copy_to_device(torch.from_numpy(cells.points), g.means.device)[row]
     if isinstance(form, Cosine):
         W1, b1, w2, b2 = (v.double() for v in (form.W1, form.b1, form.w2, form.b2))
         place = Geometry(*(v.double() for v in (g.means, g.log_scales, g.quats)))
         sigma = cosine_density(Cosine(W1, b1, w2, b2, form.omega0, form.edge), place, prim, x).clamp_min(0)
     else:
         sigma = active.sigma(prim, x.to(g.means)).double().clamp_min(0)
-    point = device.copy_from_host(torch.from_numpy(cells.order), g.means.device)[row]
+    point = device.copy_to_device(torch.from_numpy(cells.order), g.means.device)[row]
     values = torch.cat([sigma[:, None], sigma[:, None] * weights.double()[prim]], 1)
     sums = _sum_rows(len(cells.order), point, values).float()
 
@@ -137,7 +137,7 @@ def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Ten
     the geometry; three synchronisations."""
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
     starts, low, counts, points = (
-        device.copy_from_host(torch.from_numpy(x), means.device)
+        device.copy_to_device(torch.from_numpy(x), means.device)
         for x in (cells.starts, cells.low, cells.counts, cells.points)
     )
     reach = (axes * scales[:, None, :]).norm(dim=2)

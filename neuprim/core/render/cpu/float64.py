@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.compute.kernels import dispatch_by_length, inline
+from neuprim.core.compute.kernels import compile_dispatch_by_length, inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
@@ -213,4 +213,4 @@ def _soft_neurons_2(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
 
 
 # (edge, S, X, V, n, p, neurons): FADE, FIELD += the weighted mean of every neuron, and in V (None: not) for gradients
-neurons_float64 = dispatch_by_length(_hard_neurons, _soft_neurons_1, _soft_neurons_2)
+neurons_float64 = compile_dispatch_by_length(_hard_neurons, _soft_neurons_1, _soft_neurons_2)

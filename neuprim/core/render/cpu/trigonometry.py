@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from neuprim.core.compute.kernels import dispatch_by_length, inline
+from neuprim.core.compute.kernels import compile_dispatch_by_length, inline
 
 EDGE_TYPES: tuple[tuple[int, ...], ...] = ((), (0,), (0, 0))
 """The exponents p = 0, 1, 2 as kernels take them: as many zeros. A tuple's length belongs to its type, so that numba
@@ -303,9 +303,9 @@ def _fast_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
 _soft_slow, _soft_medium, _soft_fast = (
     (kind(1), kind(2)) for kind in (_slow_chord_profiles, _medium_chord_profiles, _fast_chord_profiles)
 )
-profiles_slow = dispatch_by_length(_hard_sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
-profiles_medium = dispatch_by_length(_hard_sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
-profiles_fast = dispatch_by_length(_hard_sincs_fast, _soft_fast[0][0], _soft_fast[1][0])
-slopes_slow = dispatch_by_length(_hard_slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
-slopes_medium = dispatch_by_length(_hard_slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
-slopes_fast = dispatch_by_length(_hard_slopes_fast, _soft_fast[0][1], _soft_fast[1][1])
+profiles_slow = compile_dispatch_by_length(_hard_sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
+profiles_medium = compile_dispatch_by_length(_hard_sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
+profiles_fast = compile_dispatch_by_length(_hard_sincs_fast, _soft_fast[0][0], _soft_fast[1][0])
+slopes_slow = compile_dispatch_by_length(_hard_slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
+slopes_medium = compile_dispatch_by_length(_hard_slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
+slopes_fast = compile_dispatch_by_length(_hard_slopes_fast, _soft_fast[0][1], _soft_fast[1][1])

@@ -85,7 +85,7 @@ class Medium:
     def to_device(self, where: torch.device) -> tuple[Tensor, Tensor]:
         """``values`` and ``skips`` as tensors on a device; cached for further cameras."""
         if where not in self._on_device:
-            values, skips = (device.copy_from_host(torch.from_numpy(x), where) for x in (self.values, self.skips))
+            values, skips = (device.copy_to_device(torch.from_numpy(x), where) for x in (self.values, self.skips))
             self._on_device[where] = values, skips
         return self._on_device[where]
 
@@ -132,7 +132,7 @@ def render_medium(
     if device.has_warp(where):
         from neuprim.tasks.dynamic.volume import raymarch_warp
 
-        place, lenses = (device.copy_from_host(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
+        place, lenses = (device.copy_to_device(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
         size = (camera.width, camera.height)
         return raymarch_warp.march_images(*medium.to_device(where), place, lenses, size, samples, subdivisions).cpu()
     image = np.zeros((camera.height, camera.width, 4), np.float32)
@@ -154,7 +154,7 @@ def light_transmittance(medium: Medium, direction: Sequence[float], where: torch
         if device.has_warp(where):
             from neuprim.tasks.dynamic.volume import raymarch_warp
 
-            inputs = (device.copy_from_host(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
+            inputs = (device.copy_to_device(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
             return np.exp(-raymarch_warp.march_depths(*inputs).cpu().numpy())
         rx, ry, rz = way.tolist()
         parallel_for(_march_depths, len(sigma), _SLICES_PER_JOB, 0, sigma, medium.skips, rx, ry, rz, result)

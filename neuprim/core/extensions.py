@@ -22,7 +22,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
 from neuprim.core.validation import Option, Range, coerce
-from neuprim.core.volumes.density_truth import VolumeSource
+from neuprim.core.volumes.density_truth import DensityGridSource
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class TrainedModel:
     scene: Mapping[str, Any]
     settings: RenderSettings
     dataset: Callable[[], Dataset]
-    volume: Callable[[], VolumeSource | None] = lambda: None
+    volume: Callable[[], DensityGridSource | None] = lambda: None
 
     @property
     def world(self) -> World:

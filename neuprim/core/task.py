@@ -15,7 +15,7 @@ from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField, 
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.validation import Option
-from neuprim.core.volumes.density_truth import VolumeSource
+from neuprim.core.volumes.density_truth import DensityGridSource
 
 API_VERSION = 1
 """Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""

@@ -36,11 +36,11 @@ from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import (
     DensityComparison,
+    DensityGridPlacement,
+    DensityGridSource,
     GridExtent,
-    Placement,
-    VolumeSource,
     measure_density_errors,
-    split_grid_planes,
+    split_density_grid_planes,
 )
 from neuprim.export.shared import find_export_box
 
@@ -198,7 +198,7 @@ def _find_export_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | No
     record = job.run.header.get("world")
     kept = None
     if isinstance(record, dict) and "grid" in record:
-        kept = Placement.from_json(record, str(job.run.directory / "model.safetensors"))
+        kept = DensityGridPlacement.from_json(record, str(job.run.directory / "model.safetensors"))
     if source is not None and kept is not None and not kept.matches(source.placement):
         reason = "the source's files are not those that the model was fitted to"
         notes.append(f"{reason}, so neither their voxels nor errors against them")
@@ -323,7 +323,12 @@ class _VdbExportSampler(NamedTuple):
 
 
 def _measure_vdb_errors(
-    job: ExportJob, source: VolumeSource, frame: _GridFrame, path: Path, scene_from_world: np.ndarray, factor: float
+    job: ExportJob,
+    source: DensityGridSource,
+    frame: _GridFrame,
+    path: Path,
+    scene_from_world: np.ndarray,
+    factor: float,
 ) -> dict[str, float]:
     """Compare the model and the written file with the source, on the source's own voxels."""
     assert frame.source is not None
@@ -342,7 +347,7 @@ def _measure_vdb_errors(
     if grid.bounds is None:
         return result
     dense = grid.to_dense()
-    for matrix, shape in split_grid_planes(*place):
+    for matrix, shape in split_density_grid_planes(*place):
         chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
         offset = chain[:3, 3] - np.array(grid.bounds[0])
         values = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor

@@ -22,7 +22,7 @@ from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.backends import best_render_backend_device, computing_device, with_available_render_backend
 from neuprim.core.task import SceneContext, TaskSpec
-from neuprim.core.volumes.density_truth import VolumeSource
+from neuprim.core.volumes.density_truth import DensityGridSource
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.plugins.provenance import warn_of_other_neuprim
 from neuprim.plugins.registry import PluginError
@@ -130,7 +130,7 @@ def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> Tra
     stored = load_run(run)
     config = stored.config
 
-    def volume() -> VolumeSource | None:
+    def volume() -> DensityGridSource | None:
         load = stored.scene.spec.volume
         if load is None:
             return None

@@ -21,7 +21,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions
 
 if TYPE_CHECKING:
-    from neuprim.core.volumes.density_truth import Placement
+    from neuprim.core.volumes.density_truth import DensityGridPlacement
 
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given
@@ -154,7 +154,7 @@ class Dataset:
     bounds: Tensor | None = None  # (2, 3) lower and upper corner of a box around everything, scene units, if known
     exposure: float = 1.0  # divisor that was applied to the linear values of the files
     world: World = field(default_factory=World)  # transform between the scene and the user's files
-    placement: Placement | None = None  # the voxel files the scene was made from, if any
+    placement: DensityGridPlacement | None = None  # the voxel files the scene was made from, if any
     largest: float | None = None  # largest extinction, 1/scene unit, if known; primitives stay below it
     points: PointSupervision | None = None  # for ``train.supervision=voxels`` and ``both``
     extra: object = None  # further knowledge in a class of the task, e.g. pixel classes; tasks accept None

@@ -15,7 +15,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, PointSamples, PointSupervision, View, ViewSet
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.core.volumes.density_truth import Placement
+from neuprim.core.volumes.density_truth import DensityGridPlacement
 
 Extra = TypeVar("Extra")
 
@@ -121,7 +121,7 @@ def _check_dataset_values(dataset: Dataset) -> None:
     _check_positive_dataset_number(f"{who}: exposure", dataset.exposure)
     _check_dataset_instance(f"{who}: world", dataset.world, World)
     dataset.world.validate(f"{who}: world")
-    for name, kind in (("points", PointSupervision), ("placement", Placement)):
+    for name, kind in (("points", PointSupervision), ("placement", DensityGridPlacement)):
         if getattr(dataset, name) is not None:
             _check_dataset_instance(f"{who}: {name}", getattr(dataset, name), kind, ", or None")
 

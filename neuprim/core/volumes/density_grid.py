@@ -86,7 +86,7 @@ def density_grid(
         ellipsoids = (geometry.means.double(), geometry.scales.double(), geometry.rotations.double())
         grid = np.zeros(shape, np.float32)
         if not isinstance(form, Cosine):
-            _add_any_density(model, conditions, ellipsoids, forward, back, grid)
+            _add_to_density_grid(model, conditions, ellipsoids, forward, back, grid)
             return torch.from_numpy(grid)
         neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
         if device.has_warp(where):
@@ -99,7 +99,7 @@ def density_grid(
             return torch.from_numpy(values)
         tensors = [x.detach().numpy() for x in (*ellipsoids, *neurons)]
     arguments = [np.ascontiguousarray(x) for x in (*tensors, forward[:3], back[:3])]
-    parallel_for(_fill_planes, shape[0], _PLANES_PER_JOB, threads, *arguments, form.omega0, form.edge, grid)
+    parallel_for(_fill_density_planes, shape[0], _PLANES_PER_JOB, threads, *arguments, form.omega0, form.edge, grid)
     return torch.from_numpy(grid)
 
 
@@ -118,7 +118,7 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
     return total
 
 
-def _add_any_density(
+def _add_to_density_grid(
     model: Primitives, conditions: Conditions, ellipsoids: Any, P: np.ndarray, Q: np.ndarray, grid: np.ndarray
 ) -> None:
     """Add a density in torch code, primitive by primitive in a fixed order, so that sums are the same every time."""
@@ -142,7 +142,7 @@ def _add_any_density(
 
 
 @exact_kernel
-def _fill_planes(
+def _fill_density_planes(
     start: int, stop: int, means: Any, scales: Any, R: Any, W1: Any, b1: Any, w2: Any, b2: Any, P: Any, Q: Any,
     omega0: float, edge: int,
     grid: Any,

@@ -29,7 +29,7 @@ _PAIRS = 1 << 22  # most pairs of tiles and primitives that are listed at a time
 
 
 @functools.cache
-def _add_kernel() -> Any:
+def _density_grid_kernel() -> Any:
     across, deep = _TILE[1], _TILE[2]
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
@@ -72,7 +72,7 @@ def _add_kernel() -> Any:
     return add_primitives
 
 
-def _tile_boxes(
+def _density_grid_tile_boxes(
     means: Tensor, scales: Tensor, rotations: Tensor, Q: Tensor, shape: tuple[int, ...]
 ) -> tuple[Tensor, Tensor]:
     """Tiles that the ellipsoids' boxes touch: (N, 3) int64 first ones, and ones behind the last, 0 without a point."""
@@ -85,7 +85,7 @@ def _tile_boxes(
     return low.div(tile, rounding_mode="floor"), torch.where((low < high).all(1, keepdim=True), last, 0)
 
 
-def _list_primitives(
+def _list_grid_tile_primitives(
     low: Tensor, wide: Tensor, counts: Tensor, tiles: tuple[int, ...], begin: int, end: int
 ) -> tuple[Tensor, Tensor]:
     """``starts`` (tiles + 1,) and ``ids``, int32: of every tile the primitives begin:end that reach it, in order."""
@@ -100,7 +100,7 @@ def _list_primitives(
     return starts.int(), prim[order].int()
 
 
-def _primitive_ranges(counts: Tensor) -> Iterator[tuple[int, int]]:
+def _density_grid_ranges(counts: Tensor) -> Iterator[tuple[int, int]]:
     """Ranges of primitives that reach at most ``_PAIRS`` tiles together, in order; those that reach none left out."""
     ends = np.cumsum(counts.cpu().numpy())
     begin = 0
@@ -134,7 +134,9 @@ def fill_density_grid(
         array((w2 / m[:, None]).contiguous(), d), array((b2 / m).contiguous(), d),
     )  # fmt: skip
     rows = array(device.copy_to_device(P.contiguous(), where), wp.vec4d)
-    first_tile, end_tile = _tile_boxes(means, scales, rotations, device.copy_to_device(Q.contiguous(), where), shape)
+    first_tile, end_tile = _density_grid_tile_boxes(
+        means, scales, rotations, device.copy_to_device(Q.contiguous(), where), shape
+    )
     tiles = tuple(-(-n // t) for n, t in zip(shape, _TILE, strict=True))
     planes = max(1, _POINTS // (_TILE[0] * shape[1] * shape[2]))
     grid = np.empty(shape, np.float32)
@@ -146,12 +148,12 @@ def fill_density_grid(
         counts = wide.prod(1)
         first, last = plane * _TILE[0], min(end * _TILE[0], shape[0])
         part = torch.zeros((last - first, *shape[1:]), dtype=torch.float32, device=where)
-        for some in _primitive_ranges(counts):
+        for some in _density_grid_ranges(counts):
             own = (end - plane, *tiles[1:])
-            starts, ids = _list_primitives(low, wide, counts, own, *some)
+            starts, ids = _list_grid_tile_primitives(low, wide, counts, own, *some)
             lists = array(starts, wp.int32), array(ids, wp.int32)
             launch_kernel(
-                _add_kernel(), (len(starts) - 1, _THREADS),
+                _density_grid_kernel(), (len(starts) - 1, _THREADS),
                 (*lists, wp.vec2i(own[1], own[2]), first, rows, *prims, edge, array(part, f)), where,
                 _THREADS,
             )  # fmt: skip

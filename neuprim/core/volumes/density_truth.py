@@ -41,7 +41,7 @@ class GridExtent(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Placement:
+class DensityGridPlacement:
     """How scene units follow from the world of the files.
 
     Attributes:
@@ -64,7 +64,7 @@ class Placement:
     component: str = "density"
     extents: Sequence[GridExtent] = ()
 
-    def matches(self, other: Placement) -> bool:
+    def matches(self, other: DensityGridPlacement) -> bool:
         """Whether both mean the same frames, places and values."""
         keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
         mine, theirs = self.to_json(), other.to_json()
@@ -84,14 +84,14 @@ class Placement:
         }
 
     @staticmethod
-    def from_json(record: Mapping[str, Any], where: str) -> Placement:
+    def from_json(record: Mapping[str, Any], where: str) -> DensityGridPlacement:
         """Read what :meth:`to_json` gave; ``where`` names the file in errors.
 
         Raises:
             DataError: anything else.
         """
         try:
-            placement = Placement(
+            placement = DensityGridPlacement(
                 np.array(record["scene_from_world"], np.float64).reshape(4, 4),
                 [int(n) for n in record["numbers"]],
                 {str(name): [float(v) for v in values] for name, values in record["times"].items()},
@@ -159,10 +159,10 @@ class DensityTruth(ABC):
         """
 
 
-class VolumeSource(DensityTruth):
+class DensityGridSource(DensityTruth):
     """The files themselves, one frame at a time; ``frames`` are those of the placement."""
 
-    placement: Placement
+    placement: DensityGridPlacement
 
     @abstractmethod
     def grid_transform(self, frame: int) -> np.ndarray | None:
@@ -240,13 +240,13 @@ def measure_density_errors(
         return None
     model = model if component is None else model.component(component)
     comparison = DensityComparison()
-    for matrix, shape in split_grid_planes(*place):
+    for matrix, shape in split_density_grid_planes(*place):
         sigma = truth.grid(frame, matrix, shape, component).numpy()
         comparison.add_block(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
     return comparison.errors()
 
 
-def split_grid_planes(
+def split_density_grid_planes(
     scene_from_index: Tensor, shape: tuple[int, int, int]
 ) -> list[tuple[Tensor, tuple[int, int, int]]]:
     """The same points in parts of whole planes."""

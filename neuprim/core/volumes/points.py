@@ -88,7 +88,7 @@ def volume_values_at(
             neurons = (form.W1, form.b1, form.w2, form.b2.reshape(-1))
             values = CosinePointValues.apply(cells, form.omega0, form.edge, shares, threads, *shape, *neurons, weights)
         else:
-            values = _torch_values(active, form, cells, weights, shares)
+            values = _torch_density_point_values(active, form, cells, weights, shares)
     except NonFiniteError:
         model.check_finite()  # names the parameter, if it is one
         raise
@@ -119,13 +119,13 @@ def _torch_values(
         sigma = active.sigma(prim, x.to(g.means)).double().clamp_min(0)
     point = device.copy_to_device(torch.from_numpy(cells.order), g.means.device)[row]
     values = torch.cat([sigma[:, None], sigma[:, None] * weights.double()[prim]], 1)
-    sums = _sum_rows(len(cells.order), point, values).float()
+    sums = _sum_density_point_rows(len(cells.order), point, values).float()
 
     def fill_shares(gradient: Tensor) -> None:
         own = sigma.detach()
-        shares.weight = _sum_rows(g.count, prim, own).float()
+        shares.weight = _sum_density_point_rows(g.count, prim, own).float()
         if shares.error is not None:
-            shares.error_weight = _sum_rows(g.count, prim, own * shares.error.double()[point]).float()
+            shares.error_weight = _sum_density_point_rows(g.count, prim, own * shares.error.double()[point]).float()
 
     if sums.requires_grad:
         sums.register_hook(fill_shares)
@@ -159,7 +159,7 @@ def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Ten
     return place[inside], prim[inside]
 
 
-def _sum_rows(count: int, rows: Tensor, values: Tensor) -> Tensor:
+def _sum_density_point_rows(count: int, rows: Tensor, values: Tensor) -> Tensor:
     """(count, ...) sums of ``values`` (P, ...) by ``rows`` (P,), in the order of P; differentiable."""
     zeros = torch.zeros((count, *values.shape[1:]), dtype=values.dtype, device=values.device)
     return zeros.index_put((rows,), values, accumulate=True)

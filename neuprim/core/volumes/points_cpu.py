@@ -49,7 +49,7 @@ def sort_points_into_cells(points: np.ndarray) -> PointCells:
         counts = np.floor((high - low) / step).astype(np.int64) + 1
     starts = np.zeros(int(counts.prod()) + 1, np.int64)
     order, placed = np.empty(len(points), np.int64), np.empty((len(points), 3))
-    _count_sort(points, low, step, counts, starts, order, placed)
+    _sort_density_points(points, low, step, counts, starts, order, placed)
     return PointCells(order, placed, starts, low, step, counts)
 
 
@@ -67,19 +67,21 @@ class CosinePointValues(torch.autograd.Function):
         count, K, width = len(params[0]), params[3].shape[1], 1 + params[7].shape[1]
         shapes = ((count, 3), (count, 3, 3), (count,), (count, 3))
         centers, whiten, m, reach = axes = tuple(np.empty(shape) for shape in shapes)
-        finite = parallel_for(_prepare_axes, count, _PREPARED_ROWS_PER_JOB, threads, *params[:3], *axes)
+        finite = parallel_for(_prepare_point_axes, count, _PREPARED_ROWS_PER_JOB, threads, *params[:3], *axes)
         neuron_shapes = ((count, K, 3), (count, K), (count, K), (count,), (count, width - 1))
         neurons = tuple(np.empty(shape) for shape in neuron_shapes)
         values = (*params[3:], omega0, m, *neurons)
-        finite += parallel_for(_prepare_neurons, count, _PREPARED_ROWS_PER_JOB, threads, *values)
+        finite += parallel_for(_prepare_point_neurons, count, _PREPARED_ROWS_PER_JOB, threads, *values)
         if not all(finite):
             raise NonFiniteError(NOT_FINITE)
         chunk = max(1, -(-count // _PARTIAL_SUMS))
         parts = np.zeros((max(1, -(-count // chunk)), len(cells.points), width))
         prims = (centers, whiten, *neurons)
-        parallel_for(_add_values, count, chunk, threads, cells, reach, prims, edge, chunk, parts)
+        parallel_for(_add_density_point_values, count, chunk, threads, cells, reach, prims, edge, chunk, parts)
         merged = np.empty((len(cells.points), width), np.float32)
-        parallel_for(_merge_sums, len(merged), _PREPARED_ROWS_PER_JOB, threads, parts, cells.order, merged)
+        parallel_for(
+            _merge_density_point_sums, len(merged), _PREPARED_ROWS_PER_JOB, threads, parts, cells.order, merged
+        )
         ctx.params, ctx.prims, ctx.axes, ctx.cells, ctx.shares = params, prims, (m, reach), cells, shares
         ctx.settings, ctx.dtypes = (omega0, edge, threads), [x.dtype for x in tensors]
         return torch.from_numpy(merged)
@@ -93,11 +95,13 @@ class CosinePointValues(torch.autograd.Function):
         p_prims = tuple(np.zeros_like(x) for x in ctx.prims)
         sums = np.zeros((count, 2))
         places = (cells, reach, ctx.prims, edge)
-        parallel_for(_values_backward, count, _ROWS_PER_JOB, threads, *places, pulled, error, p_prims, sums)
+        parallel_for(
+            _density_point_values_backward, count, _ROWS_PER_JOB, threads, *places, pulled, error, p_prims, sums
+        )
         shares.weight, shares.error_weight = (torch.from_numpy(sums[:, i]).float() for i in range(2))
         own = tuple(np.empty(x.shape, x.dtype) for x in ctx.params[1:7])
         rest = (omega0, m, ctx.prims[1:6], p_prims[1:6], own)
-        parallel_for(_parameters_backward, count, _PREPARED_ROWS_PER_JOB, threads, *ctx.params[1:3], *rest)
+        parallel_for(_density_parameters_backward, count, _PREPARED_ROWS_PER_JOB, threads, *ctx.params[1:3], *rest)
         gradients = zip((p_prims[0], *own, p_prims[6]), ctx.dtypes, strict=True)
         return (None,) * 5 + tuple(torch.from_numpy(x).to(dtype) for x, dtype in gradients)
 
@@ -106,7 +110,7 @@ class CosinePointValues(torch.autograd.Function):
 
 
 @exact_kernel
-def _prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]
+def _prepare_point_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]
     """Fill ``centers`` (N, 3), A (N, 3, 3) with y = A (x - mu), longest semi-axes m (N,) and half sides of the boxes
     around the ellipsoids, ``reach`` (N, 3). Returns whether all are finite."""
     R, s, total = np.empty((3, 3)), np.empty(3), 0.0
@@ -126,7 +130,7 @@ def _prepare_axes(start, stop, means, log_scales, quats, centers, A, m, reach): 
 
 
 @exact_kernel
-def _prepare_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, amplitude, offset, shown):  # type: ignore[no-untyped-def]
+def _prepare_point_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, amplitude, offset, shown):  # type: ignore[no-untyped-def]
     """Fill rate (N, K, 3), phase and amplitude (N, K), and offset (N,), so that f/m = offset + sum of amplitude
     cos(phase + rate . (x - mu)), and colours in float64. Returns whether all are finite."""
     total = 0.0
@@ -146,7 +150,7 @@ def _prepare_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase
 
 
 @exact_kernel
-def _parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
+def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
     """Gradients of (log_scales, quats, W1, b1, w2, b2) from those of ``prims``, (A, rate, phase, amplitude, offset)."""
     A, rate, phase, amplitude, offset = prims
     p_A, p_rate, p_phase, p_amplitude, p_offset = pulled
@@ -179,7 +183,7 @@ def _parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulle
 
 
 @exact_kernel
-def _count_sort(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
+def _sort_density_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
     """Counting sort by cell: fill ``starts``, zeros before, ``order`` and the sorted ``placed``."""
     cells = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
@@ -200,7 +204,7 @@ def _count_sort(points, low, step, counts, starts, order, placed):  # type: igno
 
 
 @exact_kernel
-def _merge_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
+def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
     """Sum the ``parts`` (P, M, W) of sorted points in order into ``merged`` (M, W) of the given points."""
     for p in range(start, stop):
         for q in range(parts.shape[2]):
@@ -211,24 +215,24 @@ def _merge_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-d
 
 
 @inline
-def _cell_span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
+def _density_point_cell_span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
     """First and last cell of an axis that a box meets; beyond the last, or -1, if none."""
     first = int(np.floor(min(max((center - reach - low) / step, 0.0), float(count))))
     return first, int(np.floor(min(max((center + reach - low) / step, -1.0), float(count - 1))))
 
 
 @inline
-def _met_cells(cells, reach, means, n):  # type: ignore[no-untyped-def]
+def _point_cells_of_primitive(cells, reach, means, n):  # type: ignore[no-untyped-def]
     """First and last cell along each axis that the box of primitive n meets."""
     low, step, counts = cells.low, cells.step, cells.counts
-    x0, x1 = _cell_span(means[n, 0], reach[n, 0], low[0], step, counts[0])
-    y0, y1 = _cell_span(means[n, 1], reach[n, 1], low[1], step, counts[1])
-    z0, z1 = _cell_span(means[n, 2], reach[n, 2], low[2], step, counts[2])
+    x0, x1 = _density_point_cell_span(means[n, 0], reach[n, 0], low[0], step, counts[0])
+    y0, y1 = _density_point_cell_span(means[n, 1], reach[n, 1], low[1], step, counts[1])
+    z0, z1 = _density_point_cell_span(means[n, 2], reach[n, 2], low[2], step, counts[2])
     return x0, x1, y0, y1, z0, z1
 
 
 @inline
-def _whiten_offset(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _whiten_density_point_offset(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
     y0 = A[n, 0, 0] * dx + A[n, 0, 1] * dy + A[n, 0, 2] * dz
     y1 = A[n, 1, 0] * dx + A[n, 1, 1] * dy + A[n, 1, 2] * dz
     y2 = A[n, 2, 0] * dx + A[n, 2, 1] * dy + A[n, 2, 2] * dz
@@ -236,7 +240,7 @@ def _whiten_offset(A, n, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _neuron_sum(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[no-untyped-def]
+def _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[no-untyped-def]
     """f/m at an offset from the mean."""
     f = offset[n]
     for k in range(phase.shape[1]):
@@ -245,18 +249,18 @@ def _neuron_sum(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[
 
 
 @kernel
-def _add_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
+def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
     """Add sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
 
     Args:
-        reach, prims: of all primitives, as :func:`_prepare_axes` and :func:`_prepare_neurons` fill them.
+        reach, prims: of all primitives, as :func:`_prepare_point_axes` and :func:`_prepare_point_neurons` fill them.
     """
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims
     own = sums[start // chunk]
     C = colors.shape[1]
     for n in range(start, stop):
-        x0, x1, y0, y1, z0, z1 = _met_cells(cells, reach, means, n)
+        x0, x1, y0, y1, z0, z1 = _point_cells_of_primitive(cells, reach, means, n)
         if z0 > z1:
             continue
         for i in range(x0, x1 + 1):
@@ -264,11 +268,11 @@ def _add_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: i
                 row = (i * counts[1] + j) * counts[2]
                 for p in range(starts[row + z0], starts[row + z1 + 1]):
                     dx, dy, dz = points[p, 0] - means[n, 0], points[p, 1] - means[n, 1], points[p, 2] - means[n, 2]
-                    a, b, c = _whiten_offset(A, n, dx, dy, dz)
+                    a, b, c = _whiten_density_point_offset(A, n, dx, dy, dz)
                     inner = 1.0 - (a * a + b * b + c * c)
                     if inner <= 0.0:
                         continue
-                    f = _neuron_sum(rate, phase, amplitude, offset, n, dx, dy, dz)
+                    f = _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz)
                     if f <= 0.0:
                         continue
                     sigma = f if edge == 0 else f * inner if edge == 1 else f * inner * inner
@@ -278,7 +282,7 @@ def _add_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: i
 
 
 @kernel
-def _values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
+def _density_point_values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
     """Gradients of ``prims`` from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and sigma x error,
     ``shares`` (N, 2)."""
     points, starts, counts = cells.points, cells.starts, cells.counts
@@ -286,7 +290,7 @@ def _values_backward(start, stop, cells, reach, prims, edge, pulled, error, grad
     g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors = gradients
     K, C = phase.shape[1], colors.shape[1]
     for n in range(start, stop):
-        x0, x1, y0, y1, z0, z1 = _met_cells(cells, reach, means, n)
+        x0, x1, y0, y1, z0, z1 = _point_cells_of_primitive(cells, reach, means, n)
         if z0 > z1:
             continue
         m0, m1, m2, whole, weight, wrong = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
@@ -296,11 +300,11 @@ def _values_backward(start, stop, cells, reach, prims, edge, pulled, error, grad
                 row = (i * counts[1] + j) * counts[2]
                 for p in range(starts[row + z0], starts[row + z1 + 1]):
                     dx, dy, dz = points[p, 0] - means[n, 0], points[p, 1] - means[n, 1], points[p, 2] - means[n, 2]
-                    a, b, c = _whiten_offset(A, n, dx, dy, dz)
+                    a, b, c = _whiten_density_point_offset(A, n, dx, dy, dz)
                     inner = 1.0 - (a * a + b * b + c * c)
                     if inner <= 0.0:
                         continue
-                    f = _neuron_sum(rate, phase, amplitude, offset, n, dx, dy, dz)
+                    f = _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz)
                     if f <= 0.0:
                         continue
                     fade = 1.0 if edge == 0 else inner if edge == 1 else inner * inner

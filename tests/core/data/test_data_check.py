@@ -97,7 +97,9 @@ FAULTS: dict[str, Callable[[Any], None]] = {
     "test view 0 is a str; expected a neuprim.core.data.dataset.View": wrong_view,
     "two: start is None; expected a function of (views, count, generator)": member(start=None),
     "two: exposure is 0; expected a positive number": member(exposure=0),
-    "two: placement is a dict; expected a neuprim.core.volumes.density_truth.Placement": member(placement={}),
+    "two: placement is a dict; expected a neuprim.core.volumes.density_truth.DensityGridPlacement": member(
+        placement={}
+    ),
     "two: test is a list; expected a neuprim.core.data.dataset.ViewSet": member(test=[]),
     "two: color_space is 'sRGB'; expected srgb or linear": member(color_space="sRGB"),
     "two: data_source is 'photos'; expected real or generated": member(data_source="photos"),

@@ -15,7 +15,7 @@ from neuprim.core.volumes.density_truth import (
     DensityTruth,
     TruthFrame,
     measure_density_errors,
-    split_grid_planes,
+    split_density_grid_planes,
 )
 from tests.cosine_models import model
 
@@ -94,7 +94,7 @@ def test_nothing_to_compare_with() -> None:
 def test_blocks_are_the_points_in_their_order() -> None:
     matrix = torch.eye(4, dtype=torch.float64)
     matrix[:3, :3] = torch.tensor([[0.1, 0.02, 0], [0, 0.2, 0], [0.05, 0, 0.1]])
-    parts = split_grid_planes(matrix, (5000, 60, 50))
+    parts = split_density_grid_planes(matrix, (5000, 60, 50))
     assert sum(shape[0] for _, shape in parts) == 5000 and len(parts) > 2
     assert all(shape[1:] == (60, 50) for _, shape in parts)
     point = torch.tensor([parts[0][1][0], 1, 2, 1.0], dtype=torch.float64)

@@ -29,7 +29,7 @@ from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.notices import warn_once
-from neuprim.core.volumes.density_truth import GridExtent, Placement
+from neuprim.core.volumes.density_truth import DensityGridPlacement, GridExtent
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics, build_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
@@ -110,11 +110,11 @@ class Capture:
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
-    def placement(self) -> Placement:
+    def placement(self) -> DensityGridPlacement:
         """How the scene lies in the world of its files; times as in the dataset."""
         optics, names = self.optics, self.reader.names
         flames_absorb = optics.flame_extinction > 0 and optics.flame_grid in names
-        return Placement(
+        return DensityGridPlacement(
             self.normalisation.matrix(),
             [frame.number for frame in self.frames],
             {"time": [self.time(frame) for frame in self.frames]},

@@ -15,7 +15,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import VdbFrame, vdb_sequence
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import voxels_in_box
-from neuprim.core.volumes.density_truth import DENSITY_ERRORS, TruthFrame, VolumeSource, measure_density_errors
+from neuprim.core.volumes.density_truth import DENSITY_ERRORS, DensityGridSource, TruthFrame, measure_density_errors
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 
@@ -36,7 +36,7 @@ def sample_extinction(
     return values.reshape(shape).astype(np.float32)
 
 
-class CaptureDensity(VolumeSource):
+class CaptureDensity(DensityGridSource):
     """The frames of ``path`` or the scene's own; grids, optics, placement and times are those of the scene.
 
     Frames of a folder outside the scene's times are left out; a single file outside them has no time. Models are

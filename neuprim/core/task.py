@@ -98,7 +98,7 @@ class SceneSpec:
     name: str
     summary: str
     load: Callable[[Mapping[str, Any], SceneContext], Dataset]
-    volume: Callable[[Mapping[str, Any], SceneContext], VolumeSource] | None = None
+    volume: Callable[[Mapping[str, Any], SceneContext], DensityGridSource] | None = None
     truth: Callable[[Mapping[str, Any], SceneContext, Mapping[str, Any] | None], DatasetImages] | None = None
     chunks: Callable[[Mapping[str, Any], SceneContext], Chunks | None] | None = None
 

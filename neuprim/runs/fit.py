@@ -175,7 +175,7 @@ def prepare_training(
     """
     if make is None:
         refuse_chunks(config, "this trains one model at once, and only a whole run can be fitted in chunks")
-    backends.check_render_device(config.renderer)
+    backends.check_render_backend(config.renderer)
     task = ConfigWithTask.of(config).task
     config = replace(config, made_by=current_config_provenance(config, task))
     job = ConfigWithTask(config, task)

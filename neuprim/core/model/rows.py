@@ -21,7 +21,7 @@ def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str
     """Rows (M,) int64, ascending, of ``tensors`` (N, ...), float32 or float64; differentiable, once. Not checked."""
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not kernel_needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
-    return dict(zip(tensors, apply_autograd(_PrimitiveRows, rows, *tensors.values()), strict=True))
+    return dict(zip(tensors, apply_kernel_operation(_PrimitiveRows, rows, *tensors.values()), strict=True))
 
 
 @exact_kernel
@@ -161,5 +161,5 @@ def fused_cosine_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) ->
     if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain
-    result: tuple[Tensor, Tensor] = apply_autograd(_CosineGain, w2, b2, log_gain, limit)
+    result: tuple[Tensor, Tensor] = apply_kernel_operation(_CosineGain, w2, b2, log_gain, limit)
     return result

@@ -80,7 +80,7 @@ def render_lowered(
     return _render_checked_view(lowered, camera, settings, background)
 
 
-def _draw_checked(
+def _render_checked_view(
     lowered: LoweredPrimitives, camera: AnyCamera, settings: RenderSettings, background: Tensor | None
 ) -> RenderOutput:
     settings = resolve_near(settings, lowered.geometry.means, [camera])

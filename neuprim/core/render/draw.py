@@ -20,7 +20,7 @@ Draw = Callable[..., RenderOutput]
 """A backend's ``render(lowered, camera, background, settings)``; which cameras it takes differs."""
 
 
-def draw_samples(
+def draw_pixel_samples(
     draw: Draw, lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
     """Draw ``settings.samples`` squared rays per pixel: means of rgb and alpha, and of depth weighted by alpha."""

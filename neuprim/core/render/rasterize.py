@@ -46,7 +46,7 @@ class RasterRequest:
         return cls(camera, density.omega0 / (2 * math.pi), density.edge, settings, stats, *rest)
 
 
-def primitive_tensors(lowered: LoweredPrimitives) -> tuple[Tensor, ...]:
+def rasterizer_tensors(lowered: LoweredPrimitives) -> tuple[Tensor, ...]:
     """Return the tensors of :data:`PARAMETERS`."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"

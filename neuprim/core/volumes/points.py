@@ -100,7 +100,7 @@ def volume_values_at(
 # ---------------------------------------------------------------- torch code: on a GPU, and for any other density
 
 
-def _torch_values(
+def _torch_density_point_values(
     active: ActivePrimitives, form: LoweredDensity, cells: PointCells, weights: Tensor, shares: PointShares
 ) -> Tensor:
     """As :class:`CosinePointValues`; sums run in a fixed order."""

@@ -149,5 +149,5 @@ class _HarmonicColors(torch.autograd.Function):
 
 def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
     """:func:`~neuprim.core.model.colours.sh.sh_colors` of float32 CPU tensors, degree 1..3; differentiable."""
-    result: Tensor = apply_autograd(_HarmonicColors, means, dc, rest, origin, degree)
+    result: Tensor = apply_kernel_operation(_HarmonicColors, means, dc, rest, origin, degree)
     return result

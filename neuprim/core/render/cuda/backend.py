@@ -56,7 +56,7 @@ class _Rasterize(torch.autograd.Function):
         net: ColourNet | None = None
         if weights:
             check_primitive_colours_finite(dict(zip(NET, weights, strict=True)))
-            net = prepare_colour_net(log_scales, quats, *weights)
+            net = prepare_rasterizer_colour_net(log_scales, quats, *weights)
         forced = net.fast if net is not None and net.hidden else None
         try:
             frame = prepare_frame(request, viewmat, palette, parameters, forced)

@@ -110,7 +110,7 @@ def render(
     return RenderOutput(rgb.to(dtype), alpha.to(dtype), depth, stats)
 
 
-def _trace_block(
+def _composite_ray_block(
     lowered: LoweredPrimitives,
     frame: _PreparedPrimitives,
     rays: ReferenceRays,

@@ -75,7 +75,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
             ("harmonics", sh_warp._harmonic_kernels(3)),
             ("Adam", kernels_warp.adam_kernels()),
             ("SSIM", kernels_warp.ssim_kernels()),
-            ("grid", (density_grid_warp._add_kernel(),)),
+            ("grid", (density_grid_warp._density_grid_kernel(),)),
             ("rays of volumes", (raymarch_warp._march_image_kernel(), raymarch_warp._march_depth_kernel())),
         ):
             for number, kernel in enumerate(made, 1):

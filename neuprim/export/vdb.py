@@ -125,7 +125,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     return ExportReport(tuple(paths), False, errors, tuple(notes))
 
 
-def _describe_exported_grid(placement: Placement | None, units: str, factor: float, name: str) -> list[str]:
+def _describe_exported_grid(placement: DensityGridPlacement | None, units: str, factor: float, name: str) -> list[str]:
     """Say what the values of the written grid mean."""
     unit = f"extinction per {units} unit"
     if units == "source" and placement is not None:
@@ -144,7 +144,7 @@ class _CutVoxels(NamedTuple):
     outside: int
 
 
-def _exported_component(job: ExportJob, placement: Placement | None) -> Primitives:
+def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) -> Primitives:
     """Return the model, or its part that comes from the source's grid if other grids absorb, too.
 
     Raises:
@@ -186,7 +186,9 @@ def _clamp_exported_grid(grid: Grid, extent: GridExtent, per_unit: float) -> tup
 # ---------------------------------------------------------------- which frames, and where
 
 
-def _find_export_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | None, Placement | None, list[str]]:
+def _find_export_source(
+    job: ExportJob, wanted: bool
+) -> tuple[DensityGridSource | None, DensityGridPlacement | None, list[str]]:
     """Find the scene's files, how the model lies in their world, and notes about it."""
     notes: list[str] = []
     source = None
@@ -206,7 +208,7 @@ def _find_export_source(job: ExportJob, wanted: bool) -> tuple[VolumeSource | No
     return source, kept if source is None else source.placement, notes
 
 
-def _list_export_frames(job: ExportJob, placement: Placement | None) -> list[_GridFrame]:
+def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) -> list[_GridFrame]:
     """List the frames that the user names, else those of the run; a model without conditions has one."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
@@ -216,11 +218,11 @@ def _list_export_frames(job: ExportJob, placement: Placement | None) -> list[_Gr
     return [_GridFrame(n, _export_frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
 
 
-def _export_frame_conditions(placement: Placement, frame: int) -> dict[str, Tensor]:
+def _export_frame_conditions(placement: DensityGridPlacement, frame: int) -> dict[str, Tensor]:
     return {name: torch.tensor(values[frame]) for name, values in placement.times.items()}
 
 
-def _export_source_frame(conditions: Conditions, placement: Placement | None) -> int | None:
+def _export_source_frame(conditions: Conditions, placement: DensityGridPlacement | None) -> int | None:
     """Find the frame of the source with these conditions."""
     for i in range(0 if placement is None else len(placement.numbers)):
         known = _export_frame_conditions(placement, i)

@@ -15,7 +15,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, vdb_sequence, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.density_grid import voxels_in_box
-from neuprim.core.volumes.density_truth import DensityTruth, TruthFrame, VolumeSource
+from neuprim.core.volumes.density_truth import DensityGridSource, DensityTruth, TruthFrame
 from neuprim.inspect.field import InspectionFrame
 
 _GRID, _MARK, _CONDITION = "extinction", "neuprim_units", "neuprim_condition_"
@@ -23,7 +23,7 @@ _USUAL = (_GRID, "density", "sigma")
 
 
 def open_inspection_truth(
-    path: str, volume: Callable[[], VolumeSource | None], world: World
+    path: str, volume: Callable[[], DensityGridSource | None], world: World
 ) -> tuple[DensityTruth, str]:
     """Open the ground truth that the user named, and say in a line how it was read.
 

@@ -67,7 +67,7 @@ def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor
     if not device.on_numba(w2, b2, center, log_window):
         weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
         return w2 * weight, b2 * weight
-    result: tuple[Tensor, Tensor] = apply_autograd(_TimeWindow, w2, b2, center, log_window, xi)
+    result: tuple[Tensor, Tensor] = apply_kernel_operation(_TimeWindow, w2, b2, center, log_window, xi)
     return result
 
 
@@ -107,5 +107,5 @@ def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Te
     if not device.on_numba(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center
         return means + (velocity + acceleration * since) * since
-    moved: Tensor = apply_autograd(_MoveInTime, means, velocity, acceleration, center, xi)
+    moved: Tensor = apply_kernel_operation(_MoveInTime, means, velocity, acceleration, center, xi)
     return moved

@@ -40,7 +40,7 @@ from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
 from neuprim.runs.fit import Event, Note
 from neuprim.runs.open import load_dataset
-from neuprim.search.target import choose_hold_out, run_target
+from neuprim.search.target import choose_target_hold_out, run_target
 from neuprim.search.trial_runner import VIEWS
 from neuprim.search.trials import Trial, run_trial
 
@@ -150,7 +150,7 @@ def train_grid(name: str, data: Sequence[str], work: Path) -> dict[str, Any]:
             config = compose([*words_of(name, data, out), f"model.primitives={size}", *([less] if less else [])])
             task = load_config_task(config)
             dataset = dataset or load_dataset(ConfigWithTask(config, task))
-            every = choose_hold_out(dataset)
+            every = choose_target_hold_out(dataset)
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
             model, _ = load_model(out / "model.safetensors", task)
             packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")

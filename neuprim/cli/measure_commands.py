@@ -296,7 +296,7 @@ def _tradeoff(args: argparse.Namespace) -> int:
 def _render_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration_setting
-    from neuprim.search.render_tradeoff import format_render_command, measure_tradeoff
+    from neuprim.search.render_tradeoff import format_tradeoff_render_command, measure_tradeoff
     from neuprim.search.tradeoff_measuring import TradeoffRequest
     from neuprim.search.tradeoff_record import TRADEOFF_FOLDER
 
@@ -315,7 +315,7 @@ def _render_tradeoff(args: argparse.Namespace) -> int:
             raise
         kept = f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on"
         raise KeyboardInterrupt(kept) from None
-    commands = [format_render_command(str(run_dir), point.words) for point in record.points]
+    commands = [format_tradeoff_render_command(str(run_dir), point.words) for point in record.points]
     _print_fronts(folder, record, commands)
     return 0
 
@@ -324,7 +324,7 @@ def _train_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration_setting, take_launcher_overrides
     from neuprim.config.overrides import parse_overrides
-    from neuprim.search.ablation import format_run_command, run_ablation
+    from neuprim.search.ablation import format_ablation_run_command, run_ablation
     from neuprim.search.tradeoff_measuring import TradeoffRequest
 
     launcher, words = take_launcher_overrides([args.run_dir, *args.words])
@@ -339,7 +339,7 @@ def _train_tradeoff(args: argparse.Namespace) -> int:
             folder, record = run_ablation(request, args.seeds or 1, launcher, progress.note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
-    _print_fronts(folder, record, [format_run_command(point.words) for point in record.points])
+    _print_fronts(folder, record, [format_ablation_run_command(point.words) for point in record.points])
     return 0
 
 

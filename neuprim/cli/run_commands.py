@@ -173,12 +173,12 @@ def _search_target(
 
 def _describe_target(record: TargetRecord) -> list[str]:
     """What was predicted and achieved, and why the search ended."""
-    from neuprim.search.size_forecast import format_forecast
+    from neuprim.search.size_forecast import format_target_forecast
     from neuprim.search.target_record import TARGET_FILE
 
     found = record.achieved
     lines = [
-        f"predicted {format_forecast(name, value, doubt)}; held out {found['held_out'][name]:.4g}; "
+        f"predicted {format_target_forecast(name, value, doubt)}; held out {found['held_out'][name]:.4g}; "
         f"test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing"
         for name, (value, doubt) in found["predicted"].items()
     ]

@@ -37,24 +37,24 @@ from neuprim.runs.run_directory import lock_run_directory
 from neuprim.search.ablation_plan import (
     CENTRE,
     AblationPlan,
-    StepTimes,
+    AblationStepTimes,
     Variant,
-    combine_models,
+    combine_ablation_changes,
     list_variants,
-    merge_overrides,
+    merge_variant_overrides,
     plan_training_lengths,
 )
-from neuprim.search.model_quality import EvalView, eval_views
+from neuprim.search.model_quality import EvalView, choose_trial_views
 from neuprim.search.tradeoff_measuring import (
-    EvaluationSetup,
     Progress,
     Tell,
     TradeoffRequest,
     TradeoffSession,
+    TradeoffSetup,
     check_knobs,
-    describe_conditions,
-    describe_setup,
-    load_setup,
+    describe_tradeoff_conditions,
+    describe_tradeoff_setup,
+    load_tradeoff_setup,
     measure_point,
 )
 from neuprim.search.tradeoff_record import COMBINED, TRADEOFF_FILE, TradeoffRecord, read_tradeoff_record
@@ -73,7 +73,7 @@ _EXACT = 0.004  # share of the budget for one model's exact images
 _MAX_COMBINATIONS = 12
 
 
-def format_run_command(overrides: Sequence[str]) -> str:
+def format_ablation_run_command(overrides: Sequence[str]) -> str:
     """Return the command that trains a model."""
     return shlex.join(["neuprim", "run", *overrides])
 
@@ -97,25 +97,25 @@ def run_ablation(
     Raises:
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
-    models = _compose_model_set(request.words, seeds, launcher)
+    models = _compose_ablation_set(request.words, seeds, launcher)
     folder, centre, task = models.folder, models.centre, load_config_task(models.centre)
     with use_one_torch_thread_for_run(), use_launcher_threads_for_runs(launcher), ExitStack() as stack:
         stack.enter_context(find_config_plugins(centre).attribute_errors())
         variants = list_variants(centre, task)
         check_knobs(request, variants, f"a model of task {task.name!r}")
         before = read_tradeoff_record(folder / TRADEOFF_FILE)
-        _check_set_folder(models, before)
+        _check_ablation_folder(models, before)
         stack.enter_context(lock_run_directory(folder, "set"))
-        plan = None if before is None else _parse_plan(folder / TRADEOFF_FILE, before)
+        plan = None if before is None else _parse_ablation_plan(folder / TRADEOFF_FILE, before)
         render_ground_truth_before_run(centre, launcher, progress)
         dataset = load_dataset(ConfigWithTask(centre, task), progress)
         check_dataset_views(dataset, task.conditions)
-        views = eval_views(dataset, request.views)
+        views = choose_trial_views(dataset, request.views)
         if not views:
             raise DataError(f"{dataset.name} has no test views; expected some to measure on")
         lpips = str(request.lpips or centre.metrics.lpips or "")
-        identity = {"kind": "models", **models.identity(), "lpips": lpips, **describe_conditions(views)}
-        record = _resume_model_set(folder, before, identity, tell)
+        identity = {"kind": "models", **models.identity(), "lpips": lpips, **describe_tradeoff_conditions(views)}
+        record = _resume_ablation_set(folder, before, identity, tell)
         session = _AblationSession(models, (dataset, views), request, record, progress, plan)
         # The first of every knob, then the second, so that short budgets change as many knobs as possible.
         rungs = zip_longest(*session.choose_knobs(variants).values())
@@ -124,7 +124,7 @@ def run_ablation(
 
 
 @dataclass(frozen=True)
-class _ModelSet:
+class _AblationSet:
     """A set of models: its folder, the centre's overrides and configuration, trainings of each, and where they run."""
 
     folder: Path
@@ -145,7 +145,7 @@ class _AblationSession(TradeoffSession):
 
     def __init__(
         self,
-        models: _ModelSet,
+        models: _AblationSet,
         loaded: tuple[Dataset, list[EvalView]],
         request: TradeoffRequest,
         record: TradeoffRecord,
@@ -157,7 +157,7 @@ class _AblationSession(TradeoffSession):
         self._loaded, self._plan, self._planned_at, self._compiling = loaded, plan, 0.0, 0.0
         spent = record.facts.get("spent_seconds", 0.0)
         self.begun -= float(spent) if isinstance(spent, int | float) else 0.0
-        self._setups: dict[str, EvaluationSetup] = {}
+        self._setups: dict[str, TradeoffSetup] = {}
         self._workers, self._threads = count_parallel_jobs(self.launcher, 1000)
 
     @property
@@ -186,7 +186,7 @@ class _AblationSession(TradeoffSession):
         self._train(wanted, _COMBINED)
         self.take_times(1.0)
         self.record.facts |= {
-            **describe_setup(self.point_setup(0)[0]),
+            **describe_tradeoff_setup(self.point_setup(0)[0]),
             "preset": self.centre.preset,
             "words": list(self.words),
             "seeds": self.seeds,
@@ -194,7 +194,7 @@ class _AblationSession(TradeoffSession):
             "length": self.plan.describe(),
         }
         self.record.find_fronts()
-        self.write_results(format_run_command)
+        self.write_results(format_ablation_run_command)
 
     def write_record(self) -> None:
         self.record.facts |= {"spent_seconds": self.spent, "plan": vars(self.plan)}
@@ -222,8 +222,8 @@ class _AblationSession(TradeoffSession):
         return kept
 
     @cached_property
-    def _step_times(self) -> StepTimes:
-        return StepTimes(self.centre, self._loaded[0])
+    def _step_times(self) -> AblationStepTimes:
+        return AblationStepTimes(self.centre, self._loaded[0])
 
     def _find_pace(self, variant: Variant, paces: dict[str, float]) -> str | None:
         """Measure a variant's step time; returns why it cannot be trained."""
@@ -231,7 +231,7 @@ class _AblationSession(TradeoffSession):
             paces[variant.name] = 1.0
         if variant.name in paces:
             return None
-        words = merge_overrides(self.words, [*variant.turned, "output_dir=null"])
+        words = merge_variant_overrides(self.words, [*variant.turned, "output_dir=null"])
         try:
             ratio = self._step_times.measure(compose(words, check_output=False))
         except NeuprimError as error:
@@ -282,20 +282,20 @@ class _AblationSession(TradeoffSession):
         quiet = [] if any(a.key == "train.eval_every" for a in parse_overrides(words)) else ["train.eval_every=0"]
         place = quote_override("output_dir", str(self._run_dir(variant, seed)))
         own = [*quiet, quote_override("seed", self.centre.seed + seed), place]
-        return Trial(compose(merge_overrides(words, own), check_output=False), views=self.request.views)
+        return Trial(compose(merge_variant_overrides(words, own), check_output=False), views=self.request.views)
 
     def _run_dir(self, variant: Variant, seed: int) -> Path:
         return self.folder / TRIALS / (variant.folder + (f"_seed-{self.centre.seed + seed}" if seed else ""))
 
     # ------------------------------------------------------------ measuring
 
-    def _setup(self, run_dir: str) -> EvaluationSetup:
+    def _setup(self, run_dir: str) -> TradeoffSetup:
         if run_dir not in self._setups:
             path, views = self.folder / run_dir, len(self._loaded[1])
-            self._setups[run_dir] = load_setup(path, (), views, self.request.lpips, self._loaded)
+            self._setups[run_dir] = load_tradeoff_setup(path, (), views, self.request.lpips, self._loaded)
         return self._setups[run_dir]
 
-    def point_setup(self, number: int) -> tuple[EvaluationSetup, RunRendering]:
+    def point_setup(self, number: int) -> tuple[TradeoffSetup, RunRendering]:
         setup = self._setup(self.record.points[number].run_dir)
         return setup, setup.reference
 
@@ -331,7 +331,7 @@ class _AblationSession(TradeoffSession):
         allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
         rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds * self.seeds, 1e-9)
         most = min(int(self._workers * rounds), _MAX_COMBINATIONS - len(allowed))
-        for variant in (Variant(COMBINED, way) for way in combine_models(points, most)):
+        for variant in (Variant(COMBINED, way) for way in combine_ablation_changes(points, most)):
             reason = self._find_pace(variant, self.plan.paces)
             if reason is None:
                 allowed.append(variant)
@@ -343,7 +343,7 @@ class _AblationSession(TradeoffSession):
 # ---------------------------------------------------------------- the folder
 
 
-def _compose_model_set(overrides: Sequence[str], seeds: int, launcher: LauncherSettings) -> _ModelSet:
+def _compose_ablation_set(overrides: Sequence[str], seeds: int, launcher: LauncherSettings) -> _AblationSet:
     typed = parse_overrides(overrides)
     words = [a.text for a in typed if a.key not in ("output_dir", "resume", "budget")]
     places = [a.value for a in typed if a.key == "output_dir" and a.value is not None]
@@ -351,10 +351,10 @@ def _compose_model_set(overrides: Sequence[str], seeds: int, launcher: LauncherS
     folder = Path(str(places[-1])).expanduser() if places else ROOT / f"tradeoff-{centre.task}-{centre.scene_name}"
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"output_dir={folder}: is a file; expected a directory")
-    return _ModelSet(folder, words, centre, seeds, launcher)
+    return _AblationSet(folder, words, centre, seeds, launcher)
 
 
-def _check_set_folder(models: _ModelSet, before: TradeoffRecord | None) -> None:
+def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) -> None:
     """Refuse a folder that holds something else, or another set."""
     folder = models.folder
     if before is None:
@@ -367,7 +367,7 @@ def _check_set_folder(models: _ModelSet, before: TradeoffRecord | None) -> None:
         raise ConfigError(f"{folder}: holds a set with another {' and '.join(changed)}; {expected}")
 
 
-def _resume_model_set(
+def _resume_ablation_set(
     folder: Path, before: TradeoffRecord | None, identity: Mapping[str, Any], tell: Tell
 ) -> TradeoffRecord:
     """Return the earlier record; without points if they were measured otherwise."""
@@ -386,7 +386,7 @@ def _resume_model_set(
     return record
 
 
-def _parse_plan(file: Path, record: TradeoffRecord) -> AblationPlan | None:
+def _parse_ablation_plan(file: Path, record: TradeoffRecord) -> AblationPlan | None:
     try:
         return validate(AblationPlan, record.facts["plan"], "plan") if "plan" in record.facts else None
     except ConfigError as error:

@@ -18,9 +18,9 @@ from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
 from neuprim.plugins.returns import call_task_tunable_settings
 from neuprim.runs.fit import compile_run_kernels, prepare_training, use_one_torch_thread_for_run
-from neuprim.search.pareto import FrontStep, combine_front_steps
+from neuprim.search.pareto import ParetoStep, combine_pareto_steps
 from neuprim.search.tradeoff_record import COMBINED, TradeoffPoint, name_variant
-from neuprim.search.trials import get_setting
+from neuprim.search.trials import get_trial_setting
 
 CENTRE = "centre"  # name of the model that others are compared with
 LENGTH = "train.iterations"  # the knob whose values are shares of the full length
@@ -63,7 +63,7 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
     knob = "model.primitives"
     variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.primitives]}
     for knob, values in call_task_tunable_settings(task, build_settings(task, centre.model, centre.options)).items():
-        now = get_setting(centre, knob)
+        now = get_trial_setting(centre, knob)
         others = [value for value in values if value != now]
         if now in values:
             others.sort(key=lambda value: abs(values.index(value) - values.index(now)))
@@ -72,7 +72,7 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
     return variants
 
 
-def merge_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
+def merge_variant_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
     """Return overrides with others over them, each setting once."""
     again = {assignment.key for assignment in parse_overrides(over)}
     return [*(a.text for a in parse_overrides(words) if a.key not in again), *over]
@@ -102,7 +102,7 @@ class AblationPlan:
         scaled = max(1, round(every * steps / self.whole)) if self.whole else every
         if scaled != every and key not in {assignment.key for assignment in parse_overrides(words)}:
             budget.append(quote_override(key, scaled))
-        return merge_overrides(words, [*variant.turned, *budget])
+        return merge_variant_overrides(words, [*variant.turned, *budget])
 
     def describe(self) -> str:
         text = f"Every model trains for the same time, about {self.seconds:.3g} s: {self.steps:,} steps of the centre"
@@ -128,7 +128,7 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
     return AblationPlan(steps, steps * pace, whole)
 
 
-class StepTimes:
+class AblationStepTimes:
     """Step times relative to the centre's, at half of the training, where every band of colour is in use.
 
     Attributes:
@@ -139,13 +139,13 @@ class StepTimes:
     def __init__(self, centre: RunConfig, dataset: Dataset) -> None:
         self.dataset, self.compiling = dataset, 0.0
         self._centre = self._prepare(centre)
-        self._identity = _model_identity(self._centre)
+        self._identity = _ablation_model_identity(self._centre)
         self.seconds = self._run_turns(self._centre)[1] / (_STEPS_PER_TURN * _TURNS)
 
     def measure(self, config: RunConfig) -> float | None:
         """Return the ratio of a configuration; None if it builds the same model as the centre."""
         trainer = self._prepare(config)
-        if _model_identity(trainer) == self._identity:
+        if _ablation_model_identity(trainer) == self._identity:
             return None
         own, base = self._run_turns(trainer)
         return own / base
@@ -174,13 +174,13 @@ class StepTimes:
         return total[0], total[1]
 
 
-def _model_identity(trainer: Trainer) -> tuple[Any, ...]:
+def _ablation_model_identity(trainer: Trainer) -> tuple[Any, ...]:
     model = trainer.model
     fields = [type(f).__name__ + repr(f.settings()) for f in (model.density, model.colour)]
     return (model.count, trainer.settings.population.grow_to, *fields)
 
 
-def combine_models(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
+def combine_ablation_changes(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
     """Return at most ``most`` combinations of single changes: towards fewer bytes, less time, and better quality."""
     centre = points[0]
     smaller, faster, better = [], [], []
@@ -188,7 +188,7 @@ def combine_models(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str
         if point.knob == COMBINED or point.length != 1.0 or len(point.turned) != 1:
             continue
         loss, bytes_gain = centre.quality["psnr"] - point.quality["psnr"], math.log(centre.bytes / point.bytes)
-        step = FrontStep(point.knob, point.turned[0], bytes_gain, loss)
+        step = ParetoStep(point.knob, point.turned[0], bytes_gain, loss)
         if bytes_gain > 0:
             smaller.append(step)
         if point.ratios and 0 < point.ratio < 1.0 - point.doubt:
@@ -196,4 +196,4 @@ def combine_models(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str
         if loss < -0.02:
             better.append(step._replace(gain=-loss, loss=-bytes_gain))
     known = [point.turned for point in points]
-    return combine_front_steps((smaller, faster, better), known, most)
+    return combine_pareto_steps((smaller, faster, better), known, most)

@@ -24,7 +24,7 @@ from neuprim.search.quantized_finetune import (
     QuantizedModel,
     TrainingData,
     finetune_for_table,
-    quantize_within,
+    search_fewest_bits,
 )
 
 DEFAULT_TOLERANCE = 0.1  # dB that training views may lose
@@ -130,7 +130,9 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
         start = time.perf_counter()
         if dataset is not None and (request.trains or not request.by_level):
             with use_one_torch_thread_for_run():
-                quantized = _quantize(request, TrainingData(config, task, dataset), model, table, progress)
+                quantized = _search_quantized_model(
+                    request, TrainingData(config, task, dataset), model, table, progress
+                )
             stored, coding, steps = quantized.model, quantized.quantizers, quantized.steps
             notes += quantized.notes
         text = (run_dir / "config.yaml").read_text(encoding="utf-8")
@@ -151,7 +153,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
     return Compression(final, parameters, floats, final.stat().st_size, measured, seconds, steps, tuple(notes))
 
 
-def _quantize(
+def _search_quantized_model(
     request: CompressRequest, data: TrainingData, model: Primitives, table: BitTable, progress: Progress
 ) -> QuantizedModel:
     steps = request.steps
@@ -160,4 +162,4 @@ def _quantize(
     if request.by_level:
         return finetune_for_table(data, model, table, steps, progress)
     tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance
-    return quantize_within(data, model, tolerance, steps, progress)
+    return search_fewest_bits(data, model, tolerance, steps, progress)

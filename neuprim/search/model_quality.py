@@ -42,7 +42,7 @@ class EvalQuality(NamedTuple):
     ms_per_frame: float
 
 
-def eval_views(dataset: Dataset, views: int) -> list[EvalView]:
+def choose_trial_views(dataset: Dataset, views: int) -> list[EvalView]:
     """Return at most ``views`` of the test views, evenly spread."""
     most, chosen = min(views, len(dataset.test)), []
     for i in (k * len(dataset.test) // most for k in range(most)):
@@ -57,7 +57,7 @@ def fill_masked(image: Tensor, view: EvalView) -> Tensor:
     return image if view.mask is None else torch.where(view.mask[..., None], image, view.image.to(image))
 
 
-def measure_eval_views(
+def measure_trial_views(
     model: Primitives, views: Sequence[EvalView], settings: RenderSettings, background: Tensor
 ) -> EvalQuality:
     """Render all views and compare them with the ground truth."""
@@ -84,7 +84,7 @@ _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
 _DRAWS_PER_FRAME = 6  # each draw is of a random frame; so many times the frames find most of them
 
 
-class TrainingQuality:
+class SearchQuality:
     """Mean PSNR of some training views; of a volume trained on its voxels also the accuracy of its extinction.
 
     Views are chosen at random, as training views are often ordered by camera or time.
@@ -100,11 +100,11 @@ class TrainingQuality:
         order = torch.randperm(len(dataset.train), generator=torch.Generator().manual_seed(0)).tolist()
         decide = min(_VIEWS, max(len(order) // 2, 1))
         self.views, self.others = order[:decide], order[decide : decide + _SENSITIVITY_VIEWS] or order[:decide]
-        self.draws = _draw_frames(dataset.points) if inside and dataset.points is not None else []
+        self.draws = _draw_search_quality_points(dataset.points) if inside and dataset.points is not None else []
         self._offset: float | None = None
 
     @classmethod
-    def of_run(cls, config: RunConfig, dataset: Dataset) -> TrainingQuality:
+    def of_run(cls, config: RunConfig, dataset: Dataset) -> SearchQuality:
         """Return the quality that decides for a run; inside volumes too, where it was trained on them."""
         return cls(dataset, config.renderer, config.train.supervision != "images")
 
@@ -149,7 +149,7 @@ class TrainingQuality:
         return 10 ** ((self.inside_quality(model) - self.image_quality(model)) / 10)
 
 
-def _draw_frames(points: PointSupervision) -> list[PointSamples]:
+def _draw_search_quality_points(points: PointSupervision) -> list[PointSamples]:
     """Return points of different frames, in the order of the frames' names."""
     generator, frames = torch.Generator().manual_seed(0), dict[str, PointSamples]()
     for _ in range(_DRAWS_PER_FRAME * _FRAMES):

@@ -37,7 +37,7 @@ def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> 
     return [point for _, point in front]
 
 
-class FrontStep(NamedTuple):
+class ParetoStep(NamedTuple):
     """A single change: the knob, its override, the gain (log of the cost's reduction) and the loss of quality."""
 
     knob: str
@@ -46,18 +46,18 @@ class FrontStep(NamedTuple):
     loss: float
 
 
-def chain_front_steps(steps: Sequence[FrontStep], min_gain: float = 0.01) -> list[tuple[str, ...]]:
+def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> list[tuple[str, ...]]:
     """Return combinations of overrides along the expected front, one override per knob, two or more each.
 
     Gains and losses are assumed to add up; measuring the combinations corrects that. The next step is always the one
     with the least loss per gain, of another knob or further along the same.
     """
-    state: dict[str, FrontStep] = {}
+    state: dict[str, ParetoStep] = {}
     chain: list[tuple[str, ...]] = []
     while True:
         options = []
         for step in steps:
-            now = state.get(step.knob, FrontStep(step.knob, "", 0.0, 0.0))
+            now = state.get(step.knob, ParetoStep(step.knob, "", 0.0, 0.0))
             if (gain := step.gain - now.gain) > min_gain:
                 options.append((max(step.loss - now.loss, 0.0) / gain, -gain, step.override, step))
         if not options:
@@ -68,20 +68,20 @@ def chain_front_steps(steps: Sequence[FrontStep], min_gain: float = 0.01) -> lis
             chain.append(tuple(step.override for step in state.values()))
 
 
-def combine_front_steps(
-    directions: Sequence[Sequence[FrontStep]], known: Sequence[Sequence[str]], most: int
+def combine_pareto_steps(
+    directions: Sequence[Sequence[ParetoStep]], known: Sequence[Sequence[str]], most: int
 ) -> list[tuple[str, ...]]:
     """Return at most ``most`` new combinations, alternating between directions and evenly spread along each."""
     taken = {frozenset(overrides) for overrides in known}
-    chains = [[way for way in chain_front_steps(steps) if frozenset(way) not in taken] for steps in directions]
+    chains = [[way for way in chain_pareto_steps(steps) if frozenset(way) not in taken] for steps in directions]
     chosen: dict[frozenset[str], tuple[str, ...]] = {}
-    for rung in zip_longest(*(spread_evenly(chain, most) for chain in chains)):
+    for rung in zip_longest(*(thin_pareto_chain(chain, most) for chain in chains)):
         for way in filter(None, rung):
             chosen.setdefault(frozenset(way), way)
     return list(chosen.values())[: max(most, 0)]
 
 
-def spread_evenly(items: Sequence[T], most: int) -> list[T]:
+def thin_pareto_chain(items: Sequence[T], most: int) -> list[T]:
     """Return at most ``most`` of the items, evenly spread."""
     if len(items) <= most or most < 1:
         return list(items[: max(most, 0)])

@@ -25,8 +25,14 @@ from neuprim.runs.fit import Fitted, drop_unused_run_rates, make_run_loss, use_o
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import PRUNED, kept_shares, load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.training import save_run_training
-from neuprim.search.model_quality import TrainingQuality, eval_views, measure_eval_views
-from neuprim.search.pruning_cuts import count_stored_numbers, cut_to_loss, list_reductions, price_cuts, zero_masks
+from neuprim.search.model_quality import SearchQuality, choose_trial_views, measure_trial_views
+from neuprim.search.pruning_cuts import (
+    count_unpruned_numbers,
+    cut_to_loss,
+    list_pruning_reductions,
+    mask_pruned_numbers,
+    price_cuts,
+)
 
 MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
 """Rounds of fine-tuning, unless a round would be longer than these steps; least steps of a round. Every round ends at
@@ -61,7 +67,7 @@ class PruningStage:
 
 
 @dataclass(frozen=True)
-class _State:
+class _PruningState:
     """A model on the way.
 
     Attributes:
@@ -81,13 +87,13 @@ class _State:
 
     @property
     def numbers(self) -> int:
-        return count_stored_numbers(self.model)
+        return count_unpruned_numbers(self.model)
 
 
 def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
     """Return the share saved of a file's numbers, or of those that every frame evaluates."""
     per_primitive = smaller.parameters_per_primitive / model.parameters_per_primitive
-    return max(1 - count_stored_numbers(smaller) / numbers, 1 - per_primitive)
+    return max(1 - count_unpruned_numbers(smaller) / numbers, 1 - per_primitive)
 
 
 @dataclass
@@ -111,12 +117,12 @@ class ModelShrinker:
     base: float = 0.0
 
     def __post_init__(self) -> None:
-        self.quality, self._sensitivity_seed = TrainingQuality.of_run(self.config, self.dataset), 0
+        self.quality, self._sensitivity_seed = SearchQuality.of_run(self.config, self.dataset), 0
 
     def shrink(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
         """Return the smallest model found, and the reductions of its fields."""
         self.base = self.quality(model)
-        best, tried = _State(model), None
+        best, tried = _PruningState(model), None
         untried: tuple[str, ...] = ()
         rounds = min(max(self.steps // _MIN_ROUND, 1), max(MAX_ROUNDS, self.steps // _LONG_ROUND))
         recovery = min(self.steps / rounds / _MIN_ROUND, 1.0) ** 2  # a few steps recover next to nothing
@@ -149,7 +155,9 @@ class ModelShrinker:
         last = {word.partition("=")[0]: word for word in best.words}  # degree 0 after degree 2 is degree 0
         return best.model, tuple(last.values())
 
-    def _next_state(self, best: _State, untried: tuple[str, ...], bite: float, progress: float) -> _State | None:
+    def _next_state(
+        self, best: _PruningState, untried: tuple[str, ...], bite: float, progress: float
+    ) -> _PruningState | None:
         """Return what to train next; None where nothing more can be cut."""
         if untried:  # reductions that failed together with other cuts are tried alone
             return self._reduce_fields(best, untried, bite)
@@ -161,13 +169,13 @@ class ModelShrinker:
             state = self._cut(best, 2.0 * state.bite, progress)  # each of a few large parts costs more than the bite
         return None if state.numbers >= best.numbers else state
 
-    def _max_loss(self, before: _State, now: _State, best: _State) -> float:
+    def _max_loss(self, before: _PruningState, now: _PruningState, best: _PruningState) -> float:
         """Return the dB of loss after a round beyond which a cut is taken back: more than another round would win."""
         if best.rounds and best.lost < 0:  # the model before has room, so a smaller cut saves something
             return self.tolerance
         return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
 
-    def _cut(self, state: _State, bite: float, progress: float) -> _State:
+    def _cut(self, state: _PruningState, bite: float, progress: float) -> _PruningState:
         """Return a model that is ``bite`` dB worse before training."""
 
         def quick(model: Primitives) -> float:
@@ -176,11 +184,11 @@ class ModelShrinker:
         self.progress("choosing what to cut", progress)
         model, size, start = state.model, state.numbers, quick(state.model)
         by_price = self._cut_by_price(model, quick, bite)
-        price = bite / max(1 - count_stored_numbers(by_price) / size, 1e-9)
+        price = bite / max(1 - count_unpruned_numbers(by_price) / size, 1e-9)
         smaller, words, lost, again = model, list(state.words), 0.0, True
         while again:  # whole parts of fields, while they cost no more than single numbers
             again = False
-            for kind, name, value in list_reductions(smaller):
+            for kind, name, value in list_pruning_reductions(smaller):
                 reduced = reduce_model(smaller, kind, name, value)
                 drop = start - quick(reduced)
                 cheap = drop <= min(bite, price * _saved_share(model, reduced, size))
@@ -189,15 +197,15 @@ class ModelShrinker:
                     words.append(f"{kind}.{name}={value}")
                     break
         result = by_price if smaller is model else self._cut_by_price(smaller, quick, bite - lost)
-        return _State(result, tuple(words), bite=bite, cut=self.quality(result))
+        return _PruningState(result, tuple(words), bite=bite, cut=self.quality(result))
 
-    def _reduce_fields(self, state: _State, words: tuple[str, ...], bite: float) -> _State:
+    def _reduce_fields(self, state: _PruningState, words: tuple[str, ...], bite: float) -> _PruningState:
         model = state.model
         for word in words:
             place, _, value = word.partition("=")
             kind, _, name = place.partition(".")
             model = reduce_model(model, kind, name, int(value))
-        return _State(model, (*state.words, *words), bite=bite, cut=self.quality(model), fields_only=True)
+        return _PruningState(model, (*state.words, *words), bite=bite, cut=self.quality(model), fields_only=True)
 
     def _cut_by_price(self, model: Primitives, quality: Callable[[Primitives], float], loss: float) -> Primitives:
         if loss <= 0:
@@ -208,12 +216,12 @@ class ModelShrinker:
         inside = inner_sensitivity(model, draws, seed=seed, threads=settings.threads) if draws else None
         return cut_to_loss(model, price_cuts(model, views, inside, self.quality), quality, loss)
 
-    def _train(self, state: _State, number: int, rounds: int) -> _State:
+    def _train(self, state: _PruningState, number: int, rounds: int) -> _PruningState:
         """Return the state after a round of fine-tuning."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
             trainer = make_run_finetune_trainer(ConfigWithTask(self.config, self.task), self.dataset, model, steps)
-            trainer.zero_masks, left = zero_masks(trainer.model), state.numbers
+            trainer.zero_masks, left = mask_pruned_numbers(trainer.model), state.numbers
             for done in range(steps):
                 trainer.train_step()
                 if done % 20 == 0:
@@ -304,7 +312,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
         measured = measure_quality(model, task, dataset, config.renderer)
         before = _measure_pruned(model, model_file(request.run_dir), measured, config, dataset)
         kept, stages = kept_shares(small), tuple(shrinker.stages)
-        if count_stored_numbers(small) >= count_stored_numbers(model):
+        if count_unpruned_numbers(small) >= count_unpruned_numbers(model):
             return Pruning(None, steps, seconds, before, before, (), kept_shares(model), judged, stages)
         progress("pictures and report", 1.0)
         fitted = _fit_pruned(replace(config, output_dir=final), task, dataset, small, words)
@@ -326,10 +334,10 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
 def _measure_pruned(
     model: Primitives, file: Path, measured: tuple[float, float], config: RunConfig, dataset: Dataset
 ) -> dict[str, float]:
-    views = eval_views(dataset, _TIMED_VIEWS)
+    views = choose_trial_views(dataset, _TIMED_VIEWS)
     moved = move_to_render_device(model, config.renderer, views[0].view)
-    ms = measure_eval_views(moved, views, config.renderer, dataset.background).ms_per_frame
-    facts = {"primitives": model.count, "numbers": count_stored_numbers(model), "bytes": file.stat().st_size}
+    ms = measure_trial_views(moved, views, config.renderer, dataset.background).ms_per_frame
+    facts = {"primitives": model.count, "numbers": count_unpruned_numbers(model), "bytes": file.stat().st_size}
     return {**facts, "psnr": measured[0], "ssim": measured[1], "frames_per_second": 1e3 / ms}
 
 
@@ -350,5 +358,5 @@ def _fit_pruned(
     trainer = Trainer(
         model, dataset, make_run_loss(ConfigWithTask(config, task)), settings, config.renderer, config.seed
     )
-    trainer.zero_masks = zero_masks(trainer.model)
+    trainer.zero_masks = mask_pruned_numbers(trainer.model)
     return Fitted(config, task, dataset, find_channels(task, dataset), trainer)

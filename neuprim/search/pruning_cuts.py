@@ -14,7 +14,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import PrunableUnit, count_unit_numbers, primitives_with_unit, zero_units
 from neuprim.core.model.reduction import reduce_model
 from neuprim.core.train.sensitivity import Sensitivity
-from neuprim.search.model_quality import TrainingQuality
+from neuprim.search.model_quality import SearchQuality
 
 _CONTRAST = 0.05
 """Mean squared difference of a primitive's colour from its background, where :func:`price_cuts` cannot measure it."""
@@ -28,7 +28,7 @@ def _units(model: Primitives) -> dict[str, PrunableUnit]:
     return prunable_units_of_model(model.density, model.colour)
 
 
-def count_stored_numbers(model: Primitives) -> int:
+def count_unpruned_numbers(model: Primitives) -> int:
     """Return how many numbers a file holds: all but units that are zero."""
     zeros = sum(
         count_unit_numbers(unit, model.params) * int((~primitives_with_unit(unit, model.params)).sum())
@@ -37,7 +37,7 @@ def count_stored_numbers(model: Primitives) -> int:
     return model.count * model.parameters_per_primitive - zeros
 
 
-def zero_masks(model: Primitives) -> dict[str, Tensor]:
+def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
     """Return parameter -> (N, ...) bool of the numbers in units that are zero."""
     masks: dict[str, Tensor] = {}
     for unit in _units(model).values():
@@ -49,7 +49,7 @@ def zero_masks(model: Primitives) -> dict[str, Tensor]:
     return masks
 
 
-def list_reductions(model: Primitives) -> list[tuple[str, str, int]]:
+def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
     """Return (kind, name, value) of all reductions of whole fields, the largest saving first."""
     fields = (("density", model.density), ("colour", model.colour))
     words = [
@@ -59,14 +59,14 @@ def list_reductions(model: Primitives) -> list[tuple[str, str, int]]:
 
 
 def price_cuts(
-    model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: TrainingQuality
+    model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: SearchQuality
 ) -> Sensitivity:
     """Return mean squared changes of images without each primitive and unit; changes inside count by their weight."""
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
 
-def _measure_contrast(model: Primitives, effects: Sensitivity, quality: TrainingQuality) -> float:
+def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQuality) -> float:
     """Return the mean squared difference of colour, from the cost of removing the least primitives."""
     count = max(int(_PROBE * model.count), 1)
     order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
@@ -105,10 +105,10 @@ def cut_to_loss(
     sizes = _Sizes(whole, present, numbers)
     dear = [prices.whole / whole, *(prices.pieces[name] / max(size, 1) for name, size in numbers.items())]
     low, high = 0.0, max(1e-30, *(float(each.max()) for each in dear if len(each)))
-    start, best = quality(model), _cut_below(model, prices, sizes, 0.0)
+    start, best = quality(model), _prune_below_price(model, prices, sizes, 0.0)
     for _ in range(_HALVINGS):
         price = (max(low, high * 1e-9) * high) ** 0.5
-        tried = _cut_below(model, prices, sizes, price)
+        tried = _prune_below_price(model, prices, sizes, price)
         if tried.count and start - quality(tried) <= loss:
             best, low = tried, price
         else:
@@ -116,7 +116,7 @@ def cut_to_loss(
     return best
 
 
-def _cut_below(model: Primitives, prices: Sensitivity, sizes: _Sizes, price: float) -> Primitives:
+def _prune_below_price(model: Primitives, prices: Sensitivity, sizes: _Sizes, price: float) -> Primitives:
     known = prices.seen > 0  # nothing is known of primitives in no view
     kept = (~known | (prices.whole / sizes.whole >= price)).nonzero()[:, 0]
     gone = {}

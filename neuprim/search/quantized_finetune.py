@@ -21,8 +21,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.finetune import make_run_finetune_trainer
-from neuprim.search.model_quality import TrainingQuality
-from neuprim.search.pruning_cuts import zero_masks
+from neuprim.search.model_quality import SearchQuality
+from neuprim.search.pruning_cuts import mask_pruned_numbers
 
 Progress = Callable[[str, float], None]
 
@@ -64,7 +64,7 @@ def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
 class QuantizationSearch:
     """Quantize by one number: the squared error that rounding may add, as a share of the model's own."""
 
-    def __init__(self, model: Primitives, dataset: Dataset, quality: TrainingQuality) -> None:
+    def __init__(self, model: Primitives, dataset: Dataset, quality: SearchQuality) -> None:
         self.model = canonical_model(model)
         effects = sensitivity(self.model, dataset, quality.others[:_SENSITIVITY_VIEWS], quality.settings)
         if quality.draws:
@@ -115,7 +115,7 @@ def finetune_for_table(
 ) -> QuantizedModel:
     """Train a model for the bits of a table; returns it untrained where training views are better so."""
     whole = canonical_model(model)
-    quantizers, quality = fit_quantizers(whole, table), TrainingQuality.of_run(data.config, data.dataset)
+    quantizers, quality = fit_quantizers(whole, table), SearchQuality.of_run(data.config, data.dataset)
     before = quality(dequantize(whole, quantizers))
     progress("training for few bits", 0.0)
     trained = _finetune(data, whole, quantizers, steps)
@@ -128,7 +128,7 @@ def finetune_for_table(
     return QuantizedModel(whole, quantizers, steps, (note,))
 
 
-def quantize_within(
+def search_fewest_bits(
     data: TrainingData, model: Primitives, tolerance: float, steps: int, progress: Progress
 ) -> QuantizedModel:
     """Return the model in the fewest bits with which training views lose at most ``tolerance`` dB, trained for them.
@@ -136,7 +136,7 @@ def quantize_within(
     Args:
         steps: of training; 0 for none.
     """
-    quality = TrainingQuality.of_run(data.config, data.dataset)
+    quality = SearchQuality.of_run(data.config, data.dataset)
     base = quality(model)
     progress("measuring the effect of numbers", 0.0)
     untrained = QuantizationSearch(model, data.dataset, quality)
@@ -144,7 +144,7 @@ def quantize_within(
     best: tuple[Primitives, Quantizers, float] | None = None
     rounds = min(max(steps // _ROUND_STEPS, 1), _MAX_ROUNDS) if steps else 0
     for number in range(rounds):
-        share = _error_share(at_once)
+        share = _tolerated_error_share(at_once)
         quantizers = search.fit(share)
         own = steps * (number + 1) // rounds - steps * number // rounds
         progress("training for few bits", number / rounds)
@@ -160,7 +160,7 @@ def quantize_within(
             def accept(quantizers: Quantizers, model: Primitives = one.model) -> bool:
                 return base - quality(dequantize(model, quantizers)) <= tolerance
 
-            found = one.model, *one.find_coarsest(accept, _error_share(tolerance))
+            found = one.model, *one.find_coarsest(accept, _tolerated_error_share(tolerance))
             best = found if best is None or found[2] > best[2] else best
     assert best is not None
     whole, quantizers, share = best
@@ -168,7 +168,7 @@ def quantize_within(
     return QuantizedModel(whole, quantizers, steps, (note,))
 
 
-def _error_share(decibels: float) -> float:
+def _tolerated_error_share(decibels: float) -> float:
     """Return the added share of the squared error that loses so many dB."""
     return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
 
@@ -176,7 +176,7 @@ def _error_share(decibels: float) -> float:
 def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
     """Train a canonical model, rendering every image from quantized numbers."""
     trainer = make_run_finetune_trainer(ConfigWithTask(data.config, data.task), data.dataset, model, steps)
-    trainer.zero_masks = zero_masks(trainer.model)
+    trainer.zero_masks = mask_pruned_numbers(trainer.model)
     on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}
     trainer.fake_quantize = lambda params: fake_quantize(params, on_device)
     for _ in range(steps):

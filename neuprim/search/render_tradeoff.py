@@ -21,18 +21,18 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RunRendering
-from neuprim.search.pareto import FrontStep, combine_front_steps
+from neuprim.search.pareto import ParetoStep, combine_pareto_steps
 from neuprim.search.tradeoff_measuring import (
-    EvaluationSetup,
-    ExactImages,
+    ExactTradeoffImages,
     Progress,
     Tell,
     TradeoffRequest,
     TradeoffSession,
+    TradeoffSetup,
     check_knobs,
-    describe_conditions,
-    describe_setup,
-    load_setup,
+    describe_tradeoff_conditions,
+    describe_tradeoff_setup,
+    load_tradeoff_setup,
     measure_point,
 )
 from neuprim.search.tradeoff_record import (
@@ -52,7 +52,7 @@ _EXACT, _IMAGES, _TIMES, _COMBINED = 0.2, 0.45, 0.65, 0.85
 _COMBINATIONS = 24
 
 
-def format_render_command(run_dir: str, overrides: Sequence[str]) -> str:
+def format_tradeoff_render_command(run_dir: str, overrides: Sequence[str]) -> str:
     """Return the command that draws the test views so."""
     return shlex.join(["neuprim", "render", run_dir, "--camera", "test", *overrides])
 
@@ -102,25 +102,25 @@ def measure_tradeoff(
     Raises:
         NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
     """
-    setup, folder = load_setup(run_dir, request.words, request.views, request.lpips), run_dir / TRADEOFF_FOLDER
+    setup, folder = load_tradeoff_setup(run_dir, request.words, request.views, request.lpips), run_dir / TRADEOFF_FOLDER
     knobs = list_render_knobs(setup.reference, setup.model)
     check_knobs(request, knobs, "this run")
-    record = _resume_render_tradeoff(folder / TRADEOFF_FILE, _render_identity(setup), tell)
+    record = _resume_tradeoff_record(folder / TRADEOFF_FILE, _render_tradeoff_identity(setup), tell)
     with find_config_plugins(setup.config).attribute_errors(), use_one_torch_thread_for_run():
         if (reason := setup.unsupported(setup.reference)) is not None:
             raise ConfigError(reason)
-        record.facts |= {**describe_setup(setup), "primitives": setup.model.count}
-        session = _RenderSession(folder, request, record, progress, setup)
+        record.facts |= {**describe_tradeoff_setup(setup), "primitives": setup.model.count}
+        session = _RenderTradeoffSession(folder, request, record, progress, setup)
         session.measure([(REFERENCE, setup.reference), *session.single_changes(knobs)], _IMAGES)
         session.take_times(_TIMES)
         session.measure([(COMBINED, config) for config in session.combinations()], _COMBINED)
         session.take_times(1.0)
         record.find_fronts(session.stores_the_reference, session.draws_the_reference)
-        session.write_results(partial(format_render_command, str(run_dir)), setup.model.count)
+        session.write_results(partial(format_tradeoff_render_command, str(run_dir)), setup.model.count)
     return record
 
 
-class _RenderSession(TradeoffSession):
+class _RenderTradeoffSession(TradeoffSession):
     """Measure points of one run within the budget."""
 
     def __init__(
@@ -129,16 +129,16 @@ class _RenderSession(TradeoffSession):
         request: TradeoffRequest,
         record: TradeoffRecord,
         progress: Progress,
-        setup: EvaluationSetup,
+        setup: TradeoffSetup,
     ) -> None:
         super().__init__(folder, request, record, progress)
         self.setup = setup
 
-    def point_setup(self, number: int) -> tuple[EvaluationSetup, RunRendering]:
+    def point_setup(self, number: int) -> tuple[TradeoffSetup, RunRendering]:
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     @cached_property
-    def exact(self) -> ExactImages:
+    def exact(self) -> ExactTradeoffImages:
         """Exact images, rendered when the first point needs them."""
         self.progress("exact images", 0.0)
         return self.render_exact(self.setup, _EXACT)
@@ -190,20 +190,20 @@ class _RenderSession(TradeoffSession):
                 continue
             knob, loss = turned[0].partition("=")[0], base.quality["psnr"] - point.quality["psnr"]
             if point.ratios and point.ratio < 1.0 - point.doubt and self.stores_the_reference(point):
-                faster.append(FrontStep(knob, turned[0], -math.log(point.ratio), loss))
+                faster.append(ParetoStep(knob, turned[0], -math.log(point.ratio), loss))
             if point.bytes < base.bytes and self.draws_the_reference(point):
-                smaller.append(FrontStep(knob, turned[0], math.log(base.bytes / point.bytes), loss))
+                smaller.append(ParetoStep(knob, turned[0], math.log(base.bytes / point.bytes), loss))
         configs = [self.setup.parse(point.words) for point in others if point.knob == COMBINED]
-        for way in combine_front_steps((faster, smaller), known, _COMBINATIONS):
+        for way in combine_pareto_steps((faster, smaller), known, _COMBINATIONS):
             changed = {word.partition("=")[0] for word in way}
             kept = [word for word in base.words if word.partition("=")[0] not in changed]
             configs.append(self.setup.parse([*kept, *way]))
         return configs
 
 
-def _render_identity(setup: EvaluationSetup) -> dict[str, Any]:
+def _render_tradeoff_identity(setup: TradeoffSetup) -> dict[str, Any]:
     """Return what must be equal to keep earlier points; JSON-able."""
-    config, conditions = setup.config, describe_conditions(setup.views)
+    config, conditions = setup.config, describe_tradeoff_conditions(setup.views)
     conditions["machine"]["device"] = setup.backend(setup.reference).computing_on(setup.reference.settings)
     return {
         "model": hashlib.sha256(setup.file.read_bytes()).hexdigest(),
@@ -215,7 +215,7 @@ def _render_identity(setup: EvaluationSetup) -> dict[str, Any]:
     }
 
 
-def _resume_render_tradeoff(path: Path, identity: dict[str, Any], tell: Tell) -> TradeoffRecord:
+def _resume_tradeoff_record(path: Path, identity: dict[str, Any], tell: Tell) -> TradeoffRecord:
     """Return the earlier record if nothing changed, else an empty one."""
     before = read_tradeoff_record(path)
     if before is None:

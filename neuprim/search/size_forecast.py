@@ -35,19 +35,19 @@ _FIXED_SHARE = 0.5  # share of a time that does not depend on the number of prim
 
 
 class Forecast(NamedTuple):
-    """Predicted quality in dB (:func:`to_decibels`), and half the width of its likely range."""
+    """Predicted quality in dB (:func:`to_forecast_decibels`), and half the width of its likely range."""
 
     value: float
     doubt: float
 
 
-def to_decibels(name: str, value: float) -> float:
+def to_forecast_decibels(name: str, value: float) -> float:
     """Return PSNR as it is, and SSIM as -10 log10(1 - ssim), on which equal steps need about equal work."""
     return value if name == "psnr" else -10 * math.log10(max(1.0 - value, 1e-6))
 
 
-def from_decibels(name: str, value: float) -> float:
-    """Invert :func:`to_decibels`."""
+def from_forecast_decibels(name: str, value: float) -> float:
+    """Invert :func:`to_forecast_decibels`."""
     return value if name == "psnr" else 1.0 - 10 ** (-value / 10)
 
 
@@ -67,16 +67,16 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
     ratio = _STEP_RATIO
     if len(gains) > 1 and gains[-2] > _SEED_NOISE:
         ratio = min(max((_STEP_RATIO + gains[-1] / gains[-2]) / 2, _MIN_RATIO), _MAX_RATIO)
-    low, middle, high = (_sum_gains(last, r, doublings) for r in (_MIN_RATIO, ratio, _MAX_RATIO))
+    low, middle, high = (_sum_forecast_gains(last, r, doublings) for r in (_MIN_RATIO, ratio, _MAX_RATIO))
     return Forecast(lengths[longest] + middle, _SEED_NOISE + (high - low) / 2)
 
 
-def _sum_gains(gain: float, ratio: float, doublings: float) -> float:
+def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
     """Return gain (ratio + ratio^2 + ...), for a number of doublings that need not be whole."""
     return gain * doublings if ratio == 1 else gain * ratio * (1 - ratio**doublings) / (1 - ratio)
 
 
-def fit_time_line(known: Sequence[tuple[int, float]], primitives: float) -> float:
+def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> float:
     """Return a time at a number of primitives, by a least-squares line that neither falls nor starts below zero."""
     counts, times = [float(n) for n, _ in known], [t for _, t in known]
     mean_n, mean_t = sum(counts) / len(counts), sum(times) / len(times)
@@ -134,7 +134,7 @@ class SizeCurve:
         if place <= first:
             return low - self._end_slope(0) * (first - place)
         if place >= last:
-            return high + _sum_gains(self.slope, _SIZE_RATIO, place - last)
+            return high + _sum_forecast_gains(self.slope, _SIZE_RATIO, place - last)
         (a, at_a), (b, at_b) = next(pair for pair in pairwise(self.nodes) if place <= pair[1][0])
         return at_b if b == a else at_a + (at_b - at_a) * (place - a) / (b - a)
 
@@ -177,12 +177,12 @@ def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float
     found = highest if found is None else found
     found = round(min(max(found, counts[0] / 2.0**_FURTHEST, 1), highest, 2.0**_FURTHEST * counts[-1]))
     if len(counts) == 1:
-        return SizeProposal("try" if highest > 1 else "take", _move_apart(counts[0], found, highest))
+        return SizeProposal("try" if highest > 1 else "take", _move_from_tried_size(counts[0], found, highest))
     near = any(abs(math.log2(found / count)) <= _CLOSE for count in counts)
     return SizeProposal("take" if near else "try", found)
 
 
-def _move_apart(tried: int, found: int, highest: int) -> int:
+def _move_from_tried_size(tried: int, found: int, highest: int) -> int:
     """Return ``found``, moved so far from the only size tried that both give a slope."""
     step = math.log2(found / tried)
     if abs(step) < _APART:
@@ -235,7 +235,9 @@ class SizePredictor:
         wanted = self.target.quality
         if not wanted:
             return values["psnr"]
-        return min(to_decibels(name, values[name]) - to_decibels(name, goal) for name, goal in wanted.items())
+        return min(
+            to_forecast_decibels(name, values[name]) - to_forecast_decibels(name, goal) for name, goal in wanted.items()
+        )
 
     def margin_of(self, attempt: Attempt) -> float:
         return self.margin({name: attempt.measured(name) for name in self.measures})
@@ -285,7 +287,7 @@ class SizePredictor:
 
     def _with_current_settings(self, name: str, attempt: Attempt) -> float:
         loss = sum(turn.loss.get(name, 0.0) for turn in self._changes_since(attempt))
-        return to_decibels(name, attempt.measured(name)) - loss
+        return to_forecast_decibels(name, attempt.measured(name)) - loss
 
     def margins(self) -> list[tuple[int, float]]:
         """Return (primitives, margin) of every size.
@@ -294,7 +296,7 @@ class SizePredictor:
         run that is too small and one that is large enough, only full runs count.
         """
         margins = {
-            n: self.margin({name: from_decibels(name, f.value) for name, f in values.items()})
+            n: self.margin({name: from_forecast_decibels(name, f.value) for name, f in values.items()})
             for n, values in self.forecasts().items()
         }
         known = {a.count for a in self._relevant("full")}
@@ -322,7 +324,7 @@ class SizePredictor:
         predicted = {}
         for name in self.measures:
             curve = SizeCurve.fit([(n, values[name].value) for n, values in forecasts.items()])
-            predicted[name] = [from_decibels(name, curve.at(primitives)), forecasts[nearest][name].doubt]
+            predicted[name] = [from_forecast_decibels(name, curve.at(primitives)), forecasts[nearest][name].doubt]
         return predicted
 
     def limit(self) -> int | None:
@@ -337,17 +339,17 @@ class SizePredictor:
         if not limits or not trials:
             return None
         most = [
-            _bisect_count(1.0, 1e8, lambda n, known=known, allowed=allowed: fit_time_line(known, n) <= allowed)[0]  # type: ignore[misc]
+            _bisect_count(1.0, 1e8, lambda n, known=known, allowed=allowed: forecast_time(known, n) <= allowed)[0]  # type: ignore[misc]
             for known, allowed in limits
         ]
         return max(int(min(most)), 1)
 
 
-def format_forecast(name: str, value: float, doubt: float) -> str:
+def format_target_forecast(name: str, value: float, doubt: float) -> str:
     """Format a predicted measure, with its doubt (dB) in the measure's unit."""
     if name == "psnr":
         return f"{name} {value:.2f} ± {doubt:.2g} dB"
-    low, high = (from_decibels(name, to_decibels(name, value) + sign * doubt) for sign in (-1, 1))
+    low, high = (from_forecast_decibels(name, to_forecast_decibels(name, value) + sign * doubt) for sign in (-1, 1))
     return f"{name} {value:.4f} ± {(high - low) / 2:.2g}"
 
 

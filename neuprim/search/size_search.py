@@ -24,15 +24,15 @@ from neuprim.search.size_forecast import (
     SizePredictor,
     SizeProposal,
     exceeded_limit,
-    fit_time_line,
-    format_forecast,
+    forecast_time,
+    format_target_forecast,
     propose_best_size,
     propose_size,
-    to_decibels,
+    to_forecast_decibels,
 )
 from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
 from neuprim.search.trial_runner import VIEWS, TrialRunner
-from neuprim.search.trials import get_setting, override_settings
+from neuprim.search.trials import get_trial_setting, override_trial_settings
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
 """A full run is good enough within these dB above the target, if at most this factor above the predicted size."""
@@ -72,7 +72,7 @@ def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -
 
     whole, found = count_numbers(config), []
     for key, offered in call_task_tunable_settings(task, build_settings(task, config.model, config.options)).items():
-        now = get_setting(config, key)
+        now = get_trial_setting(config, key)
         if now is None:  # not a setting of this configuration
             continue
         if key in ("model.sh_degree", "model.neurons"):  # any whole number is possible
@@ -80,13 +80,13 @@ def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -
         sizes: dict[SettingValue, int] = {}
         for value in offered:
             with suppress(ConfigError):  # not with the other settings
-                sizes[value] = count_numbers(override_settings(config, {key: value}))
+                sizes[value] = count_numbers(override_trial_settings(config, {key: value}))
         if fewer := sorted((value for value in sizes if sizes[value] < whole), key=lambda value: sizes[value]):
             found.append((sizes[fewer[0]], key, (*fewer, now)))
     return {key: values for _, key, values in sorted(found, key=lambda one: one[0])}
 
 
-def next_setting_change(
+def propose_setting_trial(
     values: Mapping[str, Sequence[SettingValue]], turns: Sequence[SettingChange]
 ) -> tuple[str, SettingValue, SettingValue] | None:
     """Return (setting, current value, value to try); None when all are done.
@@ -271,7 +271,7 @@ class SizeSearch:
         margins = predictor.margins()
         if max(SizeCurve.fit(margins).at(best), *(m for _, m in margins)) + predictor.doubt >= ALLOWANCE:
             return
-        expected = ", ".join(format_forecast(name, *pair) for name, pair in predictor.predict(best).items())
+        expected = ", ".join(format_target_forecast(name, *pair) for name, pair in predictor.predict(best).items())
         limited = predictor.limit() is not None and self._highest() == predictor.limit()
         self.record.out_of_reach = (
             f"{self.target} is out of reach: {expected} is the best that "
@@ -285,7 +285,7 @@ class SizeSearch:
             return
         values = list_smaller_settings(self.config, load_config_task(self.config), self.dataset)
         for _ in range(_MAX_CHANGES):
-            change = next_setting_change(values, self.record.turns)
+            change = propose_setting_trial(values, self.record.turns)
             wanted = self._wanted()
             bases = [
                 a
@@ -301,7 +301,10 @@ class SizeSearch:
             key, before, after = change
             words = {**self.record.words, key: after}
             (tried,) = self.runner.run(Attempt("knob", words, base.primitives, self.record.length))
-            loss = {n: to_decibels(n, base.measured(n)) - to_decibels(n, tried.measured(n)) for n in ("psnr", "ssim")}
+            loss = {
+                n: to_forecast_decibels(n, base.measured(n)) - to_forecast_decibels(n, tried.measured(n))
+                for n in ("psnr", "ssim")
+            }
             size = (tried.packed / tried.count) / (base.packed / base.count)
             slope = max(SizeCurve.fit(self.predictor.margins()).slope_at(wanted), 0.2)
             adopted = setting_change_pays(max(loss[name] for name in self.predictor.measures), size, slope)
@@ -321,7 +324,7 @@ class SizeSearch:
             attempt = unfinished[-1] if unfinished else self._plan_full()
             if attempt is None:
                 return
-            expected = ", ".join(format_forecast(name, *pair) for name, pair in attempt.predicted.items())
+            expected = ", ".join(format_target_forecast(name, *pair) for name, pair in attempt.predicted.items())
             text = f"full run: {attempt.primitives:,} primitives, {attempt.steps:,} steps; expected {expected}"
             self.runner.notify(text)
             self.runner.notify(_describe_attempt(self.runner.run(attempt)[0], {}))
@@ -355,7 +358,7 @@ class SizeSearch:
     def _reserve(self, primitives: int) -> float:
         """Return the seconds for what follows a full run: evaluation, pictures, quantization."""
         trials = self.record.finished("size", "full")
-        frame = fit_time_line([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
+        frame = forecast_time([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
         held_out = min(VIEWS, len(self.dataset.train) // self.record.hold_out)
         frames = 6 * held_out + 3 * len(self.dataset.test) + 40
         return 2 * frame * frames + 2 * max(self.runner.overhead(), 0.0)
@@ -363,7 +366,7 @@ class SizeSearch:
 
 def _describe_attempt(attempt: Attempt, predicted: Mapping[str, Sequence[float]]) -> str:
     changes = "".join(f" {key.rpartition('.')[2]}={value}" for key, value in sorted(attempt.words.items()))
-    expected = ", ".join(format_forecast(name, *pair) for name, pair in predicted.items())
+    expected = ", ".join(format_target_forecast(name, *pair) for name, pair in predicted.items())
     measured = f"held out {attempt.measured('psnr'):.2f} dB, ssim {attempt.measured('ssim'):.4f}"
     return (
         f"{attempt.count:,} primitives{changes}, {attempt.steps:,} steps, {attempt.packed / 1e3:.1f} kB: {measured}"

@@ -34,13 +34,13 @@ from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device
 from neuprim.runs.run_directory import lock_run_directory
 from neuprim.runs.training import train_in_directory
-from neuprim.search.model_quality import TrainingQuality, eval_views, measure_eval_views
+from neuprim.search.model_quality import SearchQuality, choose_trial_views, measure_trial_views
 from neuprim.search.pruning import PruneRequest, prune_run
 from neuprim.search.quantized_finetune import QuantizationSearch, dequantize
 from neuprim.search.size_forecast import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
 from neuprim.search.size_search import SizeSearch
 from neuprim.search.target_record import TARGET_FILE, Attempt, TargetRecord, read_target_record
-from neuprim.search.trial_runner import VIEWS, TrialRunner, default_compressed_bytes
+from neuprim.search.trial_runner import VIEWS, TrialRunner, count_compressed_trial_bytes
 from neuprim.search.trials import NOT_TRAINED_WITH
 
 _FIRST_SHARE = 0.05  # share of the squared error at which the search for coarse numbers begins
@@ -74,7 +74,7 @@ def run_target(
         NeuprimError: invalid input, or a budget in which nothing can be trained.
     """
     _check_target_config(config)
-    record = _resume_target(config, {**target.given_settings(), "budget": budget})
+    record = _resume_target_search(config, {**target.given_settings(), "budget": budget})
     if record.achieved:
         return record
     plugins, begun, task, folder = find_config_plugins(config), clock(), load_config_task(config), config.output_dir
@@ -86,7 +86,7 @@ def run_target(
         render_ground_truth_before_run(config, launcher, show_progress)
         dataset = load_dataset(ConfigWithTask(config, task), show_progress)
         check_dataset_views(dataset, task.conditions)
-        record.hold_out = choose_hold_out(dataset)
+        record.hold_out = choose_target_hold_out(dataset)
         loaded = clock()
         compile_run_kernels(prepare_training(config, dataset=dataset).trainer, events)
         begun += clock() - loaded
@@ -94,13 +94,13 @@ def run_target(
         try:
             search = SizeSearch(config, target, dataset, record, runner)
             search.run()
-            _publish_target(runner, search.predictor)
+            _finish_target_search(runner, search.predictor)
         finally:
             runner.write_record()
     return record
 
 
-def choose_hold_out(dataset: Dataset) -> int:
+def choose_target_hold_out(dataset: Dataset) -> int:
     """Return n: every n-th training view is held out; one of eight, more of few views."""
     count = len(dataset.train)
     if count < 4:
@@ -123,7 +123,7 @@ def _check_target_config(config: RunConfig) -> None:
         raise ConfigError(f"train.population.grow_to={population.grow_to}: {decides}; expected null")
 
 
-def _resume_target(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
+def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
     """Return the earlier record. Another target or budget keeps the trainings and starts its seconds anew."""
     folder, own = config.output_dir, (*NOT_TRAINED_WITH, "made_by")
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
@@ -175,14 +175,14 @@ def choose_full_run(predictor: SizePredictor) -> Attempt:
     return max(within, key=predictor.margin_of)
 
 
-def _publish_target(runner: TrialRunner, predictor: SizePredictor) -> None:
+def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None:
     """Write the run directory of the best full run, prune and quantize its model, and record what is achieved."""
     record, target = runner.record, predictor.target
     attempt = choose_full_run(predictor)
     record.chosen = attempt.folder
-    result = _write_full_run(runner, attempt)
+    result = _write_target_result(runner, attempt)
     result = _prune_full_run(runner, predictor, attempt, result)
-    result = _quantize_result(runner, predictor, result)
+    result = _quantize_target_model(runner, predictor, result)
     limit = exceeded_limit(target, attempt, result.packed)
     missed = [f"{n} {result.held[n]:.4g}" for n, goal in target.quality.items() if result.held[n] < goal]
     record.warning = None
@@ -207,7 +207,7 @@ def _publish_target(runner: TrialRunner, predictor: SizePredictor) -> None:
     }
 
 
-def _write_full_run(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
+def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
     """Write the run directory from the training's."""
     config, folder = runner.configure(attempt), runner.config.output_dir
     runner.events(Finishing("measuring test views"))
@@ -224,13 +224,13 @@ def _write_full_run(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
     return _TargetResult(folder, held, test, test, int(metrics["model_bytes"]), {})
 
 
-def _measure_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
+def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
     """Return PSNR and SSIM of the held-out views that evaluated the trainings."""
     dataset, settings = hold_out_views(runner.dataset, runner.record.hold_out), runner.config.renderer
-    views = eval_views(dataset, VIEWS)
+    views = choose_trial_views(dataset, VIEWS)
     with torch.no_grad():
         model = move_to_render_device(model, settings, views[0].view)
-        quality = measure_eval_views(model, views, settings, dataset.background)
+        quality = measure_trial_views(model, views, settings, dataset.background)
     return {"psnr": quality.psnr, "ssim": quality.ssim}
 
 
@@ -253,8 +253,8 @@ def _prune_full_run(
         return before
     task = load_config_task(runner.config)
     model, _ = load_model(made.run_dir / "model.safetensors", task)
-    held = _measure_held_out(runner, model)
-    old, new = (default_compressed_bytes(one, task) for one in (before.run_dir, made.run_dir))
+    held = _measure_target_held_out(runner, model)
+    old, new = (count_compressed_trial_bytes(one, task) for one in (before.run_dir, made.run_dir))
     kept = predictor.margin(held) >= 0 and new < old
     runner.notify(
         f"pruned: {model.count:,} primitives, {new / 1e3:.1f} kB in place of {old / 1e3:.1f}, held out "
@@ -267,7 +267,7 @@ def _prune_full_run(
     return _TargetResult(made.run_dir, held, test, test, int(made.after["bytes"]), facts)
 
 
-def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
+def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
     """Quantize as coarsely as the target allows, at little cost if it is missed anyway.
 
     With a limit of bytes alone, quantize as finely as it allows.
@@ -279,14 +279,14 @@ def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _Tar
     least = 0.0 if margin >= 0 else margin - ALLOWANCE
     runner.events(Finishing("quantizing"))
     views = replace(runner.dataset, train=hold_out_views(runner.dataset, runner.record.hold_out).train)
-    search = QuantizationSearch(model, views, TrainingQuality.of_run(runner.config, views))
+    search = QuantizationSearch(model, views, SearchQuality.of_run(runner.config, views))
 
     def save(quantizers: Quantizers) -> int:
         save_compressed(file, search.model, task.name, read_header_extra(header), quantizers, text)
         return file.stat().st_size
 
     def accept(quantizers: Quantizers) -> bool:
-        held = _measure_held_out(runner, dequantize(search.model, quantizers))
+        held = _measure_target_held_out(runner, dequantize(search.model, quantizers))
         if target.quality:
             return predictor.margin(held) >= least
         return before.held["psnr"] - held["psnr"] <= ALLOWANCE
@@ -300,4 +300,4 @@ def _quantize_result(runner: TrialRunner, predictor: SizePredictor, before: _Tar
     decoded, _ = load_model(file, task)
     test = dict(zip(_MEASURES, measure_quality(decoded, task, runner.dataset, runner.config.renderer), strict=True))
     facts = {**before.facts, "rounding": share, "file": str(file)}
-    return replace(before, held=_measure_held_out(runner, decoded), packed=size, test=test, facts=facts)
+    return replace(before, held=_measure_target_held_out(runner, decoded), packed=size, test=test, facts=facts)

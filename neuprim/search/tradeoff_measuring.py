@@ -28,7 +28,7 @@ from neuprim.core.render import backends
 from neuprim.report.tradeoff_page import TradeoffPicture, write_tradeoff_page
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import RunRendering, estimate_run_file_bytes, parse_run_rendering
-from neuprim.search.model_quality import EvalView, eval_views, fill_masked
+from neuprim.search.model_quality import EvalView, choose_trial_views, fill_masked
 from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord, write_tradeoff_csv
 from neuprim.version import __version__
 
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 
 @dataclass
-class EvaluationSetup:
+class TradeoffSetup:
     """A run's model, its evaluation views, and the reference configuration of rendering."""
 
     config: RunConfig
@@ -102,13 +102,13 @@ class EvaluationSetup:
         return self.channels.display(image).clamp(0.0, 1.0)
 
 
-def load_setup(
+def load_tradeoff_setup(
     run_dir: Path,
     overrides: Sequence[str] = (),
     views: int = 5,
     lpips: str | Path | None = None,
     loaded: tuple[Dataset, list[EvalView]] | None = None,
-) -> EvaluationSetup:
+) -> TradeoffSetup:
     """Load a finished run for measuring.
 
     Args:
@@ -127,15 +127,15 @@ def load_setup(
     distance = None if weights is None else Lpips.load(weights)
     if loaded is None:
         dataset = load_dataset(run)
-        loaded = dataset, eval_views(dataset, views)
+        loaded = dataset, choose_trial_views(dataset, views)
     dataset, chosen = loaded
     if not chosen:
         raise DataError(f"{run_dir}: {dataset.name} has no test views; expected some to measure on")
     channels, file = find_channels(task, dataset), model_file(run_dir)
-    return EvaluationSetup(config, model, dataset, channels, reference, chosen, file, distance)
+    return TradeoffSetup(config, model, dataset, channels, reference, chosen, file, distance)
 
 
-def describe_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
+def describe_tradeoff_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
     """Return views, machine and versions of measurements, which must be equal to keep them."""
     camera = views[0].view.camera
     return {
@@ -151,7 +151,7 @@ def describe_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
     }
 
 
-def describe_setup(setup: EvaluationSetup) -> dict[str, Any]:
+def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
     """Return facts of a measured run, for readers of the record."""
     return {
         "task": setup.config.task,
@@ -167,7 +167,7 @@ def describe_setup(setup: EvaluationSetup) -> dict[str, Any]:
 # ---------------------------------------------------------------- exact images
 
 
-class ExactImages(NamedTuple):
+class ExactTradeoffImages(NamedTuple):
     """Images without any cut-off.
 
     Attributes:
@@ -191,7 +191,7 @@ class ExactImages(NamedTuple):
         }
 
 
-def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = None) -> ExactImages:
+def render_exact_for_tradeoff(setup: TradeoffSetup, allowed: float, float64: bool | None = None) -> ExactTradeoffImages:
     """Render exact images of all views: by the float64 reference backend if ``allowed`` seconds suffice, else uncut.
 
     Opacity clamp, order and samples per pixel are the reference configuration's: they define the image.
@@ -214,16 +214,16 @@ def render_exact(setup: EvaluationSetup, allowed: float, float64: bool | None = 
     expected = (time.perf_counter() - start) * pixels / (size[0] * size[1])
     if float64 or (float64 is None and expected * len(setup.views) <= allowed):
         images = [oracle.render_view(double, v.view, background) for v in setup.views]
-        return ExactImages(images, True, None, size)
+        return ExactTradeoffImages(images, True, None, size)
     draw = setup.renderer(RunRendering(settings))
     images = [draw(v.view).double() for v in setup.views]
-    return ExactImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size)
+    return ExactTradeoffImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size)
 
 
 # ---------------------------------------------------------------- one point
 
 
-def measure_point(setup: EvaluationSetup, knob: str, config: RunRendering, exact: ExactImages) -> TradeoffPoint:
+def measure_point(setup: TradeoffSetup, knob: str, config: RunRendering, exact: ExactTradeoffImages) -> TradeoffPoint:
     """Measure images and size of a configuration.
 
     Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
@@ -259,7 +259,7 @@ class TimedPoint(NamedTuple):
     renderer: Callable[[], Renderer]
 
 
-def time_points(
+def time_tradeoff_points(
     timed: Sequence[TimedPoint],
     repeats: int,
     views: Sequence[EvalView],
@@ -284,7 +284,7 @@ def time_points(
         due = [timed[0], *(one for one in timed[1:] if len(one.point.ms) < repeats)]
         if number == 0:
             for one in due:
-                _warm_up(one.renderer(), views[0].view)
+                _warm_up_tradeoff_renderer(one.renderer(), views[0].view)
         slots = torch.tensor([0] * (1 + (len(due) - 1) // _PER_REFERENCE) + list(range(1, len(due))))
         seconds = []  # view -> point -> median
         for view in views:
@@ -304,7 +304,7 @@ def time_points(
             return
 
 
-def _warm_up(draw: Renderer, view: View) -> None:
+def _warm_up_tradeoff_renderer(draw: Renderer, view: View) -> None:
     draw(replace(view, camera=view.camera.resized(_WARM_UP_SIZE, _WARM_UP_SIZE)))
 
 
@@ -343,7 +343,7 @@ class TradeoffSession:
         self.folder, self.request, self.record, self.progress = folder, request, record, progress
         self.begun = time.monotonic()
 
-    def point_setup(self, number: int) -> tuple[EvaluationSetup, RunRendering]:
+    def point_setup(self, number: int) -> tuple[TradeoffSetup, RunRendering]:
         """Return the setup of a point's model, and the configuration that draws the point."""
         raise NotImplementedError
 
@@ -367,10 +367,10 @@ class TradeoffSession:
                 self.record.leave_out(name, (), "there is no other value")
         return chosen
 
-    def render_exact(self, setup: EvaluationSetup, share: float) -> ExactImages:
+    def render_exact(self, setup: TradeoffSetup, share: float) -> ExactTradeoffImages:
         """Render exact images in a share of the budget; those of all models are made alike."""
         float64 = self.record.facts.get("exact", {}).get("float64")
-        exact = render_exact(setup, share * self.request.budget, float64)
+        exact = render_exact_for_tradeoff(setup, share * self.request.budget, float64)
         self.record.facts.setdefault("exact", exact.to_dict())
         return exact
 
@@ -386,7 +386,7 @@ class TradeoffSession:
             self.progress(f"round {number} of {count}, {len(timed)} points", number / count)
 
         deadline, views = time.monotonic() + self.seconds_left(part), self.point_setup(0)[0].views
-        time_points(timed, self.request.repeats, views, deadline, note_round)
+        time_tradeoff_points(timed, self.request.repeats, views, deadline, note_round)
 
     def write_results(self, command: Callable[[Sequence[str]], str], primitives: int = 0) -> None:
         """Write record, table, page and chart of the fronts.

@@ -15,9 +15,9 @@ from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
 from neuprim.runs.fit import Events, Note, Preparing
 from neuprim.runs.launch.executors import count_parallel_jobs
-from neuprim.search.size_forecast import fit_time_line
+from neuprim.search.size_forecast import forecast_time
 from neuprim.search.target_record import Attempt, TargetRecord
-from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, override_settings, run_trial
+from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, override_trial_settings, run_trial
 
 TARGET_FOLDER = "target"  # folder of the trainings, in the run directory
 VIEWS = 16  # held-out views to evaluate, at most
@@ -78,7 +78,9 @@ class TrialRunner:
             "train.population.every": every,
         }
         folder = self.config.output_dir / TARGET_FOLDER / attempt.folder
-        return replace(override_settings(self.config, values), output_dir=folder, resume=attempt.purpose == "full")
+        return replace(
+            override_trial_settings(self.config, values), output_dir=folder, resume=attempt.purpose == "full"
+        )
 
     def is_finished(self, attempt: Attempt) -> bool:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)
@@ -130,14 +132,14 @@ class TrialRunner:
         attempt.outcome = asdict(outcome)
         if attempt.purpose != "pace":
             config = self.configure(attempt)
-            attempt.packed = default_compressed_bytes(config.output_dir, load_config_task(config))
+            attempt.packed = count_compressed_trial_bytes(config.output_dir, load_config_task(config))
         self.write_record()
 
     def pace(self, primitives: float) -> float:
         """Return the expected seconds of a step."""
         # The few steps of the first attempt are the poorest estimate.
         trained = self.record.finished("size", "full") or self.record.finished("pace")
-        return fit_time_line(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
+        return forecast_time(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
 
     def overhead(self) -> float:
         """Return the seconds of a trial beside its steps: initialization, evaluation."""
@@ -150,7 +152,7 @@ class TrialRunner:
         return self.seconds_spent + seconds <= share * self.record.asked["budget"]
 
 
-def default_compressed_bytes(folder: Path, task: TaskSpec) -> int:
+def count_compressed_trial_bytes(folder: Path, task: TaskSpec) -> int:
     """Return the bytes of a run's model when compressed at the default level."""
     file, config = folder / "packed.neuprim", (folder / "config.yaml").read_text(encoding="utf-8")
     model, _ = load_model(folder / "model.safetensors", task)

@@ -29,7 +29,7 @@ from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
 from neuprim.runs.open import load_dataset
 from neuprim.runs.run_directory import lock_run_directory
 from neuprim.runs.training import train_in_directory
-from neuprim.search.model_quality import eval_views, measure_eval_views
+from neuprim.search.model_quality import choose_trial_views, measure_trial_views
 
 TRIAL_FILE, _FORMAT = "trial.json", 1
 
@@ -144,8 +144,8 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
                 raise KeyboardInterrupt
             events(Finishing("measuring evaluation views"))
             fitted.unlock_bands()
-            views = eval_views(fitted.dataset, trial.views)
-            quality = measure_eval_views(fitted.model, views, config.renderer, fitted.dataset.background)
+            views = choose_trial_views(fitted.dataset, trial.views)
+            quality = measure_trial_views(fitted.model, views, config.renderer, fitted.dataset.background)
         steps, seconds = fitted.trainer.step, fitted.trainer.elapsed
         times, pace = [b - a for a, b in pairwise(ends)], seconds / max(steps, 1)
         if times:
@@ -223,7 +223,7 @@ def launch_trials(
 # ---------------------------------------------------------------- settings by dotted names
 
 
-def get_setting(config: RunConfig, key: str) -> Any:
+def get_trial_setting(config: RunConfig, key: str) -> Any:
     """Return a setting by its key on the command line; None where the configuration lacks it."""
     node: Any = config.to_dict()
     for part in key.split("."):
@@ -231,7 +231,7 @@ def get_setting(config: RunConfig, key: str) -> Any:
     return node
 
 
-def override_settings(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
+def override_trial_settings(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
     """Return the configuration with other settings, and with its record of what is not a default."""
     tree = config.to_dict()
     for key, value in values.items():

@@ -19,7 +19,7 @@ from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, load_run, model_file
 from neuprim.search import compress
 from neuprim.search.compress import Compression, CompressRequest
-from neuprim.search.model_quality import TrainingQuality
+from neuprim.search.model_quality import SearchQuality
 from tests.search.tradeoff_runs import tiny_run
 
 
@@ -137,7 +137,7 @@ def test_the_best_of_both_is_read(whole: Path, tmp_path: Path) -> None:
 def test_training_views_decide_how_coarse_numbers_are(whole: Path, tmp_path: Path, steps: int) -> None:
     stored = load_run(whole)
     config, task, model = stored.config, stored.task, stored.model
-    quality = TrainingQuality.of_run(config, load_dataset(stored))
+    quality = SearchQuality.of_run(config, load_dataset(stored))
     base, sizes = quality(model), []
     for tolerance in (0.05, 0.3, 1.5):
         made = compress_run(whole, tolerance=tolerance, steps=steps, out=tmp_path / f"{tolerance}")

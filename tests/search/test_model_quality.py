@@ -14,7 +14,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.volumes.points import volume_values_at
-from neuprim.search.model_quality import TrainingQuality, eval_views, fill_masked
+from neuprim.search.model_quality import SearchQuality, choose_trial_views, fill_masked
 from neuprim.search.pruning_cuts import cut_to_loss, price_cuts
 from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
@@ -26,13 +26,13 @@ from tests.core import tiny
 )
 def test_evenly_spread_and_all_where_more_are_asked_for(asked: int, found: list[str]) -> None:
     dataset = tiny.two_primitives()
-    assert [truth.view.name for truth in eval_views(replace(dataset, test=dataset.train), asked)] == found
+    assert [truth.view.name for truth in choose_trial_views(replace(dataset, test=dataset.train), asked)] == found
 
 
 def test_none_of_no_views_and_over_the_background() -> None:
     dataset = tiny.two_primitives()
-    assert eval_views(replace(dataset, test=tiny.Views(0, 0.0)), 4) == []
-    assert torch.equal(eval_views(dataset, 1)[0].image, dataset.test.pixels(0).over(dataset.background))
+    assert choose_trial_views(replace(dataset, test=tiny.Views(0, 0.0)), 4) == []
+    assert torch.equal(choose_trial_views(dataset, 1)[0].image, dataset.test.pixels(0).over(dataset.background))
 
 
 def test_where_pixels_do_not_count_the_truth_stands() -> None:
@@ -40,7 +40,7 @@ def test_where_pixels_do_not_count_the_truth_stands() -> None:
     mask = torch.zeros(tiny.SIZE, tiny.SIZE, dtype=torch.bool)
     mask[3, 4] = True
     dataset.test.images = [replace(pixels, mask=mask) for pixels in dataset.test.images]  # type: ignore[attr-defined]
-    truth = eval_views(dataset, 1)[0]
+    truth = choose_trial_views(dataset, 1)[0]
     drawn = fill_masked(torch.full_like(truth.image, 7.0), truth)
     assert drawn[3, 4].tolist() == [7.0] * 3 and torch.equal(drawn[4:], truth.image[4:])
 
@@ -94,14 +94,14 @@ def without(model: Primitives, rows: list[int]) -> Primitives:
 
 def test_frames_decide_once_each() -> None:
     _, dataset = known()
-    assert [draw.name for draw in TrainingQuality(dataset, SETTINGS, inside=True).draws] == ["a", "b", "c"]
-    assert TrainingQuality(dataset, SETTINGS).draws == []
+    assert [draw.name for draw in SearchQuality(dataset, SETTINGS, inside=True).draws] == ["a", "b", "c"]
+    assert SearchQuality(dataset, SETTINGS).draws == []
 
 
 def test_what_is_lost_inside_counts_as_what_is_lost_in_images() -> None:
     model, dataset = known()
     off = Primitives(model.density, model.colour, {**model.params, "b2": 1.01 * model.params["b2"]})
-    quality = TrainingQuality(dataset, SETTINGS, inside=True)
+    quality = SearchQuality(dataset, SETTINGS, inside=True)
     start = quality(off)
     assert start == pytest.approx(quality.image_quality(off))
     less = without(off, [3, 4])
@@ -114,7 +114,7 @@ def test_what_is_lost_inside_counts_as_what_is_lost_in_images() -> None:
 
 def test_inside_the_signs_find_each_primitive_s_share() -> None:
     model, dataset = known()
-    draws = TrainingQuality(dataset, SETTINGS, inside=True).draws
+    draws = SearchQuality(dataset, SETTINGS, inside=True).draws
     found = torch.stack([inner_sensitivity(model, draws, seed, 1).whole for seed in range(40)]).mean(0)
     for row in range(model.count):
         true = 0.0
@@ -128,7 +128,7 @@ def test_inside_the_signs_find_each_primitive_s_share() -> None:
 def test_primitives_that_no_image_shows_go_only_where_nothing_is_known_inside() -> None:
     model, dataset = known()
     seen = sensitivity(model, dataset, list(range(len(dataset.train))), SETTINGS)
-    plain, quality = TrainingQuality(dataset, SETTINGS), TrainingQuality(dataset, SETTINGS, inside=True)
+    plain, quality = SearchQuality(dataset, SETTINGS), SearchQuality(dataset, SETTINGS, inside=True)
     off = Primitives(model.density, model.colour, {**model.params, "b2": 1.01 * model.params["b2"]})
     quality(off)
     inside = inner_sensitivity(off, quality.draws, 0, 1)
@@ -147,6 +147,6 @@ def test_what_no_view_shows_is_left_alone() -> None:
     views = list(range(len(dataset.train)))
     found = sensitivity(aside, dataset, views, SETTINGS)
     assert int(found.seen[5]) == 0 and float(found.whole[5]) == 0.0 and int(found.seen[0]) == len(views)
-    quality = TrainingQuality(dataset, SETTINGS)
+    quality = SearchQuality(dataset, SETTINGS)
     left = cut_to_loss(aside, price_cuts(aside, found, None, quality), quality.image_quality, 1.0)
     assert bool((left.params["means"][:, 2] == 50.0).any())

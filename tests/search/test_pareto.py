@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuprim.search.pareto import (
-    FrontStep,
     Objectives,
-    chain_front_steps,
-    combine_front_steps,
+    ParetoStep,
+    chain_pareto_steps,
+    combine_pareto_steps,
     pareto_front,
-    spread_evenly,
+    thin_pareto_chain,
 )
 
 VALUES = st.integers(0, 6).map(float)
@@ -37,18 +37,18 @@ def test_differences_within_the_doubt_do_not_count() -> None:
 
 def test_chains_take_the_least_loss_per_gain_first() -> None:
     steps = [
-        FrontStep("a", "a=1", 0.5, 0.1),
-        FrontStep("a", "a=2", 1.0, 1.0),
-        FrontStep("b", "b=1", 0.4, 0.2),
-        FrontStep("c", "c=1", 0.0, 0.0),
+        ParetoStep("a", "a=1", 0.5, 0.1),
+        ParetoStep("a", "a=2", 1.0, 1.0),
+        ParetoStep("b", "b=1", 0.4, 0.2),
+        ParetoStep("c", "c=1", 0.0, 0.0),
     ]
-    assert chain_front_steps(steps) == [("a=1", "b=1"), ("a=2", "b=1")]
-    assert chain_front_steps(steps[:2]) == []
+    assert chain_pareto_steps(steps) == [("a=1", "b=1"), ("a=2", "b=1")]
+    assert chain_pareto_steps(steps[:2]) == []
 
 
 def test_combinations_are_new_and_alternate_between_directions() -> None:
-    faster = [FrontStep(name, f"{name}=1", gain, 0.1) for name, gain in (("a", 0.4), ("b", 0.3), ("c", 0.2))]
-    smaller = [FrontStep(name, f"{name}=1", gain, 0.1) for name, gain in (("x", 0.4), ("y", 0.3))]
-    assert combine_front_steps((faster, smaller), [("b=1", "a=1")], 5) == [("a=1", "b=1", "c=1"), ("x=1", "y=1")]
-    assert combine_front_steps((faster, smaller), [], 2) == [("a=1", "b=1"), ("x=1", "y=1")]
-    assert spread_evenly(list(range(10)), 4) == [0, 3, 6, 9] and spread_evenly([1, 2], 0) == []
+    faster = [ParetoStep(name, f"{name}=1", gain, 0.1) for name, gain in (("a", 0.4), ("b", 0.3), ("c", 0.2))]
+    smaller = [ParetoStep(name, f"{name}=1", gain, 0.1) for name, gain in (("x", 0.4), ("y", 0.3))]
+    assert combine_pareto_steps((faster, smaller), [("b=1", "a=1")], 5) == [("a=1", "b=1", "c=1"), ("x=1", "y=1")]
+    assert combine_pareto_steps((faster, smaller), [], 2) == [("a=1", "b=1"), ("x=1", "y=1")]
+    assert thin_pareto_chain(list(range(10)), 4) == [0, 3, 6, 9] and thin_pareto_chain([1, 2], 0) == []

@@ -19,7 +19,7 @@ from neuprim.runs.render_images import RenderRequest, render_run
 from neuprim.search import pruning
 from neuprim.search.compress import CompressRequest, compress_run
 from neuprim.search.pruning import PruneRequest, Pruning, prune_run
-from neuprim.search.pruning_cuts import count_stored_numbers
+from neuprim.search.pruning_cuts import count_unpruned_numbers
 from tests.core import tiny
 from tests.search.tradeoff_runs import copied
 from tests.short_runs import fit, words
@@ -61,7 +61,7 @@ def test_the_run_of_what_is_left_is_a_run(whole: Path, left: Path, made: Pruning
     model, header = stored.model, stored.header
     assert (
         model.count == made.after["primitives"] == config.model.primitives
-        and count_stored_numbers(model) == made.after["numbers"]
+        and count_unpruned_numbers(model) == made.after["numbers"]
     )
     assert header["iterations"] == 240 and config.output_dir == left
     found, recorded = evaluate_run(left), json.loads((left / "metrics.json").read_text())
@@ -85,7 +85,7 @@ def test_every_command_reads_it(left: Path, tmp_path: Path) -> None:
     small = compress_run(CompressRequest(left, level=1, out=tmp_path / "small.neuprim"))
     back, _ = checkpoint.load_model(small.file, load_run(left).task)
     model = load_run(left).model
-    assert count_stored_numbers(back) <= count_stored_numbers(model)  # what is zero comes back as zero
+    assert count_unpruned_numbers(back) <= count_unpruned_numbers(model)  # what is zero comes back as zero
     assert small.measured["psnr"][0] - small.measured["psnr"][1] < 0.2
 
 
@@ -97,7 +97,7 @@ def test_training_goes_on_where_it_was_left_and_what_is_gone_stays_gone(left: Pa
     fit([*typed, f"output_dir={copy}", "resume=true", "train.iterations=300", "train.population.strategy=fixed"])
     after = load_run(copy).model
     assert checkpoint.read_header(copy / "checkpoint.safetensors", "checkpoint")["step"] == 300
-    assert after.count == before.count and count_stored_numbers(after) <= count_stored_numbers(before)
+    assert after.count == before.count and count_unpruned_numbers(after) <= count_unpruned_numbers(before)
     assert not torch.equal(after.params["means"], before.params["means"])
 
 
@@ -114,7 +114,7 @@ def test_with_steps_more_may_go_and_the_result_is_the_same_again(whole: Path, ma
 def nothing_goes(monkeypatch: pytest.MonkeyPatch) -> None:
     """A model without anything to cut: of this one, single numbers may go by which it is better."""
     monkeypatch.setattr(pruning, "cut_to_loss", lambda model, *rest: model)
-    monkeypatch.setattr(pruning, "list_reductions", lambda model: [])
+    monkeypatch.setattr(pruning, "list_pruning_reductions", lambda model: [])
 
 
 @pytest.mark.usefixtures("nothing_goes")

@@ -15,13 +15,13 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, make_run_finetune_trainer
 from neuprim.runs.open import load_dataset, load_run
-from neuprim.search.model_quality import TrainingQuality
+from neuprim.search.model_quality import SearchQuality
 from neuprim.search.quantized_finetune import (
     QuantizationSearch,
     TrainingData,
     dequantize,
     finetune_for_table,
-    quantize_within,
+    search_fewest_bits,
 )
 from tests.core import tiny
 from tests.short_runs import fit, words
@@ -114,7 +114,7 @@ def equal(a: Primitives, b: Primitives) -> bool:
 
 
 def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, data: TrainingData) -> None:
-    model, quality = load_run(run_dir).model, TrainingQuality(data.dataset, data.config.renderer)
+    model, quality = load_run(run_dir).model, SearchQuality(data.dataset, data.config.renderer)
     table, plain = bit_table(5, [], model.specs), canonical_model(model)
     at_once = quality(dequantize(plain, fit_quantizers(plain, table)))
     fewer, again = (finetune_for_table(data, model, table, 150, ignore) for _ in range(2))
@@ -124,10 +124,10 @@ def test_training_for_few_bits_wins_back_what_they_cost(run_dir: Path, data: Tra
 
 @pytest.mark.parametrize("steps", [0, 200])
 def test_a_tolerance_is_kept(run_dir: Path, data: TrainingData, steps: int) -> None:
-    model, quality = load_run(run_dir).model, TrainingQuality(data.dataset, data.config.renderer)
+    model, quality = load_run(run_dir).model, SearchQuality(data.dataset, data.config.renderer)
     base = quality(model)
     for allowed in (0.1, 0.5):
-        fewer = quantize_within(data, model, allowed, steps, ignore)
+        fewer = search_fewest_bits(data, model, allowed, steps, ignore)
         assert base - quality(dequantize(fewer.model, fewer.quantizers)) <= allowed + 1e-6
         assert torch.equal(fewer.model.params["W1"], canonical_model(model).params["W1"]) == (steps == 0)
 
@@ -136,9 +136,9 @@ def test_training_that_spoils_the_model_is_not_stored(
     run_dir: Path, data: TrainingData, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     model = load_run(run_dir).model
-    plain = quantize_within(data, model, 0.2, 0, ignore)
+    plain = search_fewest_bits(data, model, 0.2, 0, ignore)
     monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)
-    found = quantize_within(data, model, 0.2, 20, ignore)
+    found = search_fewest_bits(data, model, 0.2, 20, ignore)
     assert equal(found.model, plain.model) and found.notes == plain.notes and found.steps == 20
     fewer = finetune_for_table(data, model, bit_table(1, [], model.specs), 20, ignore)
     assert fewer.steps == 20 and len(fewer.notes) == 1 and "brought nothing" in fewer.notes[0]
@@ -147,7 +147,7 @@ def test_training_that_spoils_the_model_is_not_stored(
 
 @pytest.mark.parametrize("start", [1e-3, 0.1, 20.0])
 def test_the_coarsest_numbers_that_are_enough_are_found(run_dir: Path, data: TrainingData, start: float) -> None:
-    quality = TrainingQuality(data.dataset, data.config.renderer)
+    quality = SearchQuality(data.dataset, data.config.renderer)
     rounding = QuantizationSearch(load_run(run_dir).model, data.dataset, quality)
 
     def width(made: Quantizers) -> float:

@@ -18,10 +18,10 @@ from neuprim.search.render_tradeoff import measure_tradeoff
 from neuprim.search.tradeoff_measuring import (
     TimedPoint,
     TradeoffRequest,
-    load_setup,
+    load_tradeoff_setup,
     measure_point,
-    render_exact,
-    time_points,
+    render_exact_for_tradeoff,
+    time_tradeoff_points,
 )
 from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord, read_tradeoff_record
 from tests.search.tradeoff_runs import copied, tiny_run
@@ -79,8 +79,8 @@ def test_coarser_points_are_farther_from_the_exact_image(measured: tuple[Path, T
 
 
 def test_exact_images_without_float64_know_their_error(bare: Path) -> None:
-    setup = load_setup(bare, (), 1)
-    fast, slow = render_exact(setup, 0.0), render_exact(setup, 1e9)
+    setup = load_tradeoff_setup(bare, (), 1)
+    fast, slow = render_exact_for_tradeoff(setup, 0.0), render_exact_for_tradeoff(setup, 1e9)
     assert slow.float64 and slow.error is None and not fast.float64 and fast.checked == (24, 24)
     assert fast.error is not None and 100 < fast.error <= psnr(fast.images[0], slow.images[0]) + 1e-6
     uncut = setup.parse(["renderer.alpha_min=0", "renderer.transmittance_min=0"])
@@ -148,7 +148,7 @@ def test_a_word_that_cannot_be_drawn_is_refused(bare: Path) -> None:
 
 
 def test_rounds_time_the_reference_beside_each_point(bare: Path) -> None:
-    setup = load_setup(bare, (), 2)
+    setup = load_tradeoff_setup(bare, (), 2)
 
     def renderer(seconds: float):  # type: ignore[no-untyped-def]
         def draw(view: object) -> torch.Tensor:
@@ -161,8 +161,8 @@ def test_rounds_time_the_reference_beside_each_point(bare: Path) -> None:
     points[2].ms, points[2].ratios = [1.0, 1.0], [1.0, 1.0]
     timed = [TimedPoint(p, renderer(s)) for p, s in zip(points, (0.002, 0.008, 0.002), strict=True)]
     rounds: list[tuple[int, int]] = []
-    time_points(timed, 3, setup.views, time.monotonic() + 60, lambda *one: rounds.append(one))
+    time_tradeoff_points(timed, 3, setup.views, time.monotonic() + 60, lambda *one: rounds.append(one))
     assert [len(p.ms) for p in points] == [3, 3, 3] and rounds == [(1, 3), (2, 3), (3, 3)]
     assert set(points[0].ratios) == {1.0} and all(2 < ratio < 6 for ratio in points[1].ratios)
-    time_points(timed, 9, setup.views, 0.0, lambda *one: None)
+    time_tradeoff_points(timed, 9, setup.views, 0.0, lambda *one: None)
     assert len(points[0].ms) == 4, "one round after the deadline"

@@ -19,15 +19,15 @@ from neuprim.search.size_forecast import (
     SizeCurve,
     SizePredictor,
     exceeded_limit,
-    fit_time_line,
     forecast_quality,
-    format_forecast,
-    from_decibels,
+    forecast_time,
+    format_target_forecast,
+    from_forecast_decibels,
     propose_best_size,
     propose_size,
-    to_decibels,
+    to_forecast_decibels,
 )
-from neuprim.search.size_search import next_setting_change, setting_change_pays
+from neuprim.search.size_search import propose_setting_trial, setting_change_pays
 from neuprim.search.target_record import Attempt, SettingChange, TargetRecord
 from tests.search.simulated_search import attempt, from_grid, simulate_search
 
@@ -105,17 +105,19 @@ def test_forecasts_follow_the_gains() -> None:
     one, two = (forecast_quality({100: 20.0, 200: 21.0}, steps) for steps in (400, 800))
     assert one.value == pytest.approx(21.75) and two.value == pytest.approx(21.75 + 0.75**2) and two.doubt > one.doubt
     assert forecast_quality({100: 20.0, 200: 22.0, 400: 24.0}, 800).value > 25.5
-    assert to_decibels("ssim", 0.9) == pytest.approx(10) and from_decibels("ssim", 10) == pytest.approx(0.9)
-    assert format_forecast("psnr", 30, 0.5) == "psnr 30.00 ± 0.5 dB" and "ssim 0.9000" in format_forecast(
+    assert to_forecast_decibels("ssim", 0.9) == pytest.approx(10) and from_forecast_decibels(
+        "ssim", 10
+    ) == pytest.approx(0.9)
+    assert format_target_forecast("psnr", 30, 0.5) == "psnr 30.00 ± 0.5 dB" and "ssim 0.9000" in format_target_forecast(
         "ssim", 0.9, 0.5
     )
 
 
 def test_times_are_lines_that_neither_fall_nor_start_below_zero() -> None:
-    assert fit_time_line([(100, 2.0)], 200) == pytest.approx(3.0)
-    assert fit_time_line([(100, 2.0), (200, 3.0)], 400) == pytest.approx(5.0)
-    assert fit_time_line([(100, 3.0), (200, 2.0)], 400) == pytest.approx(2.5)
-    assert fit_time_line([(100, 1.0), (200, 5.0)], 1) >= 0
+    assert forecast_time([(100, 2.0)], 200) == pytest.approx(3.0)
+    assert forecast_time([(100, 2.0), (200, 3.0)], 400) == pytest.approx(5.0)
+    assert forecast_time([(100, 3.0), (200, 2.0)], 400) == pytest.approx(2.5)
+    assert forecast_time([(100, 1.0), (200, 5.0)], 1) >= 0
 
 
 # ---------------------------------------------------------------- the record, read with a target
@@ -142,7 +144,7 @@ def test_between_full_runs_that_bracket_the_target_only_these_count() -> None:
 
 def test_the_least_measure_counts() -> None:
     both = predictor(SearchTarget(psnr=30.0, ssim=0.9), attempt(100, 800, 31.0, "full"))
-    assert both.margin({"psnr": 31.0, "ssim": 0.8}) == pytest.approx(to_decibels("ssim", 0.8) - 10)
+    assert both.margin({"psnr": 31.0, "ssim": 0.8}) == pytest.approx(to_forecast_decibels("ssim", 0.8) - 10)
     assert both.measures == ("psnr", "ssim") and predictor(SearchTarget(megabytes=1)).margin({"psnr": 31.0}) == 31.0
 
 
@@ -173,14 +175,14 @@ def test_settings_are_halved_while_that_pays() -> None:
         return SettingChange(key, before, after, {}, 1.0, adopted)
 
     turns: list[SettingChange] = []
-    assert next_setting_change(ladder, turns) == ("a", 4, 2)
+    assert propose_setting_trial(ladder, turns) == ("a", 4, 2)
     turns.append(change("a", 4, 2, True))
-    assert next_setting_change(ladder, turns) == ("a", 2, 1)
+    assert propose_setting_trial(ladder, turns) == ("a", 2, 1)
     turns.append(change("a", 2, 1, False))
-    assert next_setting_change(ladder, turns) == ("b", 1, 0)
+    assert propose_setting_trial(ladder, turns) == ("b", 1, 0)
     turns.append(change("b", 1, 0, True))
-    assert next_setting_change(ladder, turns) is None
-    assert next_setting_change(ladder, [change("a", 4, 2, False)]) == ("a", 4, 3)
+    assert propose_setting_trial(ladder, turns) is None
+    assert propose_setting_trial(ladder, [change("a", 4, 2, False)]) == ("a", 4, 3)
     assert (
         setting_change_pays(0.4, 0.7, 1.0)
         and not setting_change_pays(0.6, 0.7, 1.0)

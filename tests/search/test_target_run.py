@@ -135,7 +135,7 @@ def test_an_interrupted_search_ends_like_one_that_was_not_and_test_views_decide_
     """With other test views, and interrupted in trials and in full runs, the search is the same to the last digit."""
     _, whole, clock = met
     out, views = tmp_path / "interrupted", "scene.test_views=2"
-    monkeypatch.setattr(target, "_publish_target", lambda runner, predictor: None)
+    monkeypatch.setattr(target, "_finish_target_search", lambda runner, predictor: None)
     for share in (0.2, 0.5):
         again = ["resume=true"] if out.exists() else []
         with pytest.raises(KeyboardInterrupt):
@@ -158,7 +158,7 @@ def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: py
         return [JobResult("done", one, seconds=each) for one, each in zip(outcomes, seconds, strict=True)]
 
     monkeypatch.setattr(trial_runner, "launch_trials", launch)
-    monkeypatch.setattr(target, "_publish_target", lambda runner, predictor: None)
+    monkeypatch.setattr(target, "_finish_target_search", lambda runner, predictor: None)
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
     settings = LauncherSettings("processes")
     record = run_target(config(tmp_path / "run"), SearchTarget(psnr=20.0), BUDGET, clock.hear, clock, settings)

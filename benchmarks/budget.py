@@ -29,7 +29,7 @@ from shared.records import RESULTS, read_trials
 from shared.tables import DOCS, Run, Table, between_markers, spread
 from shared.trials import Trial, run_all
 
-from neuprim.report.charts import LARGE, Chart, Points, write_png_charts
+from neuprim.report.charts import LARGE, Chart, ChartPoints, write_png_charts
 
 RECORD = RESULTS / "budget.json"
 PICTURE = DOCS / "pictures" / "budgets.png"
@@ -127,7 +127,7 @@ def make_chart(scene: str, runs: Sequence[Run]) -> Chart:
     for number, (measure, title) in enumerate(MEASURES[scene].items()):
         found = values_by_budget(runs, scene, measure)
         means = [statistics.mean(own) for own in found.values()]
-        lines.append(Points(list(found), means, f"C{number}", name=title))
+        lines.append(ChartPoints(list(found), means, f"C{number}", name=title))
     return Chart(TITLES[scene].replace("`", ""), lines, "steps", "dB, test views", LARGE, log_x=True)
 
 

@@ -28,7 +28,7 @@ from shared.timing import fastest
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.report.charts import LARGE, Chart, Points, write_png_charts
+from neuprim.report.charts import LARGE, Chart, ChartPoints, write_png_charts
 
 PICTURE = DOCS / "pictures" / "scaling.png"
 MEMORY_BOUND = 4e9
@@ -80,7 +80,7 @@ def make_chart(series: str, rows: list[Run]) -> Chart:
     own = [row for row in rows if row["series"] == series]
     x = [row["size"] ** 2 if series == "pixels" else row[series] for row in own]
     lines = [
-        Points(x, [row[key] for row in own], colour, name=name)
+        ChartPoints(x, [row[key] for row in own], colour, name=name)
         for key, colour, name in (("forward_ms", "C0", "forward"), ("both_ms", "C1", "forward and backward"))
     ]
     texts = {"primitives": f"{own[0]['primitives']} primitives", "pixels": f"{own[0]['size']}×{own[0]['size']}"}

@@ -45,8 +45,8 @@ _LEAST_DECIBELS = 0.4  # least range of the y axis of a front: smaller differenc
 
 
 @dataclass(frozen=True)
-class Points:
-    """Points of one colour; those that are not finite are left out.
+class ChartPoints:
+    """ChartPoints of one colour; those that are not finite are left out.
 
     Attributes:
         joined: connect them by a line.
@@ -68,7 +68,7 @@ class Points:
     labels: Sequence[str] = ()
     name: str = ""
 
-    def finite(self) -> Points:
+    def finite(self) -> ChartPoints:
         """Return those with finite coordinates."""
         x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
         rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
@@ -92,7 +92,7 @@ class Chart:
     """
 
     title: str
-    points: Sequence[Points]
+    points: Sequence[ChartPoints]
     x_label: str
     y_label: str = ""
     size: tuple[int, int] = SMALL
@@ -105,7 +105,7 @@ class Chart:
     whole: bool = False
     least: float = 0.0
 
-    def known(self) -> list[Points]:
+    def known(self) -> list[ChartPoints]:
         """Return what can be drawn."""
         return [finite for points in self.points if len((finite := points.finite()).x)]
 
@@ -128,7 +128,7 @@ class Dot(NamedTuple):
 
 
 def curve_chart(
-    title: str, unit: str, lines: Sequence[Points], log: bool = False, size: tuple[int, int] = SMALL
+    title: str, unit: str, lines: Sequence[ChartPoints], log: bool = False, size: tuple[int, int] = SMALL
 ) -> Chart:
     """Return a chart of values over seconds, steps or frames.
 
@@ -158,7 +158,7 @@ def view_chart(title: str, values: Sequence[float | None], mean: float | None, l
     if lowest and len(known) > 1:
         labels[min(range(len(known)), key=lambda i: known[i][1])] = lowest
     size = 4.5 if len(known) <= 60 else 2.5
-    points = Points([i for i, _ in known], [v for _, v in known], HELD_OUT, False, size=size, labels=labels)
+    points = ChartPoints([i for i, _ in known], [v for _, v in known], HELD_OUT, False, size=size, labels=labels)
     level = mean if mean is not None and math.isfinite(mean) else None
     return Chart(title, [points], "view", level=level, left=-0.7, right=len(values) - 0.3, whole=True)
 
@@ -179,10 +179,10 @@ def front_chart(
     marked = sorted((dot for dot in drawn if dot.mark is not None), key=lambda dot: dot.cost)
     others = [dot for dot in drawn if dot.mark is None]
 
-    def points(dots: Sequence[Dot], colour: str, joined: bool, size: float, opacity: float) -> Points:
+    def points(dots: Sequence[Dot], colour: str, joined: bool, size: float, opacity: float) -> ChartPoints:
         x, y, spread = [dot.cost for dot in dots], [dot.good for dot in dots], [dot.spread for dot in dots]
         labels = [dot.mark or "" for dot in dots]
-        return Points(x, y, colour, joined, size=size, opacity=opacity, spread=spread, labels=labels)
+        return ChartPoints(x, y, colour, joined, size=size, opacity=opacity, spread=spread, labels=labels)
 
     both = [points(others, TRAINING, False, 4.5, 0.75), points(marked, HELD_OUT, joined and len(marked) > 1, 6.0, 1.0)]
     costs = [dot.cost for dot in drawn]
@@ -201,8 +201,10 @@ def draw_svg(chart: Chart) -> str | None:
     with _style():
         figure = Figure(figsize=(width / 72, height / 72))
         left, bottom = 41.4 / width, 42 / height  # room for the labels
-        _draw(figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom)), chart, {name: name for name in _VARIABLES})
-        return _to_element(figure, chart.title)
+        _draw_chart(
+            figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom)), chart, {name: name for name in _VARIABLES}
+        )
+        return _chart_to_svg_element(figure, chart.title)
 
 
 def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None:
@@ -215,7 +217,7 @@ def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None
         size = (columns * width / 72, rows * 1.12 * height / 72)
         figure = Figure(figsize=size, layout="constrained", facecolor="white")
         for axes, chart in zip(figure.subplots(rows, columns, squeeze=False).flat, charts, strict=False):
-            _draw(axes, chart, _PNG_COLOURS)
+            _draw_chart(axes, chart, _PNG_COLOURS)
             axes.set_title(chart.title, fontsize=11, loc="left", color=_PNG_COLOURS[INK])
             axes.set_ylabel(chart.y_label, color=_PNG_COLOURS[INK])
         with atomic_path(path) as temporary:
@@ -225,15 +227,15 @@ def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None
 # ---------------------------------------------------------------- drawing
 
 
-def _draw(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
+def _draw_chart(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
     known, ink, grid = chart.known(), palette[INK], palette[GRID]
     if chart.level is not None:
         axes.axhline(chart.level, color=ink, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
         for points in known:
             axes.vlines(points.x, chart.level, points.y, color=palette[points.colour], linewidth=1, alpha=0.45)
     for points in known:
-        _draw_points(axes, points, palette.get(points.colour, points.colour))
-        _draw_labels(axes, points, chart.level is not None, ink)
+        _draw_chart_points(axes, points, palette.get(points.colour, points.colour))
+        _draw_chart_labels(axes, points, chart.level is not None, ink)
     if any(points.name for points in known):
         axes.legend(frameon=False, labelcolor=ink)
     if chart.ring is not None:
@@ -254,7 +256,7 @@ def _draw(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
         spine.set_color(grid)
 
 
-def _draw_points(axes: Axes, points: Points, colour: str) -> None:
+def _draw_chart_points(axes: Axes, points: ChartPoints, colour: str) -> None:
     x, y = np.asarray(points.x), np.asarray(points.y)
     marked = x.size == 1 if points.band else x.size <= _FEW
     size = points.size if points.size is not None else 4.0 if marked else 0.0
@@ -271,7 +273,7 @@ def _draw_points(axes: Axes, points: Points, colour: str) -> None:
         axes.errorbar(x, y, xerr=errors, linestyle="none", marker="o", markersize=size, markeredgewidth=0, **look)
 
 
-def _draw_labels(axes: Axes, points: Points, aside: bool, colour: str) -> None:
+def _draw_chart_labels(axes: Axes, points: ChartPoints, aside: bool, colour: str) -> None:
     """Write each point's label below it, or ``aside``, towards the middle of the chart."""
     for i, (x, y, text) in enumerate(zip(points.x, points.y, points.labels, strict=False)):
         if not text:
@@ -314,7 +316,7 @@ def _style() -> AbstractContextManager[None]:
     return matplotlib.rc_context(settings)
 
 
-def _to_element(figure: Figure, label: str) -> str:
+def _chart_to_svg_element(figure: Figure, label: str) -> str:
     """Return a figure as an element of a page: no outside addresses or global styles, own ids, the page's font."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True)

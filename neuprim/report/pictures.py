@@ -37,16 +37,16 @@ def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> ND
         raise ConfigError(f"scale of the error map must be positive, found {scale}")
     first, second = comparable_images(rendered, truth)
     error = (first - second).abs().mean(-1).numpy()
-    return _color_table()[np.rint(np.clip(error / scale, 0.0, 1.0) * 255.0).astype(np.intp)]
+    return _error_map_colors()[np.rint(np.clip(error / scale, 0.0, 1.0) * 255.0).astype(np.intp)]
 
 
 def color_bar(stops: int = 13) -> str:
     """Return a CSS gradient of the error map's colours, left to right."""
-    rows = _color_table()[np.linspace(0, 255, stops).round().astype(np.intp)]
+    rows = _error_map_colors()[np.linspace(0, 255, stops).round().astype(np.intp)]
     return "linear-gradient(to right, " + ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in rows.tolist()) + ")"
 
 
-def _color_table() -> NDArray[np.uint8]:
+def _error_map_colors() -> NDArray[np.uint8]:
     from matplotlib import colormaps  # slow to import, and only reports need it
 
     return np.asarray(colormaps["inferno"](np.arange(256), bytes=True))[:, :3]

@@ -108,10 +108,10 @@ def read_regions(folder: Path) -> list[RegionFile]:
     if not isinstance(entries, list):
         raise DataError(f"{file}: expected a list, found {type(entries).__name__}")
     pictures = {path.name: path for path in folder.glob("worst_*.png")}
-    return [region for entry in entries if (region := _parse_region(pictures, entry)) is not None]
+    return [region for entry in entries if (region := _parse_worst_region(pictures, entry)) is not None]
 
 
-def _parse_region(pictures: Mapping[str, Path], entry: Any) -> RegionFile | None:
+def _parse_worst_region(pictures: Mapping[str, Path], entry: Any) -> RegionFile | None:
     """Return a region; None for what is no region of a picture in the folder."""
     if not isinstance(entry, Mapping) or not isinstance(entry.get("file"), str) or entry["file"] not in pictures:
         return None

@@ -16,7 +16,7 @@ from string import Template
 
 from neuprim.report.charts import Chart, draw_svg
 from neuprim.report.pictures import InlinedPicture, inline_picture
-from neuprim.report.run_record import as_number
+from neuprim.report.run_record import as_reported_number
 
 MISSING = "–"
 
@@ -48,12 +48,12 @@ def section(title: str, body: str) -> str:
     return f"<section><h2>{title}</h2>{body}</section>\n" if body else ""
 
 
-def note(text: str) -> str:
+def report_note(text: str) -> str:
     """Return a paragraph of explanation; takes HTML."""
     return f'<p class="note">{text}</p>'
 
 
-def folded(title: str, body: str) -> str:
+def report_folded(title: str, body: str) -> str:
     """Return HTML that opens with a click."""
     return f"<details><summary>{title}</summary>{body}</details>"
 
@@ -69,12 +69,12 @@ def badge(name: str, text: str = "") -> str:
     return f'\n<p class="badge"><strong>{escape(name)}</strong> <span>{escape(text) if text else ""}</span></p>'
 
 
-def banner(notes: Iterable[str]) -> str:
+def report_banner(notes: Iterable[str]) -> str:
     """Return notes, HTML, on what is not as it should be."""
     return "".join(f'<p class="banner" role="status">{text}</p>' for text in notes)
 
 
-def tiles(items: Sequence[Tile], lead: range = range(1)) -> str:
+def report_tiles(items: Sequence[Tile], lead: range = range(1)) -> str:
     """Return numbers in large type; those of ``lead`` stand out."""
     cells = []
     for i, (label, value, unit, text) in enumerate(items):
@@ -140,10 +140,10 @@ def fact_list(pairs: Iterable[tuple[str, object]]) -> str:
 
 def escape(value: object) -> str:
     """Return ``value`` as HTML text that is also safe inside a quoted attribute."""
-    return MISSING if value is None or value == "" else html.escape(format_setting(value), quote=True)
+    return MISSING if value is None or value == "" else html.escape(format_report_setting(value), quote=True)
 
 
-def format_setting(value: object) -> str:
+def format_report_setting(value: object) -> str:
     """Write a setting as users type it: ``true``, ``null``, ``0.001``, ``[1, 2]``; strings bare. Not escaped."""
     if isinstance(value, str):
         return value
@@ -159,22 +159,22 @@ def format_decimal(value: float | None, digits: int) -> str:
     return f"{value:,.{digits}f}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
 
 
-def _finite_number(value: object) -> float | None:
-    found = as_number(value)
+def _finite_report_number(value: object) -> float | None:
+    found = as_reported_number(value)
     return found if found is not None and math.isfinite(found) else None
 
 
-def format_count(value: object) -> str:
+def format_report_count(value: object) -> str:
     """Write a whole number with thousands separated; other numbers with up to two decimals."""
-    found = _finite_number(value)
+    found = _finite_report_number(value)
     if found is None:
         return MISSING
     return f"{round(found):,}" if found == round(found) else f"{found:,.2f}"
 
 
-def format_bytes(value: object) -> tuple[str, str]:
+def format_report_bytes(value: object) -> tuple[str, str]:
     """Return (number, unit) of a size in bytes, in powers of 1000."""
-    found = _finite_number(value)
+    found = _finite_report_number(value)
     if found is None:
         return MISSING, ""
     for unit in ("B", "kB", "MB"):
@@ -184,9 +184,9 @@ def format_bytes(value: object) -> tuple[str, str]:
     return f"{found:,.2f}", "GB"
 
 
-def format_duration(seconds: object) -> str:
+def format_report_duration(seconds: object) -> str:
     """Write ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
-    found = _finite_number(seconds)
+    found = _finite_report_number(seconds)
     if found is None or found < 0:
         return MISSING
     if found < 59.95:

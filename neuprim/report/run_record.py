@@ -35,7 +35,7 @@ class ViewFiles:
 
 
 @dataclass(frozen=True)
-class RunRecord:
+class ReportedRun:
     """A run directory's content.
 
     Attributes:
@@ -81,31 +81,33 @@ class RunRecord:
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
         """Return the values of two keys over the log lines that have finite numbers for both."""
-        pairs = [(as_number(line.get(x)), as_number(line.get(y))) for line in self.log]
+        pairs = [(as_reported_number(line.get(x)), as_reported_number(line.get(y))) for line in self.log]
         known = [(a, b) for a, b in pairs if a is not None and b is not None and math.isfinite(a) and math.isfinite(b)]
         return [a for a, _ in known], [b for _, b in known]
 
     def view_numbers(self, view: ViewFiles) -> Mapping[str, Any]:
         """Return the entry of ``per_view`` of a view's pictures; empty where the names do not agree."""
-        entries = per_view(self)
+        entries = read_reported_view_numbers(self)
         entry = entries[view.index] if view.index < len(entries) else {}
-        return entry if _plain_view_name(str(entry.get("name"))) == _plain_view_name(view.stem) else {}
+        return (
+            entry if _plain_reported_view_name(str(entry.get("name"))) == _plain_reported_view_name(view.stem) else {}
+        )
 
 
-def per_view(run: RunRecord) -> list[Mapping[str, Any]]:
+def read_reported_view_numbers(run: ReportedRun) -> list[Mapping[str, Any]]:
     """Return the per-view entries of ``metrics.json``; empty where there are none."""
     entries = run.field("per_view")
     return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
 
-def as_number(value: object) -> float | None:
+def as_reported_number(value: object) -> float | None:
     """Return ``value`` as a float if it is a number and not NaN, else None."""
     if isinstance(value, bool) or not isinstance(value, int | float) or math.isnan(value):
         return None
     return float(value)
 
 
-def read_run(run_dir: Path) -> RunRecord:
+def read_reported_run(run_dir: Path) -> ReportedRun:
     """Read a run directory.
 
     Raises:
@@ -116,27 +118,27 @@ def read_run(run_dir: Path) -> RunRecord:
     files = [run_dir / name for name in ("config.yaml", "metrics.json", "metrics.jsonl")]
     if not any(f.is_file() for f in files):
         raise DataError(f"{run_dir}: not a run directory, it has none of config.yaml, metrics.json and metrics.jsonl")
-    config_text = _read_text(files[0])
-    config = _read_mapping(files[0], "YAML", lambda text: load_yaml(text) or {})
-    metrics = _read_mapping(files[1], "JSON", lambda text: load_json(text, infinite=True))
-    log, unreadable = _parse_metrics_log(_read_text(files[2]) or "")
+    config_text = _read_reported_text(files[0])
+    config = _read_reported_mapping(files[0], "YAML", lambda text: load_yaml(text) or {})
+    metrics = _read_reported_mapping(files[1], "JSON", lambda text: load_json(text, infinite=True))
+    log, unreadable = _parse_reported_log(_read_reported_text(files[2]) or "")
     renders = run_dir / "renders"
     orbit, clips = renders / "orbit.webp", sorted(renders.glob("clip_*.webp"))
-    return RunRecord(
+    return ReportedRun(
         run_dir,
         config_text,
         config or {},
         metrics,
         log,
         unreadable,
-        _find_view_files(renders),
+        _find_reported_views(renders),
         orbit if orbit.is_file() else None,
         clips,
         read_regions(renders),
     )
 
 
-def _read_text(path: Path) -> str | None:
+def _read_reported_text(path: Path) -> str | None:
     if not path.is_file():
         return None
     try:
@@ -145,8 +147,8 @@ def _read_text(path: Path) -> str | None:
         raise DataError(f"{path}: not UTF-8 text ({error})") from error
 
 
-def _read_mapping(path: Path, kind: str, parse: Callable[[str], Any]) -> Mapping[str, Any] | None:
-    text = _read_text(path)
+def _read_reported_mapping(path: Path, kind: str, parse: Callable[[str], Any]) -> Mapping[str, Any] | None:
+    text = _read_reported_text(path)
     if text is None:
         return None
     try:
@@ -158,7 +160,7 @@ def _read_mapping(path: Path, kind: str, parse: Callable[[str], Any]) -> Mapping
     return data
 
 
-def _parse_metrics_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
+def _parse_reported_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
     """Return readable lines in order of steps, and the number of the others."""
     lines: list[Mapping[str, Any]] = []
     unreadable = 0
@@ -167,7 +169,7 @@ def _parse_metrics_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
             line = load_json(raw, infinite=True)
         except (ValueError, RecursionError):
             line = None
-        step = as_number(line.get("step")) if isinstance(line, Mapping) else None
+        step = as_reported_number(line.get("step")) if isinstance(line, Mapping) else None
         if step is None:
             unreadable += 1
             continue
@@ -178,7 +180,7 @@ def _parse_metrics_log(text: str) -> tuple[list[Mapping[str, Any]], int]:
     return lines, unreadable
 
 
-def _find_view_files(folder: Path) -> list[ViewFiles]:
+def _find_reported_views(folder: Path) -> list[ViewFiles]:
     groups: dict[str, set[str]] = defaultdict(set)
     for path in folder.glob("test_*.png"):
         match = re.match(r"test_(\d+)(_|$)", path.stem)
@@ -195,5 +197,5 @@ def _find_view_files(folder: Path) -> list[ViewFiles]:
     return views
 
 
-def _plain_view_name(name: str) -> str:
+def _plain_reported_view_name(name: str) -> str:
     return re.sub(r"\W+|_+", "_", name).strip("_").lower()

@@ -12,21 +12,27 @@ from neuprim.core.io.files import write_text
 from neuprim.core.metrics import metric_from_json
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import report_page as page
-from neuprim.report.charts import HELD_OUT, Chart, Points, curve_chart, view_chart
+from neuprim.report.charts import HELD_OUT, Chart, ChartPoints, curve_chart, view_chart
 from neuprim.report.pictures import ERROR_SCALE, color_bar, inline_picture
 from neuprim.report.report_page import (
     MISSING,
     Tile,
     escape,
     figure,
-    folded,
-    format_count,
     format_decimal,
-    format_duration,
-    note,
+    format_report_count,
+    format_report_duration,
+    report_folded,
+    report_note,
     section,
 )
-from neuprim.report.run_record import RunRecord, ViewFiles, as_number, per_view, read_run
+from neuprim.report.run_record import (
+    ReportedRun,
+    ViewFiles,
+    as_reported_number,
+    read_reported_run,
+    read_reported_view_numbers,
+)
 
 VIEWER_LIMIT = 4_000_000  # bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it
 _WORST_SHOWN = 12  # worst regions that are shown unfolded
@@ -61,7 +67,7 @@ def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer
         DataError: the directory is no run, or its ``config.yaml`` or ``metrics.json`` is damaged.
     """
     run_dir = Path(run_dir)
-    run, beside, target = read_run(run_dir), run_dir / _VIEWER_FILE, run_dir / "report.html"
+    run, beside, target = read_reported_run(run_dir), run_dir / _VIEWER_FILE, run_dir / "report.html"
     text = _render_report(run, conditions, viewer)
     if viewer is not None and len(text.encode()) > VIEWER_LIMIT:
         write_text(beside, viewer.text)
@@ -73,22 +79,22 @@ def write_report(run_dir: Path, conditions: Sequence[ConditionSpec] = (), viewer
 
 
 def _render_report(
-    run: RunRecord, conditions: Sequence[ConditionSpec], viewer: Viewer | None = None, linked: str = ""
+    run: ReportedRun, conditions: Sequence[ConditionSpec], viewer: Viewer | None = None, linked: str = ""
 ) -> str:
     names = [name for name in (run.name_of("task"), run.name_of("scene")) if name]
     sections = (
         _report_head(run),
-        page.banner(_report_warnings(run)),
+        page.report_banner(_report_page_warnings(run)),
         _report_headline(run),
-        _report_model("" if viewer is None else viewer.text, linked),
+        _report_model_section("" if viewer is None else viewer.text, linked),
         _report_films(run),
-        _report_held_out(run),
+        _report_held_out_section(run),
         _report_worst_regions(run),
         _report_curves(run),
         _report_view_table(run),
-        _report_settings(run),
+        _report_settings_section(run),
         _report_facts(run),
-        _report_commands(run, conditions),
+        _report_commands_section(run, conditions),
         _report_config(run),
     )
     policy = "" if viewer is None else f"; script-src 'nonce-{viewer.nonce}'; worker-src blob:"
@@ -98,7 +104,7 @@ def _render_report(
 # ---------------------------------------------------------------- head
 
 
-def _report_head(run: RunRecord) -> str:
+def _report_head(run: ReportedRun) -> str:
     """Return task and scene, and a badge unless the data is real."""
     source, drawn = run.field("data_source"), run.field("rendered_from")
     mark = ""
@@ -110,29 +116,31 @@ def _report_head(run: RunRecord) -> str:
     return page.masthead(run.name_of("task") or "", run.name_of("scene") or "", mark)
 
 
-def _report_warnings(run: RunRecord) -> list[str]:
+def _report_page_warnings(run: ReportedRun) -> list[str]:
     """Return notes, HTML: no final metrics, unreadable log lines, views worse than nothing."""
     notes = []
     if not run.metrics:
         last, train = run.last("step"), run.config.get("train")
-        total = as_number(train.get("iterations")) if isinstance(train, Mapping) else None
-        of = "" if total is None else f" of {format_count(total)}"
-        where = f"The last logged step is {format_count(last[1])}{of}." if last else "No step was logged."
+        total = as_reported_number(train.get("iterations")) if isinstance(train, Mapping) else None
+        of = "" if total is None else f" of {format_report_count(total)}"
+        where = f"The last logged step is {format_report_count(last[1])}{of}." if last else "No step was logged."
         notes.append(f"<strong>This run has not finished.</strong> There is no metrics.json yet. {where}")
     if run.unreadable_lines:
         lines = "1 line" if run.unreadable_lines == 1 else f"{run.unreadable_lines} lines"
         notes.append(f"{lines} of metrics.jsonl could not be read and left out of the curves.")
     bad = run.field("worse_than_black_image")
     if isinstance(bad, list) and bad:
-        views = "1 view is" if len(bad) == 1 else f"{format_count(len(bad))} views are"
+        views = "1 view is" if len(bad) == 1 else f"{format_report_count(len(bad))} views are"
         names = escape(", ".join(map(str, bad)))
         notes.append(f"<strong>{views} worse than a black image</strong>, which the mean hides: {names}.")
     return notes
 
 
-def _report_headline(run: RunRecord) -> str:
+def _report_headline(run: ReportedRun) -> str:
     """Return final numbers in large type, or the last logged ones of an unfinished run; and the orbit."""
-    html = page.tiles(_report_interim_tiles(run) if run.metrics is None else _report_final_tiles(run, run.metrics))
+    html = page.report_tiles(
+        _report_interim_tiles(run) if run.metrics is None else _report_final_tiles(run, run.metrics)
+    )
     if run.metrics is not None:
         kept = run.field("checkpoint")
         which = "the last checkpoint, not the best" if kept in (None, "last") else f"checkpoint “{escape(kept)}”"
@@ -144,30 +152,30 @@ def _report_headline(run: RunRecord) -> str:
     return html
 
 
-def _report_final_tiles(run: RunRecord, metrics: Mapping[str, object]) -> list[Tile]:
+def _report_final_tiles(run: ReportedRun, metrics: Mapping[str, object]) -> list[Tile]:
     mean, worst, ssim = (metric_from_json(metrics, key) for key in ("psnr", "psnr_worst", "ssim"))
-    views, split = len(per_view(run)), escape(metrics.get("split") or "held-out")
-    shown = f"{format_count(views)} {split} view{'s' if views != 1 else ''}" if views else ""
+    views, split = len(read_reported_view_numbers(run)), escape(metrics.get("split") or "held-out")
+    shown = f"{format_report_count(views)} {split} view{'s' if views != 1 else ''}" if views else ""
     empty, worst_name = metrics.get("views_empty"), _worst_view_name(run)
     displayed = metric_from_json(metrics, "ssim_3dgs")
     rule = "" if displayed is None else f"; as displayed, by 3DGS’s rule: {format_decimal(displayed, 4)}"
     each, steps = metrics.get("parameters_per_primitive"), metrics.get("iterations")
-    per_primitive = "" if each is None else f"{format_count(each)} per primitive"
-    iterations = "" if steps is None else f"{format_count(steps)} iterations"
-    fps, backend = as_number(metrics.get("render_fps")), metrics.get("backend")
+    per_primitive = "" if each is None else f"{format_report_count(each)} per primitive"
+    iterations = "" if steps is None else f"{format_report_count(steps)} iterations"
+    fps, backend = as_reported_number(metrics.get("render_fps")), metrics.get("backend")
     speed, unit = format_decimal(fps, 1 if fps is None or fps < 100 else 0), "" if fps is None else "fps"
     return [
         _decibel_tile("PSNR, mean", mean, shown),
         _decibel_tile("PSNR, worst view", worst, escape(worst_name) if worst_name else ""),
-        *([("Empty views", format_count(empty), "", "the model is not in them")] if empty else []),
+        *([("Empty views", format_report_count(empty), "", "the model is not in them")] if empty else []),
         ("SSIM", format_decimal(ssim, 4), "", "" if ssim is None else f"mean over views{rule}"),
         *_report_lpips_tile(metrics),
         *_report_mask_tile(metrics),
         *_report_volume_tiles(metrics),
-        ("Primitives", format_count(metrics.get("primitives")), "", ""),
-        ("Parameters", format_count(metrics.get("parameters")), "", per_primitive),
-        ("Model size", *page.format_bytes(metrics.get("model_bytes")), ""),
-        ("Training", format_duration(metrics.get("train_seconds")), "", iterations),
+        ("Primitives", format_report_count(metrics.get("primitives")), "", ""),
+        ("Parameters", format_report_count(metrics.get("parameters")), "", per_primitive),
+        ("Model size", *page.format_report_bytes(metrics.get("model_bytes")), ""),
+        ("Training", format_report_duration(metrics.get("train_seconds")), "", iterations),
         ("Rendering", speed, unit, escape(backend) if backend else ""),
     ]
 
@@ -209,7 +217,7 @@ def _report_volume_tiles(metrics: Mapping[str, object]) -> list[Tile]:
     return tiles
 
 
-def _report_interim_tiles(run: RunRecord) -> list[Tile]:
+def _report_interim_tiles(run: ReportedRun) -> list[Tile]:
     tiles: list[Tile] = []
     for label, key, digits, unit in (
         ("PSNR, held-out", "eval_psnr", 2, "dB"),
@@ -222,19 +230,21 @@ def _report_interim_tiles(run: RunRecord) -> list[Tile]:
         if last is None:
             tiles.append((label, MISSING, "", "not logged yet"))
         else:
-            tiles.append((label, format_decimal(last[1], digits), unit, f"at step {format_count(last[0])}"))
+            tiles.append((label, format_decimal(last[1], digits), unit, f"at step {format_report_count(last[0])}"))
     return tiles
 
 
-def _worst_view_name(run: RunRecord) -> str | None:
+def _worst_view_name(run: ReportedRun) -> str | None:
     known = [
-        (value, entry.get("name")) for entry in per_view(run) if (value := metric_from_json(entry, "psnr")) is not None
+        (value, entry.get("name"))
+        for entry in read_reported_view_numbers(run)
+        if (value := metric_from_json(entry, "psnr")) is not None
     ]
     name = min(known, key=lambda pair: pair[0])[1] if known else None
     return None if name is None else str(name)
 
 
-def _report_model(viewer: str, linked: str) -> str:
+def _report_model_section(viewer: str, linked: str) -> str:
     """Return the model to turn by hand: a page in this page, or a link to one."""
     if viewer:
         frame = f'<iframe title="the model, drawn by this browser" loading="lazy" srcdoc="{escape(viewer)}"></iframe>'
@@ -249,22 +259,22 @@ def _report_model(viewer: str, linked: str) -> str:
 # ---------------------------------------------------------------- pictures
 
 
-def _report_films(run: RunRecord) -> str:
+def _report_films(run: ReportedRun) -> str:
     figures = ""
     for path in run.clips:
         name = escape(path.stem.removeprefix("clip_"))
         figures += figure(path, f"{name}: ground truth, render", f"film of {name}, ground truth beside render")
     return (
-        section("Held-out films", f'{_note_shown_channels(run)}<div class="films">{figures}</div>') if figures else ""
+        section("Held-out films", f'{_report_shown_channels(run)}<div class="films">{figures}</div>') if figures else ""
     )
 
 
-def _note_shown_channels(run: RunRecord) -> str:
+def _report_shown_channels(run: ReportedRun) -> str:
     """Return a line on what pictures show of the channels, where that is not plain colour."""
-    return note(f"Shown: {escape(run.shown)}.") if run.shown else ""
+    return report_note(f"Shown: {escape(run.shown)}.") if run.shown else ""
 
 
-def _report_held_out(run: RunRecord) -> str:
+def _report_held_out_section(run: ReportedRun) -> str:
     """Return each view: render, truth and error map with its numbers; the colour bar once."""
     if not run.views:
         return ""
@@ -278,10 +288,12 @@ def _report_held_out(run: RunRecord) -> str:
         f'<div class="scale"><p>Error: mean absolute difference over {"all " if run.shown else ""}channels</p>'
         f'<div class="bar" style="background: {color_bar()}"></div><div class="ticks">{ticks}</div></div>'
     )
-    return section("Held-out views", f"{_note_shown_channels(run)}{bar}{rows}{note(exact) if compressed else ''}")
+    return section(
+        "Held-out views", f"{_report_shown_channels(run)}{bar}{rows}{report_note(exact) if compressed else ''}"
+    )
 
 
-def _report_view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
+def _report_view_row(run: ReportedRun, view: ViewFiles) -> tuple[str, bool]:
     """Return a view's pictures and numbers, and whether a picture was compressed."""
     entry = run.view_numbers(view)
     name = escape(entry.get("name") or view.stem or view.index)
@@ -294,13 +306,13 @@ def _report_view_row(run: RunRecord, view: ViewFiles) -> tuple[str, bool]:
         (format_decimal(metric_from_json(entry, "psnr"), 2), "dB PSNR"),
         (format_decimal(metric_from_json(entry, "ssim"), 4), "SSIM"),
     ]
-    if (seconds := as_number(entry.get("seconds"))) is not None:
+    if (seconds := as_reported_number(entry.get("seconds"))) is not None:
         numbers.append((format_decimal(seconds, 3), "s to render"))
     line = "".join(f"<span><b>{value}</b> {what}</span>" for value, what in numbers)
     return f'<article class="view"><header><h3>{name}</h3><p>{line}</p></header>{figures}</article>', compressed
 
 
-def _report_worst_regions(run: RunRecord) -> str:
+def _report_worst_regions(run: ReportedRun) -> str:
     """Return the square of every held-out view with the largest error, worst first, folded after the first dozen."""
     figures = []
     for region in run.regions:
@@ -313,26 +325,26 @@ def _report_worst_regions(run: RunRecord) -> str:
         "Of every view the square of a quarter of its shorter side with the largest error: ground truth, render, error."
     )
     first, rest = figures[:_WORST_SHOWN], figures[_WORST_SHOWN:]
-    body = f'{note(text)}<div class="regions">{"".join(first)}</div>'
+    body = f'{report_note(text)}<div class="regions">{"".join(first)}</div>'
     if rest:
-        body += folded(f"{format_count(len(rest))} more", f'<div class="regions">{"".join(rest)}</div>')
+        body += report_folded(f"{format_report_count(len(rest))} more", f'<div class="regions">{"".join(rest)}</div>')
     return section("Worst regions", body)
 
 
 # ---------------------------------------------------------------- curves
 
 
-def _report_curves(run: RunRecord) -> str:
-    views = [metric_from_json(entry, "psnr") for entry in per_view(run)]
+def _report_curves(run: ReportedRun) -> str:
+    views = [metric_from_json(entry, "psnr") for entry in read_reported_view_numbers(run)]
     mean, frames = metric_from_json(run.metrics or {}, "psnr"), run.field("per_frame")
     known = [
         (i, value)
         for i, entry in enumerate(frames if isinstance(frames, list) else [])
         if isinstance(entry, Mapping) and (value := metric_from_json(entry, "psnr")) is not None
     ]
-    film = Points([i for i, _ in known], [value for _, value in known], HELD_OUT)
+    film = ChartPoints([i for i, _ in known], [value for _, value in known], HELD_OUT)
     lines = [
-        _report_curve(run, x, key, title)
+        _report_curve_chart(run, x, key, title)
         for x, key, title in (
             ("seconds", "psnr", "PSNR over time"),
             ("seconds", "loss", "Loss over time"),
@@ -350,18 +362,18 @@ def _report_curves(run: RunRecord) -> str:
     return section("Curves", key + body) if body else ""
 
 
-def _report_curve(run: RunRecord, x: str, key: str, title: str) -> Chart:
-    lines = [Points(*run.series(x, key), band=True)]
+def _report_curve_chart(run: ReportedRun, x: str, key: str, title: str) -> Chart:
+    lines = [ChartPoints(*run.series(x, key), band=True)]
     if key == "psnr":
-        lines.append(Points(*run.series(x, "eval_psnr"), HELD_OUT))
+        lines.append(ChartPoints(*run.series(x, "eval_psnr"), HELD_OUT))
     return curve_chart(title, "steps" if x == "step" else x, lines, log=key == "loss")
 
 
 # ---------------------------------------------------------------- tables
 
 
-def _report_view_table(run: RunRecord) -> str:
-    entries = per_view(run)
+def _report_view_table(run: ReportedRun) -> str:
+    entries = read_reported_view_numbers(run)
     if not entries:
         return ""
     rows = []
@@ -370,29 +382,29 @@ def _report_view_table(run: RunRecord) -> str:
             format_decimal(metric_from_json(entry, "psnr"), 3),
             format_decimal(metric_from_json(entry, "ssim"), 5),
         )
-        seconds = format_decimal(as_number(entry.get("seconds")), 3)
+        seconds = format_decimal(as_reported_number(entry.get("seconds")), 3)
         rows.append(page.table_row(escape(entry.get("name")), (psnr, ssim, seconds)))
     table = page.number_table(("view", "PSNR, dB", "SSIM", "render, s"), rows)
-    return folded(f"All {format_count(len(entries))} held-out views", table)
+    return report_folded(f"All {format_report_count(len(entries))} held-out views", table)
 
 
-def _report_settings(run: RunRecord) -> str:
+def _report_settings_section(run: ReportedRun) -> str:
     changed = run.field("non_default")
     if not isinstance(changed, Mapping):
-        body = note(f"{MISSING} not recorded")
+        body = report_note(f"{MISSING} not recorded")
     elif not changed:
-        body = note("All settings are at their defaults.")
+        body = report_note("All settings are at their defaults.")
     else:
         rows = []
         for key, pair in changed.items():
             default, value = pair if isinstance(pair, list | tuple) and len(pair) == 2 else (None, pair)
-            first, second = (f"<code>{escape(page.format_setting(v))}</code>" for v in (default, value))
+            first, second = (f"<code>{escape(page.format_report_setting(v))}</code>" for v in (default, value))
             rows.append(page.table_row(escape(key), (f'<td class="default">{first}</td>', second)))
         body = page.number_table(("setting", "default", "this run"), rows, "")
     return section("Settings changed from their defaults", body)
 
 
-def _report_facts(run: RunRecord) -> str:
+def _report_facts(run: ReportedRun) -> str:
     keys = ("split", "data_source", "color_space", "channels", "downsampling", "background", "seed", "iterations")
     pairs = [(key.replace("_", " "), run.field(key)) for key in (*keys, "checkpoint", "backend", "device")]
     pairs = [
@@ -406,7 +418,7 @@ def _report_facts(run: RunRecord) -> str:
     return section("Run", page.fact_list(pairs))
 
 
-def _report_commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str:
+def _report_commands_section(run: ReportedRun, conditions: Sequence[ConditionSpec]) -> str:
     """Return the commands that go on from here, among them an animation of each condition of the task that has one."""
     folder = shlex.quote(str(run.run_dir))
     orbit = f"neuprim render {folder} --camera orbit"
@@ -419,7 +431,7 @@ def _report_commands(run: RunRecord, conditions: Sequence[ConditionSpec]) -> str
     return section("Go on", f'<ul class="commands">{items}</ul>')
 
 
-def _report_config(run: RunRecord) -> str:
+def _report_config(run: ReportedRun) -> str:
     if run.config_text is None:
-        return note("There is no config.yaml in this run directory.")
-    return folded("Full configuration", f"<pre><code>{escape(run.config_text)}</code></pre>")
+        return report_note("There is no config.yaml in this run directory.")
+    return report_folded("Full configuration", f"<pre><code>{escape(run.config_text)}</code></pre>")

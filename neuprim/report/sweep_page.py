@@ -14,17 +14,17 @@ from urllib.parse import quote
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import metric_from_json
 from neuprim.report import report_page as page
-from neuprim.report.charts import LARGE, Points, curve_chart
+from neuprim.report.charts import LARGE, ChartPoints, curve_chart
 from neuprim.report.report_page import (
     escape,
-    format_bytes,
-    format_count,
     format_decimal,
-    format_duration,
-    note,
+    format_report_bytes,
+    format_report_count,
+    format_report_duration,
+    report_note,
     section,
 )
-from neuprim.report.run_record import RunRecord
+from neuprim.report.run_record import ReportedRun
 
 _LESS, _MORE = "less", "more"
 _BETTER = {
@@ -54,7 +54,7 @@ _MOST_PICTURES, _MOST_VIEWS = 8, 3  # runs whose pictures are shown, and held-ou
 
 
 @dataclass(frozen=True)
-class SweepRun:
+class SweepPageRun:
     """One run of a sweep.
 
     Attributes:
@@ -71,7 +71,7 @@ class SweepRun:
     line: str
     seconds: float
     attempts: int
-    run: RunRecord | None
+    run: ReportedRun | None
 
     @property
     def numbers(self) -> dict[str, float]:
@@ -81,13 +81,13 @@ class SweepRun:
         return {name: value for name, value in found.items() if value is not None}
 
 
-def better_direction(name: str) -> str | None:
+def better_table_direction(name: str) -> str | None:
     """Return whether "more" or "less" of a metric is better; None where that is not known."""
     known = [start for start in _BETTER if name == start or name.startswith(f"{start}_")]
     return _BETTER[max(known, key=len)] if known and name != "parameters_per_primitive" else None
 
 
-def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str]) -> Path:
+def write_sweep_page(folder: Path, runs: Sequence[SweepPageRun], words: Sequence[str]) -> Path:
     """Write ``sweep.html`` into a sweep's directory, finished or not, and return its path.
 
     The page needs nothing else; without scripts it stands in the order of the mean PSNR.
@@ -115,7 +115,7 @@ def write_sweep_page(folder: Path, runs: Sequence[SweepRun], words: Sequence[str
 
 
 class _SweepPage:
-    def __init__(self, folder: Path, runs: Sequence[SweepRun], words: Sequence[str]) -> None:
+    def __init__(self, folder: Path, runs: Sequence[SweepPageRun], words: Sequence[str]) -> None:
         self.folder, self.words = folder, words
         self.numbers = {run.name: run.numbers for run in runs}
         self.runs = sorted(runs, key=lambda run: -self.numbers[run.name].get("psnr", -math.inf))
@@ -127,14 +127,14 @@ class _SweepPage:
         self.metrics = [*first, *(name for name in kept if name not in first and name in differ)]
         self.best = {name: self._best(name) for name in {*self.metrics, *_BEST}}
 
-    def _best(self, name: str) -> SweepRun | None:
-        sign = {_MORE: 1.0, _LESS: -1.0, None: 0.0}[better_direction(name)]
+    def _best(self, name: str) -> SweepPageRun | None:
+        sign = {_MORE: 1.0, _LESS: -1.0, None: 0.0}[better_table_direction(name)]
         having = [run for run in self.runs if name in self.numbers[run.name] and sign]
         return max(having, key=lambda run: sign * self.numbers[run.name][name], default=None)
 
     def heading(self) -> str:
         command = shlex.join(["neuprim", "run", "-m", *self.words])
-        return page.masthead("sweep", self.folder.resolve().name, "\n" + note(f"<code>{escape(command)}</code>"))
+        return page.masthead("sweep", self.folder.resolve().name, "\n" + report_note(f"<code>{escape(command)}</code>"))
 
     def banner(self) -> str:
         lines = []
@@ -143,24 +143,24 @@ class _SweepPage:
                 lines.append(f"<strong>{escape(run.name)} failed:</strong> {escape(run.line)}")
             elif run.state != "done":
                 lines.append(f"<strong>{escape(run.name)}</strong> has not finished.")
-        return page.banner(lines)
+        return page.report_banner(lines)
 
     def headline(self) -> str:
         done = sum(run.state == "done" for run in self.runs)
-        tiles = [("Runs", format_count(len(self.runs)), "", f"{format_count(done)} done")]
+        tiles = [("Runs", format_report_count(len(self.runs)), "", f"{format_report_count(done)} done")]
         for name, title in _BEST.items():
             best = self.best[name]
             if best is not None:
                 tiles.append((title, *_format_metric(name, self.numbers[best.name][name]), escape(best.name)))
         rule = "Metrics of the last checkpoints, on the held-out views of each run."
-        return page.tiles(tiles, lead=range(1, len(tiles))) + f'<p class="rule">{rule}</p>'
+        return page.report_tiles(tiles, lead=range(1, len(tiles))) + f'<p class="rule">{rule}</p>'
 
     def table(self) -> str:
         keys = list(dict.fromkeys(key for run in self.runs for key in run.swept))
         heads = [escape(title) for title in ("run", *keys, "state")]
         options = ""
         for name in self.metrics:
-            title, known = escape(_TITLES.get(name, name.replace("_", " "))), better_direction(name)
+            title, known = escape(_TITLES.get(name, name.replace("_", " "))), better_table_direction(name)
             heads.append(f'<th data-metric="{escape(name)}" data-better="{known or ""}">{title}</th>')
             options += "" if known is None else f'<option value="{escape(name)}">{title}</option>'
         rows = [self._row(run, keys) for run in self.runs]
@@ -170,9 +170,9 @@ class _SweepPage:
             label = '<label for="metric">Best by</label>'
             choice = f'<p class="choose" hidden>{label}<select id="metric">{options}</select><b id="best"></b></p>'
         text = "Orange: the best of a column. A name leads to the run’s own report."
-        return section("All runs", choice + table + note(text))
+        return section("All runs", choice + table + report_note(text))
 
-    def _row(self, run: SweepRun, keys: Sequence[str]) -> str:
+    def _row(self, run: SweepPageRun, keys: Sequence[str]) -> str:
         name = escape(run.name)
         if run.run is not None and (run.run.run_dir / "report.html").is_file():
             name = f'<a href="{escape(quote(run.name))}/report.html">{name}</a>'
@@ -189,14 +189,14 @@ class _SweepPage:
         cells.append(f'<td data-value="{run.seconds:.3f}">{format_decimal(run.seconds, 1)}</td>')
         return page.table_row(self._chip(run) + name, cells, f' data-run="{escape(run.name)}"')
 
-    def _chip(self, run: SweepRun) -> str:
+    def _chip(self, run: SweepPageRun) -> str:
         return f'<span class="chip" style="background: {self.colours[run.name]}"></span>'
 
     def charts(self) -> str:
         known = [(run, run.run) for run in self.runs if run.run is not None]
         charts = []
         for x, unit, title in (("seconds", "seconds", "training time"), ("step", "steps", "steps")):
-            lines = [Points(*record.series(x, "eval_psnr"), self.colours[run.name]) for run, record in known]
+            lines = [ChartPoints(*record.series(x, "eval_psnr"), self.colours[run.name]) for run, record in known]
             title = f"Held-out PSNR over {title}, dB"
             charts.append((title, curve_chart(title, unit, lines, size=LARGE)))
         panels = page.chart_panels(charts, "charts")
@@ -205,7 +205,7 @@ class _SweepPage:
 
     def pictures(self) -> str:
         """Return the same views of the best runs; runs of different data have views of their own."""
-        groups: dict[tuple[str | None, str | None], list[tuple[SweepRun, RunRecord]]] = {}
+        groups: dict[tuple[str | None, str | None], list[tuple[SweepPageRun, ReportedRun]]] = {}
         for run in self.runs:
             if run.run is not None and run.run.views:
                 groups.setdefault((run.run.name_of("task"), run.run.name_of("scene")), []).append((run, run.run))
@@ -219,17 +219,17 @@ class _SweepPage:
         pairs = [("directory", str(self.folder)), ("all numbers", "sweep.csv"), ("what was asked", "sweep.json")]
         tried = [run for run in self.runs if run.attempts > 1]
         pairs += [(run.name, f"started {run.attempts} times, as its worker died") for run in tried]
-        pairs += [("time of all runs together", format_duration(sum(run.seconds for run in self.runs)))]
+        pairs += [("time of all runs together", format_report_duration(sum(run.seconds for run in self.runs)))]
         return section("Where the numbers come from", page.fact_list(pairs))
 
 
-def _views_side_by_side(members: Sequence[tuple[SweepRun, RunRecord]]) -> str:
+def _views_side_by_side(members: Sequence[tuple[SweepPageRun, ReportedRun]]) -> str:
     """Return a few views, evenly spread, of the first runs, which are the best."""
     shown, views = members[:_MOST_PICTURES], members[0][1].views
     few = min(len(views), _MOST_VIEWS)
     html = ""
     if len(shown) < len(members):
-        html += note(f"{len(shown)} of {len(members)} runs, those with the best PSNR.")
+        html += report_note(f"{len(shown)} of {len(members)} runs, those with the best PSNR.")
     for view in (views[i] for i in sorted({round(k * (len(views) - 1) / max(few - 1, 1)) for k in range(few)})):
         name = escape(view.stem or view.index)
         figures = "" if view.truth is None else page.figure(view.truth, "ground truth", f"view {name}, ground truth")
@@ -248,13 +248,13 @@ def _format_metric(name: str, value: float | None) -> tuple[str, str]:
     if value is None:
         return page.MISSING, ""
     if name.endswith("bytes"):
-        return format_bytes(value)
+        return format_report_bytes(value)
     if name.endswith("seconds"):
         return format_decimal(value, 1), "s"
     if "psnr" in name:
         return format_decimal(value, 2), "dB"
     if name.startswith(("primitives", "parameters", "iterations", "train_views")):
-        return format_count(value), ""
+        return format_report_count(value), ""
     return format_decimal(value, 1 if name.endswith("fps") else 4), ""
 
 

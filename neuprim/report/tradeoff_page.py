@@ -17,7 +17,14 @@ from neuprim.core.metrics import metric_from_json
 from neuprim.report import report_page as elements
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.report.pictures import InlinedPicture, color_bar, error_map, inline_picture
-from neuprim.report.report_page import escape, format_bytes, format_count, format_decimal, note, section
+from neuprim.report.report_page import (
+    escape,
+    format_decimal,
+    format_report_bytes,
+    format_report_count,
+    report_note,
+    section,
+)
 
 _SLOWEST = 12.0  # multiples of the reference's time beyond which points are off the charts
 
@@ -107,23 +114,26 @@ class _TradeoffPage:
         source = self.record["data_source"]
         more = "" if source == "real" else elements.badge(f"{source} data")
         if self.trained:
-            more += "\n" + note(escape(self.record["length"]))
+            more += "\n" + report_note(escape(self.record["length"]))
         return elements.masthead(self.texts.eyebrow, f"{self.record['task']} / {self.record['scene']}", more)
 
     def tiles(self) -> str:
         base = self.points[0]
-        (size, unit), count = format_bytes(base["bytes"]), base.get("primitives") or self.record.get("primitives")
+        (size, unit), count = (
+            format_report_bytes(base["bytes"]),
+            base.get("primitives") or self.record.get("primitives"),
+        )
         tiles = [
             (self.texts.reference, format_decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
             ("PSNR", format_decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} test views"),
-            ("Model file", size, unit, f"{format_count(count)} primitives"),
+            ("Model file", size, unit, f"{format_report_count(count)} primitives"),
         ]
         for front, label in (("speed", "Fastest"), ("size", "Smallest")):
             good = [i for i in self.front[front] if self.quality(i) >= self.quality(0) - 0.1]
             if good:
                 value, _, what = self.gain(front, good[-1]).partition("×")
                 tiles.append((f"{label} within 0.1 dB", value, f"times{what}", escape(self.name(good[-1]))))
-        return elements.tiles(tiles, lead=range(3, len(tiles)))
+        return elements.report_tiles(tiles, lead=range(3, len(tiles)))
 
     def fronts(self) -> list[Chart]:
         """Return PSNR against time and against bytes; of a finished run the latter of smaller points alone."""
@@ -152,7 +162,7 @@ class _TradeoffPage:
         if self.trained:
             text += " Trainings with another seed differ by some hundredths to tenths of a decibel."
         panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in charts], "charts")
-        return section("Fronts", panels + note(text))
+        return section("Fronts", panels + report_note(text))
 
     def cards(self, front: str, title: str, text: str) -> str:
         """Return a card with picture, numbers and command for every point of a front."""
@@ -163,8 +173,8 @@ class _TradeoffPage:
             cards.append(self._card(number, f"{place}. {escape(self.name(number))}", self.gain(front, number)))
         bar = f'<span class="bar" style="background: {color_bar()}"></span>'
         text += f" Beside the picture: its difference from {self.texts.compared_with}."
-        scale = note(f"Difference: 0{bar}{self.texts.difference:g} or more.")
-        return section(title, f'{note(text)}{scale}<div class="points">{"".join(cards)}</div>')
+        scale = report_note(f"Difference: 0{bar}{self.texts.difference:g} or more.")
+        return section(title, f'{report_note(text)}{scale}<div class="points">{"".join(cards)}</div>')
 
     def _card(self, number: int, heading: str, gain: str) -> str:
         html = f'<article class="point"><header><span class="gain">{gain}</span><h3>{heading}</h3></header>'
@@ -172,7 +182,7 @@ class _TradeoffPage:
             html += self._pair(self.pictures[number], "ground truth" if number < 0 else self.name(number))
         if number < 0:
             return html + "</article>"
-        point, (size, unit) = self.points[number], format_bytes(self.points[number]["bytes"])
+        point, (size, unit) = self.points[number], format_report_bytes(self.points[number]["bytes"])
         quality = f"{format_decimal(self.quality(number), 2)} dB ({self.change(number)})"
         ssim = format_decimal(self.quality(number, "ssim"), 4)
         ms, rate = format_decimal(point.get("ms_per_frame"), 2), format_decimal(point.get("frames_per_second"), 1)
@@ -202,16 +212,16 @@ class _TradeoffPage:
                 format_decimal(p.get("time_ratio_spread"), 3),
                 format_decimal(p.get("ms_per_frame"), 2),
                 format_decimal(p.get("frames_per_second"), 1),
-                format_count(p["bytes"]),
-                format_count(len(p["ms"])),
+                format_report_count(p["bytes"]),
+                format_report_count(len(p["ms"])),
             ]
             if self.trained:
-                cells += [format_count(p[name]) for name in ("primitives", "parameters_per_primitive", "steps")]
+                cells += [format_report_count(p[name]) for name in ("primitives", "parameters_per_primitive", "steps")]
                 cells += [format_decimal(p["ms_per_step"], 2), format_decimal(p["seconds"], 1)]
             rows.append(elements.table_row(escape(self.name(i)), cells, ' class="front"' if i in marked else ""))
         text = f"Time and ± are multiples of the time of {self.texts.reference} in the same round; orange: on a front."
-        title = f"All {format_count(len(self.points))} {'models' if self.trained else 'points'}"
-        return section(title, elements.number_table(names, rows) + note(text))
+        title = f"All {format_report_count(len(self.points))} {'models' if self.trained else 'points'}"
+        return section(title, elements.number_table(names, rows) + report_note(text))
 
     def left_out(self) -> str:
         rows = [

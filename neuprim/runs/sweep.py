@@ -16,8 +16,8 @@ from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_output_overrides, parse_overrides, swept_override_keys
 from neuprim.core.errors import ConfigError, DataError, cut
 from neuprim.core.io.files import write_text
-from neuprim.report.run_record import RunRecord, read_run
-from neuprim.report.sweep_page import SweepRun, write_sweep_page
+from neuprim.report.run_record import ReportedRun, read_reported_run
+from neuprim.report.sweep_page import SweepPageRun, write_sweep_page
 from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.launch.launcher import OnStatus, ignore_status
 from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
@@ -59,23 +59,23 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
     return [*before.words, *words]
 
 
-def read_sweep_runs(record: LaunchRecord) -> list[SweepRun]:
+def read_sweep_runs(record: LaunchRecord) -> list[SweepPageRun]:
     """Read the runs in a sweep's directory, in the record's order."""
     found = [_read_finished_run(record.file.parent / run.name) for run in record.runs]
     return [
-        SweepRun(run.name, run.swept, run.state, run.line, run.seconds, run.attempts, one)
+        SweepPageRun(run.name, run.swept, run.state, run.line, run.seconds, run.attempts, one)
         for run, one in zip(record.runs, found, strict=True)
     ]
 
 
-def _read_finished_run(directory: Path) -> RunRecord | None:
+def _read_finished_run(directory: Path) -> ReportedRun | None:
     try:
-        return read_run(directory)
+        return read_reported_run(directory)
     except DataError:  # no run yet, or one that was damaged: its state says that it is not done
         return None
 
 
-def write_sweep_csv(path: Path, runs: Sequence[SweepRun]) -> None:
+def write_sweep_csv(path: Path, runs: Sequence[SweepPageRun]) -> None:
     """Write a row for every run: its name, its swept settings, its state, every number of its ``metrics.json``, and
     its directory below the sweep's. Cells without a value are empty."""
     keys = list(dict.fromkeys(key for run in runs for key in run.swept))

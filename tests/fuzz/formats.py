@@ -331,11 +331,11 @@ def _read_compressed(folder: Path) -> None:
 
 
 def _read_run(folder: Path) -> None:
-    from neuprim.report.run_record import per_view, read_run
+    from neuprim.report.run_record import read_reported_run, read_reported_view_numbers
     from neuprim.runs.open import open_run, read_metrics
 
-    run, record = open_run(folder / "run"), read_run(folder / "run")
-    repr((run.settings, run.header.get("background"), record.shown, per_view(record)))
+    run, record = open_run(folder / "run"), read_reported_run(folder / "run")
+    repr((run.settings, run.header.get("background"), record.shown, read_reported_view_numbers(record)))
     if (folder / "run/metrics.json").exists():
         read_metrics(folder / "run")
 

@@ -20,7 +20,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.metrics import metric_to_json, psnr, ssim
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report import error_map, write_report
-from neuprim.report.run_record import read_run
+from neuprim.report.run_record import read_reported_run
 from tests.reports import offered
 
 NAMES = ("r_0", "r_25", "night-view", "r_75")
@@ -289,7 +289,7 @@ def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
     folder.mkdir()
     for stem in ("010_a", "002_x_truth", "002_x_truth_truth", "002_x_truth_error", "1000_b", "note"):
         save(folder / f"test_{stem}.png", scene(4, 4, 0.0))
-    views = read_run(tmp_path).views
+    views = read_reported_run(tmp_path).views
     assert [(v.index, v.stem) for v in views] == [(2, "x_truth"), (10, "a"), (1000, "b")]
     assert views[0].truth == folder / "test_002_x_truth_truth.png"
     assert views[0].error == folder / "test_002_x_truth_error.png"

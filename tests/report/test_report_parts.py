@@ -15,17 +15,23 @@ from PIL import Image
 
 from neuprim.core.errors import ConfigError, DataError, NonFiniteError
 from neuprim.report import ERROR_SCALE, error_map
-from neuprim.report.charts import HELD_OUT, TRAINING, Dot, Points, curve_chart, draw_svg, front_chart, view_chart
+from neuprim.report.charts import HELD_OUT, TRAINING, ChartPoints, Dot, curve_chart, draw_svg, front_chart, view_chart
 from neuprim.report.pictures import inline_picture
-from neuprim.report.report_page import escape, format_bytes, format_count, format_decimal, format_duration
-from neuprim.report.run_record import read_run
+from neuprim.report.report_page import (
+    escape,
+    format_decimal,
+    format_report_bytes,
+    format_report_count,
+    format_report_duration,
+)
+from neuprim.report.run_record import read_reported_run
 
 
 def test_a_resumed_run_counts_each_step_once(tmp_path: Path) -> None:
     steps = [(10, 1.0), (20, 2.0), (30, 3.0), (20, 2.5), (30, 3.5), (40, 4.5)]
     lines = [json.dumps({"step": s, "loss": v}) for s, v in steps]
     (tmp_path / "metrics.jsonl").write_text("\n".join([*lines, "[1]", '{"loss": 3}', ""]))
-    run = read_run(tmp_path)
+    run = read_reported_run(tmp_path)
     assert [(line["step"], line["loss"]) for line in run.log] == [(10, 1.0), (20, 2.5), (30, 3.5), (40, 4.5)]
     assert run.unreadable_lines == 2 and run.last("loss") == (40, 4.5) and run.last("psnr") is None
 
@@ -43,7 +49,7 @@ def test_a_resumed_run_counts_each_step_once(tmp_path: Path) -> None:
 def test_damaged_files_are_named(tmp_path: Path, name: str, text: str | bytes, message: str) -> None:
     (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
     with pytest.raises(DataError, match=message):
-        read_run(tmp_path)
+        read_reported_run(tmp_path)
 
 
 def test_large_pictures_are_compressed(tmp_path: Path) -> None:
@@ -94,7 +100,7 @@ Pairs = list[tuple[float, float]]
 def curve(training: Pairs, held_out: Pairs, unit: str, log: bool = False) -> str | None:
     """The SVG of a chart with two lines."""
     both = ((training, TRAINING), (held_out, HELD_OUT))
-    lines = [Points([x for x, _ in pairs], [y for _, y in pairs], colour) for pairs, colour in both]
+    lines = [ChartPoints([x for x, _ in pairs], [y for _, y in pairs], colour) for pairs, colour in both]
     return draw_svg(curve_chart("Loss", unit, lines, log))
 
 
@@ -130,20 +136,20 @@ def test_non_finite_log_values_are_left_out_of_the_curves(tmp_path: Path) -> Non
         '{"step": 3, "loss": null, "psnr": true}',
     ]
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
-    run = read_run(tmp_path)
+    run = read_reported_run(tmp_path)
     assert run.last("loss") == (1, 2) and run.last("psnr") == (1, 3)
     for key, value in (("loss", 2.0), ("psnr", 3.0)):
         assert run.series("step", key) == ([1.0], [value])
 
 
 def test_numbers_as_text() -> None:
-    assert [format_duration(s) for s in (8.34, 59.97, 247, 3599.7, 7500, None, -1, math.nan)] == [
+    assert [format_report_duration(s) for s in (8.34, 59.97, 247, 3599.7, 7500, None, -1, math.nan)] == [
         "8.3 s", "1 min 00 s", "4 min 07 s", "1 h 00 min", "2 h 05 min", "–", "–", "–",
     ]  # fmt: skip
-    assert [format_bytes(b) for b in (0, 999, 1234, 45_600_000, 456_700_000, 7.25e9, "x")] == [
+    assert [format_report_bytes(b) for b in (0, 999, 1234, 45_600_000, 456_700_000, 7.25e9, "x")] == [
         ("0", "B"), ("999", "B"), ("1.23", "kB"), ("45.6", "MB"), ("457", "MB"), ("7.25", "GB"), ("–", ""),
     ]  # fmt: skip
-    assert [format_count(v) for v in (1234567, 67.25, None, math.inf)] == ["1,234,567", "67.25", "–", "–"]
+    assert [format_report_count(v) for v in (1234567, 67.25, None, math.inf)] == ["1,234,567", "67.25", "–", "–"]
     assert [format_decimal(v, 2) for v in (1.005, math.inf, -math.inf, None)] == ["1.00", "∞", "−∞", "–"]
     texts = ["–", "–", "a&quot;&lt;", "true", "[1, &quot;b&quot;]", "0.001"]
     assert [escape(v) for v in (None, "", 'a"<', True, [1, "b"], 0.001)] == texts

@@ -9,8 +9,8 @@ from pathlib import Path
 import pytest
 from PIL import Image
 
-from neuprim.report.run_record import read_run
-from neuprim.report.sweep_page import COLOURS, SweepRun, better_direction, write_sweep_page
+from neuprim.report.run_record import read_reported_run
+from neuprim.report.sweep_page import COLOURS, SweepPageRun, better_table_direction, write_sweep_page
 from tests.browsers import browser
 
 
@@ -31,8 +31,8 @@ def sweep(folder: Path) -> Path:
     for name, (psnr, size) in numbers.items():
         run(folder / name, psnr, size, lpips=None if name == "small" else 0.1 + psnr / 100)
         attempts, swept = 2 if name == "small" else 1, {"model.primitives": str(size)}
-        runs.append(SweepRun(name, swept, "done", "", 2.0, attempts, read_run(folder / name)))
-    runs.append(SweepRun("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
+        runs.append(SweepPageRun(name, swept, "done", "", 2.0, attempts, read_reported_run(folder / name)))
+    runs.append(SweepPageRun("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
     return write_sweep_page(folder, runs, ["task=static", "model.primitives=1,2"])
 
 
@@ -63,14 +63,14 @@ def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
     ],
 )
 def test_what_is_better_is_said_where_it_is_known(name: str, expected: str | None) -> None:
-    assert better_direction(name) == expected
+    assert better_table_direction(name) == expected
 
 
 def test_of_many_runs_each_has_its_colour_and_infinite_numbers_sort(tmp_path: Path) -> None:
     runs = []
     for n in range(14):
         run(tmp_path / str(n), 10.0 + n, 100, psnr_infinite=n == 3)
-        runs.append(SweepRun(str(n), {}, "done", "", 1.0, 1, read_run(tmp_path / str(n))))
+        runs.append(SweepPageRun(str(n), {}, "done", "", 1.0, 1, read_reported_run(tmp_path / str(n))))
     text = write_sweep_page(tmp_path, runs, []).read_text()
     assert runs[3].numbers["psnr"] == math.inf and 'data-value="Infinity">∞' in text
     assert len(set(__import__("re").findall(r'class="chip" style="background: (#\w+)"', text))) == 14

@@ -80,7 +80,7 @@ class Command:
         parser = self.build_parser(words)
         arguments, rest = parser.parse_known_args(words)
         if self.opens_run:
-            check_run_directory(arguments.run_dir)
+            check_run_dir_argument(arguments.run_dir)
         rest = self.take_rest(arguments, rest, parser)
         if rest:
             raise refuse_argument(rest[0], parser)
@@ -103,7 +103,7 @@ def add_trust_flag(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(FLAG, action="store_true", help=text)
 
 
-def check_run_directory(path: Path) -> None:
+def check_run_dir_argument(path: Path) -> None:
     """Raise ConfigError unless ``path`` is a folder."""
     if not path.is_dir():
         model = path.is_file() and path.suffix in (".neuprim", ".npz", ".ply")
@@ -114,25 +114,31 @@ def check_run_directory(path: Path) -> None:
 # ---------------------------------------------------------------- words that argparse does not know
 
 
-def take_overrides(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+def take_override_arguments(
+    arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
+) -> list[str]:
     """Add the words that are no flags to ``arguments.overrides``: argparse gives up on them after the first flag."""
     arguments.overrides += [word for word in rest if not word.startswith("-")]
     return [word for word in rest if word.startswith("-")]
 
 
-def take_render_overrides(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+def take_render_override_arguments(
+    arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
+) -> list[str]:
     """Set ``arguments.words`` to the render overrides."""
-    arguments.words, rest = split_render_overrides(rest)
+    arguments.words, rest = split_override_arguments(rest)
     return rest
 
 
-def split_render_overrides(words: Sequence[str]) -> tuple[list[str], list[str]]:
+def split_override_arguments(words: Sequence[str]) -> tuple[list[str], list[str]]:
     """Split words into render overrides, as ``renderer.samples=2``, and others; ``--`` may stand between."""
     found = [word for word in words if "=" in word and re.split(r"[.=]", word)[0] in RENDER_OVERRIDE_HEADS]
     return found, [word for word in words if word not in found and word != "--"]
 
 
-def take_conditions(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+def take_condition_arguments(
+    arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
+) -> list[str]:
     """Set ``arguments.conditions``, name -> text, from the flags that the run's task defines.
 
     ``arguments.run`` is the run, opened if there are flags, else its directory.
@@ -182,7 +188,7 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
         print("  ".join([f"{first:{widths[0]}}", *cells]).rstrip())
 
 
-def describe_interruption(directory: Path, typed: ConfigArguments) -> str:
+def describe_interrupted_command(directory: Path, typed: ConfigArguments) -> str:
     """Return what an interrupted run has, and the command that continues it."""
     begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
     state = "has the run up to here" if begun else "has no checkpoint yet"
@@ -192,7 +198,7 @@ def describe_interruption(directory: Path, typed: ConfigArguments) -> str:
 # ---------------------------------------------------------------- values of flags
 
 
-def parse_size(text: str) -> tuple[int, int]:
+def parse_size_argument(text: str) -> tuple[int, int]:
     """Read 640x480 as (640, 480) pixels."""
     match = re.fullmatch(r"([1-9]\d{0,5})[xX]([1-9]\d{0,5})", text)
     if not match:

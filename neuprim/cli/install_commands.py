@@ -33,7 +33,7 @@ _OTHER_PLUGINS: tuple[tuple[str, PluginGroup[Any]], ...] = (
 )
 
 
-def list_plugins() -> list[str]:
+def list_printed_plugins() -> list[str]:
     """Return the lines of ``neuprim tasks``; a broken plugin is one of them, with its error, and stops no other."""
     lines: list[str] = []
     scenes = SCENES.survey()
@@ -44,34 +44,35 @@ def list_plugins() -> list[str]:
             summary, body = report.spec.summary, _describe_task_choices(report.spec, scenes)
         except NeuprimError as broken:
             summary, body = "BROKEN", [str(broken)]
-        title = f"{report.info.name}  ({report.info.origin})  {summary}{_describe_plugin_note(report)}"
+        title = f"{report.info.name}  ({report.info.origin})  {summary}{_format_printed_plugin_note(report)}"
         lines += [title, *(f"  {line}" for line in body), ""]
     tasks = {info.name for info in TASKS.list_plugins()}
     homeless = [report for report in scenes if report.info.name.partition(".")[0] not in tasks]
     if homeless:
-        described = (f"  {_describe_plugin(report, report.info.name)}" for report in homeless)
+        described = (f"  {_format_printed_plugin(report, report.info.name)}" for report in homeless)
         lines += ["scenes of tasks that are not installed", *described, ""]
     for heading, group in _OTHER_PLUGINS:
         reports = group.survey()
         width = max((len(report.info.name) for report in reports), default=0)
         lines += [heading] if reports else []
         for report in reports:
-            lines.append(f"  {_describe_plugin(report, f'{report.info.name:{width}}')}")
+            lines.append(f"  {_format_printed_plugin(report, f'{report.info.name:{width}}')}")
             if group is LOSSES and report.spec is not None:
                 lines += [f"    {line}" for line in _describe_options(report.spec)]
         lines += [""] if reports else []
     return lines
 
 
-def _describe_plugin(report: PluginReport[Any], name: str) -> str:
+def _format_printed_plugin(report: PluginReport[Any], name: str) -> str:
     if report.spec is None:
-        return f"{name}  BROKEN  ({report.info.origin})  {report.error}{_describe_plugin_note(report)}"
-    return f"{name}  ({report.info.origin})  {getattr(report.spec, 'summary', '')}".rstrip() + _describe_plugin_note(
-        report
+        return f"{name}  BROKEN  ({report.info.origin})  {report.error}{_format_printed_plugin_note(report)}"
+    return (
+        f"{name}  ({report.info.origin})  {getattr(report.spec, 'summary', '')}".rstrip()
+        + _format_printed_plugin_note(report)
     )
 
 
-def _describe_plugin_note(report: PluginReport[Any]) -> str:
+def _format_printed_plugin_note(report: PluginReport[Any]) -> str:
     return f"  [{report.note}]" if report.note else ""
 
 
@@ -103,7 +104,7 @@ def _describe_scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tup
     from neuprim.config import check_scene_config
 
     name = report.info.name.removeprefix(f"{spec.name}.")
-    problem, note = report.error, _describe_plugin_note(report)
+    problem, note = report.error, _format_printed_plugin_note(report)
     if any(scene.name == name for scene in spec.scenes):
         note = f"  [hidden by the task's own; {SCENES.choice(report.info)} chooses it]"
     if report.spec is not None:
@@ -115,8 +116,8 @@ def _describe_scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tup
     return name, f"BROKEN  ({report.info.origin})  {problem}{note}"
 
 
-def _tasks(arguments: argparse.Namespace) -> int:
-    print(*list_plugins(), sep="\n")
+def _tasks_command(arguments: argparse.Namespace) -> int:
+    print(*list_printed_plugins(), sep="\n")
     return 0
 
 
@@ -127,7 +128,7 @@ def _add_new_task_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, metavar="DIR", help=out)
 
 
-def _new_task(arguments: argparse.Namespace) -> int:
+def _new_task_command(arguments: argparse.Namespace) -> int:
     from neuprim.plugins.new_task import write_task_package
 
     print(*write_task_package(arguments.name, arguments.out), sep="\n")
@@ -135,12 +136,12 @@ def _new_task(arguments: argparse.Namespace) -> int:
 
 
 TASKS_COMMAND = Command(
-    "tasks", "list tasks, scenes, presets and other plugins, and the packages they come from", _tasks
+    "tasks", "list tasks, scenes, presets and other plugins, and the packages they come from", _tasks_command
 )
 NEW_TASK_COMMAND = Command(
     "new-task",
     "write a small working package with a task of your own: see docs/plugins.md",
-    _new_task,
+    _new_task_command,
     _add_new_task_arguments,
 )
 
@@ -164,12 +165,12 @@ def print_doctor_report(console: Console | None = None) -> int:
     from neuprim.core.render import backends
 
     console = console or plain_console()
-    reasons = {name: _probe_backend(name) for name in backends.backend_names()}
+    reasons = {name: _probe_doctor_backend(name) for name in backends.backend_names()}
     working = None in reasons.values()
     tables: dict[str, Rows] = {
-        "machine": _describe_machine(),
-        "packages": _list_packages(),
-        "CUDA devices": _list_devices(),
+        "machine": _describe_doctor_machine(),
+        "packages": _list_doctor_packages(),
+        "CUDA devices": _list_doctor_devices(),
         "renderer backends": [(n, "works" if r is None else f"does not work: {r}") for n, r in reasons.items()],
         "caches": [
             ("kernels", f"{kernel_cache()} (set by NUMBA_CACHE_DIR)"),
@@ -188,7 +189,7 @@ def print_doctor_report(console: Console | None = None) -> int:
     return 0 if working else 1
 
 
-def _describe_machine() -> Rows:
+def _describe_doctor_machine() -> Rows:
     from llvmlite import binding
 
     from neuprim.core.compute.threads import cpu_name
@@ -216,7 +217,7 @@ def _describe_memory() -> str:
     return f"{total / 2**30:.1f} GiB"
 
 
-def _list_packages() -> Rows:
+def _list_doctor_packages() -> Rows:
     extras = ["", *(metadata.metadata("neuprim").get_all("Provides-Extra") or [])]
     needed: dict[str, list[tuple[Requirement, str]]] = {}  # several extras may name one package
     for text in metadata.requires("neuprim") or []:
@@ -241,7 +242,7 @@ def _describe_package(name: str, needed: list[tuple[Requirement, str]]) -> str:
     return version
 
 
-def _list_devices() -> Rows:
+def _list_doctor_devices() -> Rows:
     import torch
 
     from neuprim.core.render.backends import gpu_backends_unavailable
@@ -260,7 +261,7 @@ def _list_devices() -> Rows:
     return rows
 
 
-def _probe_backend(name: str) -> str | None:
+def _probe_doctor_backend(name: str) -> str | None:
     """None if a backend draws a picture here, else the reason it does not."""
     from neuprim.core.render import probe_backend
 

@@ -13,11 +13,11 @@ from neuprim.cli.command import (
     RENDER_OVERRIDES_HELP,
     Command,
     add_trust_flag,
-    check_run_directory,
+    check_run_dir_argument,
     parse_count,
     plain_console,
-    take_overrides,
-    take_render_overrides,
+    take_override_arguments,
+    take_render_override_arguments,
 )
 from neuprim.core.errors import ConfigError
 
@@ -36,12 +36,12 @@ def _add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=text)
 
 
-def _evaluate(arguments: argparse.Namespace) -> int:
+def _eval_command(arguments: argparse.Namespace) -> int:
     from neuprim.core.metrics.image import format_metrics
     from neuprim.runs.measure import evaluate_run
 
     metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.words)
-    rows = _flatten_metrics(metrics)
+    rows = _list_printed_metrics(metrics)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"{name:{width}}  {value}")
@@ -50,12 +50,12 @@ def _evaluate(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _flatten_metrics(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
+def _list_printed_metrics(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     for key, value in metrics.items():
         name = f"{where}{key}"
         if isinstance(value, Mapping):
-            rows += _flatten_metrics(value, f"{name}.")
+            rows += _list_printed_metrics(value, f"{name}.")
         elif isinstance(value, list) and value and all(isinstance(entry, Mapping) for entry in value):
             rows.append((name, f"{len(value)} entries, in the run's metrics.json"))
         else:
@@ -66,10 +66,10 @@ def _flatten_metrics(metrics: Mapping[str, Any], where: str = "") -> list[tuple[
 EVAL_COMMAND = Command(
     "eval",
     "measure a run on its test views",
-    _evaluate,
+    _eval_command,
     _add_eval_arguments,
     RENDER_OVERRIDES_HELP,
-    take_render_overrides,
+    take_render_override_arguments,
     opens_run=True,
 )
 
@@ -103,9 +103,9 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
 
 
-def _bench(args: argparse.Namespace) -> int:
+def _bench_command(args: argparse.Namespace) -> int:
     """List the tables, or run what stands for their rows."""
-    from neuprim.cli.run_commands import run_one
+    from neuprim.cli.run_commands import run_command_here
     from neuprim.config.overrides import ConfigArguments
     from neuprim.runs.open import read_metrics
     from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
@@ -127,8 +127,8 @@ def _bench(args: argparse.Namespace) -> int:
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
-        results.append((one, read_metrics(run_one(one.config, ConfigArguments(one.config.overrides)))))
-        print(*_describe_paper_result(*results[-1]), sep="\n", flush=True)
+        results.append((one, read_metrics(run_command_here(one.config, ConfigArguments(one.config.overrides)))))
+        print(*_describe_bench_result(*results[-1]), sep="\n", flush=True)
     print(*_describe_paper_averages(results), _PAPER_RULES, sep="\n")
     return 0
 
@@ -181,7 +181,7 @@ def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
     yield f"{len(planned)} runs, about {_format_seconds(total)} of training on this machine{longer}, and measuring"
 
 
-def _describe_paper_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Iterator[str]:
+def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Iterator[str]:
     from neuprim.runs.paper import compare_run_with_paper
 
     steps, seconds = metrics["iterations"], _format_seconds(metrics["train_seconds"])
@@ -237,9 +237,9 @@ def _format_seconds(seconds: float) -> str:
 BENCH_COMMAND = Command(
     "bench",
     "the paper's tables, and runs of their protocol on data that you have",
-    _bench,
+    _bench_command,
     _add_bench_arguments,
-    take_rest=take_overrides,
+    take_rest=take_override_arguments,
 )
 
 
@@ -259,7 +259,7 @@ After RUN_DIR, """
 _TRADEOFF_FILES = ("tradeoff.json", "tradeoff.csv", "tradeoff.html", "front.png")
 
 
-def is_override(first: str) -> bool:
+def is_override_argument(first: str) -> bool:
     """Return whether the first argument is an override of ``neuprim run`` and not a run directory."""
     return "=" in first and not Path(first).exists()
 
@@ -281,19 +281,19 @@ def _add_tradeoff_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _take_tradeoff_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    if is_override(arguments.run_dir):
+    if is_override_argument(arguments.run_dir):
         arguments.words = [word for word in rest if not word.startswith("-")]
         return [word for word in rest if word.startswith("-") and word != "--"]
-    return take_render_overrides(arguments, rest, parser)
+    return take_render_override_arguments(arguments, rest, parser)
 
 
-def _tradeoff(args: argparse.Namespace) -> int:
+def _tradeoff_command(args: argparse.Namespace) -> int:
     args.words += [word for word in args.knobs if "=" in word]  # overrides after --knobs look like names
     args.knobs = [word for word in args.knobs if "=" not in word]
-    return _train_tradeoff(args) if is_override(args.run_dir) else _render_tradeoff(args)
+    return _train_tradeoff_command(args) if is_override_argument(args.run_dir) else _render_tradeoff_command(args)
 
 
-def _render_tradeoff(args: argparse.Namespace) -> int:
+def _render_tradeoff_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration_setting
     from neuprim.search.render_tradeoff import format_tradeoff_render_command, measure_tradeoff
@@ -301,7 +301,7 @@ def _render_tradeoff(args: argparse.Namespace) -> int:
     from neuprim.search.tradeoff_record import TRADEOFF_FOLDER
 
     run_dir = Path(args.run_dir)
-    check_run_directory(run_dir)
+    check_run_dir_argument(run_dir)
     if args.seeds is not None:
         raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
     budget = parse_duration_setting(args.budget or "5m", f"--budget {args.budget}")
@@ -309,7 +309,7 @@ def _render_tradeoff(args: argparse.Namespace) -> int:
     folder = run_dir / TRADEOFF_FOLDER
     try:
         with DrawProgress() as progress:
-            record = measure_tradeoff(run_dir, request, progress.note, progress.show)
+            record = measure_tradeoff(run_dir, request, progress.print_note, progress.show)
     except KeyboardInterrupt:
         if not (folder / "tradeoff.json").exists():
             raise
@@ -320,7 +320,7 @@ def _render_tradeoff(args: argparse.Namespace) -> int:
     return 0
 
 
-def _train_tradeoff(args: argparse.Namespace) -> int:
+def _train_tradeoff_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.config.command_settings import parse_duration_setting, take_launcher_overrides
     from neuprim.config.overrides import parse_overrides
@@ -336,7 +336,7 @@ def _train_tradeoff(args: argparse.Namespace) -> int:
     request = TradeoffRequest(words, budget, args.views, args.repeats, args.knobs, args.lpips)
     try:
         with DrawProgress() as progress:
-            folder, record = run_ablation(request, args.seeds or 1, launcher, progress.note, progress.show)
+            folder, record = run_ablation(request, args.seeds or 1, launcher, progress.print_note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
     _print_fronts(folder, record, [format_ablation_run_command(point.words) for point in record.points])
@@ -348,7 +348,7 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
     if "length" in record.facts:
         console.print(record.facts["length"])
     for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
-        console.print(_build_front_table(title, record, numbers))
+        console.print(_build_printed_front_table(title, record, numbers))
         for place, number in enumerate(numbers, 1):
             console.print(f"{commands[number]}  # {place}")
         console.print()
@@ -359,7 +359,7 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
         console.print(folder / name)
 
 
-def _build_front_table(title: str, record: TradeoffRecord, numbers: Sequence[int]) -> Table:
+def _build_printed_front_table(title: str, record: TradeoffRecord, numbers: Sequence[int]) -> Table:
     """Build the table of the reference and a front; the numbers are those of the commands."""
     from rich import box
     from rich.table import Table
@@ -372,11 +372,11 @@ def _build_front_table(title: str, record: TradeoffRecord, numbers: Sequence[int
         table.add_column(name, justify="right", no_wrap=True)
     first = "centre" if trained else "ref."
     for place, number in ((first, 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
-        table.add_row(*(Text(cell) for cell in (place, *_format_point(record.points[number]))))
+        table.add_row(*(Text(cell) for cell in (place, *_format_printed_point(record.points[number]))))
     return table
 
 
-def _format_point(point: TradeoffPoint) -> tuple[str, ...]:
+def _format_printed_point(point: TradeoffPoint) -> tuple[str, ...]:
     q = point.quality
     about = "" if point.spread is None else f" ± {point.spread:.3f}"
     seeds = "" if point.seed_spread is None else f" ± {point.seed_spread:.2f}"
@@ -390,7 +390,7 @@ def _format_point(point: TradeoffPoint) -> tuple[str, ...]:
 TRADEOFF_COMMAND = Command(
     "tradeoff",
     "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
-    _tradeoff,
+    _tradeoff_command,
     _add_tradeoff_arguments,
     _TRADEOFF_FORMS + RENDER_OVERRIDES_HELP,
     _take_tradeoff_words,

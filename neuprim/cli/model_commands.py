@@ -61,7 +61,7 @@ def _take_export_options(arguments: argparse.Namespace, rest: list[str], parser:
     return []
 
 
-def _export(arguments: argparse.Namespace) -> int:
+def _export_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import LineProgress
     from neuprim.runs.export import export_run
 
@@ -148,7 +148,7 @@ def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
 
 
-def _import_model(arguments: argparse.Namespace) -> int:
+def _import_command(arguments: argparse.Namespace) -> int:
     from neuprim.runs.export import import_run_directory
 
     print(import_run_directory(arguments.file, arguments.out))
@@ -158,14 +158,17 @@ def _import_model(arguments: argparse.Namespace) -> int:
 EXPORT_COMMAND = Command(
     "export",
     "write a run's model in another format",
-    _export,
+    _export_command,
     _add_export_arguments,
     _export_help,
     _take_export_options,
     opens_run=True,
 )
 IMPORT_COMMAND = Command(
-    "import", "make a run directory of an exported .ply or .npz, or of a .neuprim", _import_model, _add_import_arguments
+    "import",
+    "make a run directory of an exported .ply or .npz, or of a .neuprim",
+    _import_command,
+    _add_import_arguments,
 )
 
 
@@ -188,7 +191,7 @@ def _add_compress_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
 
-def _compress(args: argparse.Namespace) -> int:
+def _compress_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import LineProgress
     from neuprim.search.compress import CompressRequest, compress_run
 
@@ -221,7 +224,7 @@ def _print_compression(made: Compression) -> None:
 COMPRESS_COMMAND = Command(
     "compress",
     "write a run's model in few bits, as one file that every command reads",
-    _compress,
+    _compress_command,
     _add_compress_arguments,
     opens_run=True,
 )
@@ -241,7 +244,7 @@ def _add_prune_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
-def _prune(args: argparse.Namespace) -> int:
+def _prune_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.pruning import PruneRequest, prune_run
 
@@ -287,7 +290,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
 PRUNE_COMMAND = Command(
     "prune",
     "remove what a run's scene does not require, and write the rest as a run",
-    _prune,
+    _prune_command,
     _add_prune_arguments,
     opens_run=True,
 )

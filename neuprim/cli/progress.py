@@ -102,7 +102,7 @@ class DrawProgress(_ProgressBar):
         super().__init__(console, (TextColumn("eta"), TimeRemainingColumn()), True)
         self._started = time.monotonic()
 
-    def note(self, text: str) -> None:
+    def print_note(self, text: str) -> None:
         """Print a line that stays."""
         self.console.print(f"neuprim: {text}")
 
@@ -111,7 +111,7 @@ class DrawProgress(_ProgressBar):
         self.bar.update(self.task, description=text, completed=fraction)
         if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
             self._started = time.monotonic()
-            self.note(f"{text}, {fraction:.0%}")
+            self.print_note(f"{text}, {fraction:.0%}")
 
 
 class LineProgress:
@@ -125,7 +125,7 @@ class LineProgress:
             self.last = (text, fraction)
             self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text)
 
-    def note(self, text: str) -> None:
+    def print_note(self, text: str) -> None:
         """Print a line that stays."""
         self.console.print(f"neuprim: {text}")
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from neuprim.cli.command import Command, add_trust_flag, describe_interruption, take_overrides
+from neuprim.cli.command import Command, add_trust_flag, describe_interrupted_command, take_override_arguments
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_line
 
 if TYPE_CHECKING:
@@ -77,7 +77,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
     add_trust_flag(parser)
 
 
-def _run(args: argparse.Namespace) -> int:
+def _run_command(args: argparse.Namespace) -> int:
     from neuprim.config import compose, compose_all, read_stored_config
     from neuprim.config.command_settings import (
         LauncherSettings,
@@ -91,7 +91,7 @@ def _run(args: argparse.Namespace) -> int:
 
     place = read_torchrun_rank()
     if place is not None:
-        return run_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
+        return run_command_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
     typed = ConfigArguments(args.overrides, args.config)
     viewer, overrides = take_viewer_overrides(args.overrides)
     launcher, overrides = take_launcher_overrides(overrides)
@@ -116,16 +116,16 @@ def _run(args: argparse.Namespace) -> int:
         print("---\n".join(config.to_yaml() for config in configs), end="")
         return 0
     if wanted is not None:
-        return _search_target(configs[0], *wanted, launcher, typed)
+        return _run_command_with_target(configs[0], *wanted, launcher, typed)
     if viewer is not None:
         refuse_chunks(configs[0], "viewer=true shows one training")
     if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
-        return launch_runs(configs, overrides, launcher, typed)
-    print(run_one(configs[0], typed, viewer, launcher))
+        return run_command_with_launcher(configs, overrides, launcher, typed)
+    print(run_command_here(configs[0], typed, viewer, launcher))
     return 0
 
 
-def run_one(
+def run_command_here(
     config: RunConfig,
     typed: ConfigArguments,
     viewer: ViewerSettings | None = None,
@@ -139,20 +139,20 @@ def run_one(
         launcher: where the chunks of a scene that is fitted in chunks work; None: here.
     """
     from neuprim.cli.progress import RunProgress
-    from neuprim.cli.view_commands import run_viewed
+    from neuprim.cli.view_commands import run_command_with_viewer
     from neuprim.config.command_settings import LauncherSettings
     from neuprim.runs.run import run
 
     try:
         with RunProgress(f"{config.task}/{config.scene_name}") as events:
             if viewer is not None:
-                return run_viewed(config, events, viewer)
+                return run_command_with_viewer(config, events, viewer)
             return run(config, events, launcher=launcher or LauncherSettings())
     except KeyboardInterrupt:
-        raise KeyboardInterrupt(describe_interruption(config.output_dir, typed)) from None
+        raise KeyboardInterrupt(describe_interrupted_command(config.output_dir, typed)) from None
 
 
-def _search_target(
+def _run_command_with_target(
     config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: ConfigArguments
 ) -> int:
     """Search for a model that reaches a target; print what was achieved and the run's directory."""
@@ -165,13 +165,13 @@ def _search_target(
     except KeyboardInterrupt:
         command = typed.resume_command(config.output_dir)
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
-    for line in _describe_target(record):
+    for line in _list_printed_target_lines(record):
         events.console.print(line)
     print(record.achieved["run_dir"])
     return 0
 
 
-def _describe_target(record: TargetRecord) -> list[str]:
+def _list_printed_target_lines(record: TargetRecord) -> list[str]:
     """What was predicted and achieved, and why the search ended."""
     from neuprim.search.size_forecast import format_target_forecast
     from neuprim.search.target_record import TARGET_FILE
@@ -192,13 +192,13 @@ def _describe_target(record: TargetRecord) -> list[str]:
     return [*lines, f"everything that was tried: {TARGET_FILE}"]
 
 
-RUN_COMMAND = Command("run", "fit a scene", _run, _add_run_arguments, _run_help, take_overrides)
+RUN_COMMAND = Command("run", "fit a scene", _run_command, _add_run_arguments, _run_help, take_override_arguments)
 
 
 # ---------------------------------------------------------------- sweeps and launchers
 
 
-def launch_runs(
+def run_command_with_launcher(
     configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: ConfigArguments
 ) -> int:
     """Launch the runs of a sweep, or a single run in another process; return the exit status.
@@ -244,7 +244,7 @@ def _report_launched_runs(
                 print(f"neuprim: error: {config.output_dir}: {result.line}", file=sys.stderr)
             status = 1 if result.trace or status == 1 else 2
     if left and len(configs) == 1:
-        raise KeyboardInterrupt(describe_interruption(left[0], typed))
+        raise KeyboardInterrupt(describe_interrupted_command(left[0], typed))
     if left:
         over = f"{left[0].parent} has {len(configs) - len(left)} of {len(configs)} runs"
         begun = sum((directory / "checkpoint.safetensors").exists() for directory in left)
@@ -271,7 +271,7 @@ def _add_truth_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-m", "--multirun", action="store_true", help=every)
 
 
-def _truth(args: argparse.Namespace) -> int:
+def _truth_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import RunProgress
     from neuprim.config import compose, compose_all
     from neuprim.config.command_settings import take_launcher_overrides
@@ -297,17 +297,17 @@ def _truth(args: argparse.Namespace) -> int:
 TRUTH_COMMAND = Command(
     "truth",
     "render the ground truth of a scene before runs need it",
-    _truth,
+    _truth_command,
     _add_truth_arguments,
     _TRUTH_HELP,
-    take_overrides,
+    take_override_arguments,
 )
 
 
 # ---------------------------------------------------------------- torchrun
 
 
-def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
+def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
     """Fit one scene as one of several ranks; returns the exit status.
 
     An error is printed once, in one line, by the first rank that fails.
@@ -331,7 +331,7 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
     before = signal.signal(signal.SIGTERM, terminate)
     try:
         with limit_process_threads(max(machine_cores() // place.local_size, 1)):
-            _fit_as_rank(_compose_for_rank(words, more, group), words, group)
+            _fit_with_rank_progress(_compose_rank_arguments(words, more, group), words, group)
         return 0
     except KeyboardInterrupt:
         group.record_failure("interrupted")
@@ -355,7 +355,7 @@ def run_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
         signal.signal(signal.SIGTERM, before)
 
 
-def _compose_for_rank(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
+def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
     """Compose the configuration; all ranks take the output directory of rank 0, which writes there."""
     from neuprim.config import compose
     from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
@@ -399,7 +399,7 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
     torch.cuda.set_device(place.local_rank)
 
 
-def _fit_as_rank(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
+def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
     """Train, and show it on rank 0."""
     from neuprim.cli.progress import RunProgress
     from neuprim.config.overrides import ConfigArguments
@@ -422,5 +422,5 @@ def _fit_as_rank(config: RunConfig, overrides: Sequence[str], group: ProcessGrou
     except KeyboardInterrupt:
         # torchrun takes any other status than 0 for a failure, and ends rank 0, which still has to write
         if group.is_first:
-            text = describe_interruption(config.output_dir, typed)
+            text = describe_interrupted_command(config.output_dir, typed)
             raise KeyboardInterrupt(text.replace("  neuprim run", f"  torchrun {ranks} -m neuprim run")) from None

@@ -17,11 +17,11 @@ from neuprim.cli.command import (
     parse_number,
     parse_numbers,
     parse_rate,
-    parse_size,
+    parse_size_argument,
     parse_whole,
     plain_console,
-    take_conditions,
-    take_render_overrides,
+    take_condition_arguments,
+    take_render_override_arguments,
 )
 from neuprim.core.errors import ConfigError, DataError
 
@@ -50,7 +50,7 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
     space = "coordinates of cameras, lights and .exr files: the run's data (default), or the model (volumes: unit box)"
     parser.add_argument("--space", choices=("world", "scene"), help=space)
-    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels (default: the data set's)")
+    parser.add_argument("--size", type=parse_size_argument, metavar="WxH", help="pixels (default: the data set's)")
     formats = ("png", "exr", "npy", "webp", "gif", "mp4")
     parser.add_argument("--format", choices=formats, help="default: png, or webp for an animation")
     layers = "of an .exr: beauty, alpha, depth, density, and the task's own (an unknown name lists them); default: all"
@@ -66,7 +66,7 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     image = "radiance by latitude and longitude, twice as wide as high"
     group.add_argument("--environment", type=Path, metavar="FILE.exr", help=image)
     lights = "lights that stand for it (default: 64)"
-    group.add_argument("--environment-samples", type=_parse_light_count, metavar="N", help=lights)
+    group.add_argument("--environment-samples", type=_parse_light_count_argument, metavar="N", help=lights)
     rotation = "anticlockwise about up, seen from above (default: 0)"
     group.add_argument("--environment-rotation", type=_parse_degrees, metavar="DEG", help=rotation)
     scale = "multiplies its radiance (default: 1)"
@@ -76,14 +76,14 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _take_render_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    return take_conditions(arguments, take_render_overrides(arguments, rest, parser), parser)
+    return take_condition_arguments(arguments, take_render_override_arguments(arguments, rest, parser), parser)
 
 
-def _render(arguments: argparse.Namespace) -> int:
+def _render_command(arguments: argparse.Namespace) -> int:
     camera = arguments.camera
     if camera not in ("orbit", "test") and not any(Path(n).exists() for n in (camera, camera.partition("#")[0])):
         raise ConfigError(f"--camera {camera}: no such file; expected orbit, test, or a file or folder of cameras")
-    environment = _read_environment(arguments)
+    environment = _read_environment_argument(arguments)
     from neuprim.cli.progress import DrawProgress
     from neuprim.runs.render_images import RenderRequest, render_run
 
@@ -93,12 +93,12 @@ def _render(arguments: argparse.Namespace) -> int:
         camera, environment=environment, overrides=arguments.words, overwrite=arguments.force, **given
     )
     with DrawProgress() as progress:
-        paths = render_run(arguments.run, request, notify=progress.note, progress=progress.show)
+        paths = render_run(arguments.run, request, notify=progress.print_note, progress=progress.show)
     print(*paths, sep="\n")
     return 0
 
 
-def _read_environment(arguments: argparse.Namespace) -> EnvironmentFile | None:
+def _read_environment_argument(arguments: argparse.Namespace) -> EnvironmentFile | None:
     given = {name: getattr(arguments, f"environment_{name}") for name in ("samples", "rotation", "scale", "unseen")}
     settings = {name: value for name, value in given.items() if value is not None}
     if arguments.environment is None:
@@ -111,7 +111,7 @@ def _read_environment(arguments: argparse.Namespace) -> EnvironmentFile | None:
     return EnvironmentFile(arguments.environment, **settings, guesses=guesses)
 
 
-def _parse_light_count(text: str) -> int:
+def _parse_light_count_argument(text: str) -> int:
     return int(parse_number(text, 1, 4096, "a whole number from 1 to 4096", whole=True))
 
 
@@ -126,7 +126,7 @@ def _parse_factor(text: str) -> float:
 RENDER_COMMAND = Command(
     "render",
     "draw images of a run",
-    _render,
+    _render_command,
     _add_render_arguments,
     _RENDER_CONDITIONS + RENDER_OVERRIDES_HELP,
     _take_render_words,
@@ -157,13 +157,13 @@ def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     levels = "extinctions of isosurfaces, 1/scene unit"
     parser.add_argument("--level", type=parse_numbers, default=[], metavar="S,...", help=levels)
     parser.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
-    parser.add_argument("--size", type=parse_size, metavar="WxH", help="pixels of the picture or window")
+    parser.add_argument("--size", type=parse_size_argument, metavar="WxH", help="pixels of the picture or window")
     out = ".png, .webp, .gif, .mp4, .html or .vdb (default: a window)"
     parser.add_argument("--out", type=Path, metavar="FILE", help=out)
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
-def _inspect(arguments: argparse.Namespace) -> int:
+def _inspect_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import print_notes
     from neuprim.inspect import ViewOptions, parse_inspection_box
     from neuprim.runs.inspect import InspectRequest, inspect_run
@@ -190,10 +190,10 @@ def _inspect(arguments: argparse.Namespace) -> int:
 INSPECT_COMMAND = Command(
     "inspect",
     "look inside a run's density",
-    _inspect,
+    _inspect_command,
     _add_inspect_arguments,
     _INSPECT_CONDITIONS,
-    take_conditions,
+    take_condition_arguments,
     opens_run=True,
 )
 
@@ -208,38 +208,38 @@ def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--host", metavar="ADDRESS", help=host)
 
 
-def _view(args: argparse.Namespace) -> int:
+def _view_command(args: argparse.Namespace) -> int:
     """Show the run until Ctrl-C."""
     from neuprim.cli.progress import LineProgress
     from neuprim.config.command_settings import LOOPBACK, ViewerSettings
     from neuprim.viewer.view import view_run
 
     settings = ViewerSettings(args.host or LOOPBACK, args.port)
-    _warn_of_open_host(settings)
+    _print_open_host_warning(settings)
     progress = LineProgress()
 
     def print_address(address: str) -> None:
         print(f"{address}\nopen it in a browser; Ctrl-C ends the viewer", flush=True)
 
     try:
-        view_run(args.run_dir, settings, print_address, progress.note, progress)
+        view_run(args.run_dir, settings, print_address, progress.print_note, progress)
     except KeyboardInterrupt:
         print("neuprim: the viewer is closed", file=sys.stderr)
     return 0
 
 
-def run_viewed(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
+def run_command_with_viewer(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
     """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
     from neuprim.runs.fit import Note
     from neuprim.runs.run import run
     from neuprim.viewer.live_training import LiveTraining
 
-    _warn_of_open_host(settings)
+    _print_open_host_warning(settings)
     with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:
         return run(config, live, live.between)
 
 
-def _warn_of_open_host(settings: ViewerSettings) -> None:
+def _print_open_host_warning(settings: ViewerSettings) -> None:
     from neuprim.config.command_settings import LOOPBACK
     from neuprim.viewer.server import is_loopback
 
@@ -262,7 +262,7 @@ def _parse_port(text: str) -> int:
 VIEW_COMMAND = Command(
     "view",
     "look at a run in the browser: turn it, play it, move its light, edit a camera path",
-    _view,
+    _view_command,
     _add_view_arguments,
     opens_run=True,
 )
@@ -280,22 +280,22 @@ def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _vdb_info(arguments: argparse.Namespace) -> int:
+def _vdb_info_command(arguments: argparse.Namespace) -> int:
     """Print a report on a file, or on every file of a folder."""
-    files, notes = _find_vdb_files(arguments.path)
+    files, notes = _find_vdb_command_files(arguments.path)
     if arguments.json:
-        record = {"files": [_describe_vdb_file(file) for file in files], "notes": notes}
+        record = {"files": [_describe_vdb_command_file(file) for file in files], "notes": notes}
         print(json.dumps(record, indent=1, allow_nan=False))
         return 0
     console = plain_console()
     for file in files:
-        _print_vdb_table(console, _describe_vdb_file(file))
+        _print_vdb_table(console, _describe_vdb_command_file(file))
     for note in notes:
         console.print(note)
     return 0
 
 
-def _find_vdb_files(path: Path) -> tuple[list[Path], list[str]]:
+def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return files, frames in their order, and notes on the folder."""
     if not path.is_dir():
         return [path], []
@@ -314,7 +314,7 @@ def _find_vdb_files(path: Path) -> tuple[list[Path], list[str]]:
     return [frame.path for frame in frames.frames], [note]
 
 
-def _describe_vdb_file(path: Path) -> dict[str, Any]:
+def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
     """Return JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
     from neuprim.core.io.vdb import read_grids, read_header
 
@@ -324,7 +324,7 @@ def _describe_vdb_file(path: Path) -> dict[str, Any]:
         "path": str(path),
         "version": header.version,
         "library": list(header.library),
-        "metadata": _grid_to_json(header.metadata),
+        "metadata": _vdb_command_to_json(header.metadata),
         "grids": [_describe_grid(entry, None if entry.undecodable() else next(grids)) for entry in header.grids],
     }
 
@@ -340,14 +340,14 @@ def _describe_grid(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
         "map": header.map,
         "transform": None if header.transform is None else header.transform.tolist(),
         "voxel_size": header.voxel_size,
-        "metadata": _grid_to_json(header.metadata),
+        "metadata": _vdb_command_to_json(header.metadata),
         "reason": header.refusal(),
     }
     if grid is None:
         return entry
     box = grid.world_bounds()
     return entry | {
-        "background": _grid_to_json(grid.background.ravel().tolist()),
+        "background": _vdb_command_to_json(grid.background.ravel().tolist()),
         "bounds": grid.bounds,
         "world_bounds": None if box is None else box.tolist(),
         "leaves": len(grid.values),
@@ -360,12 +360,12 @@ def _describe_grid(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
     }
 
 
-def _grid_to_json(value: Any) -> Any:
+def _vdb_command_to_json(value: Any) -> Any:
     """Plain values: JSON knows no bytes, tuples or NaN."""
     if isinstance(value, Mapping):
-        return {name: _grid_to_json(item) for name, item in value.items()}
+        return {name: _vdb_command_to_json(item) for name, item in value.items()}
     if isinstance(value, tuple | list):
-        return [_grid_to_json(item) for item in value]
+        return [_vdb_command_to_json(item) for item in value]
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
@@ -423,7 +423,7 @@ def _printable(text: str) -> str:
 VDB_COMMAND = Command(
     "vdb",
     "look into OpenVDB files",
-    _vdb_info,
+    _vdb_info_command,
     _add_vdb_arguments,
     "`info` lists grids: type, transform, bounds, active voxels, values, memory.",
 )

@@ -30,7 +30,7 @@ def train(console: Console) -> None:
 
 def draw(console: Console) -> None:
     with DrawProgress(console) as progress:
-        progress.note(ODD)
+        progress.print_note(ODD)
         progress.show(ODD, 0.5)
         progress.bar.refresh()
 

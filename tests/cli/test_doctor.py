@@ -20,7 +20,7 @@ def report() -> tuple[int, str]:
 
 
 def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_probe_backend", lambda name: None if name == "reference" else "no such luck")
+    monkeypatch.setattr(doctor, "_probe_doctor_backend", lambda name: None if name == "reference" else "no such luck")
     status, text = report()
     assert status == 0
     for word in (
@@ -40,7 +40,7 @@ def test_report(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_status_1_when_nothing_works(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_probe_backend", lambda name: "broken")
+    monkeypatch.setattr(doctor, "_probe_doctor_backend", lambda name: "broken")
     status, text = report()
     assert status == 1
     assert "no renderer backend works" in text
@@ -55,7 +55,7 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
         "skipped; sys_platform == 'none'",
     ]
     monkeypatch.setattr(metadata, "requires", lambda name: needs)
-    rows = dict(doctor._list_packages())
+    rows = dict(doctor._list_doctor_packages())
     assert "needs >=999: pip install 'numpy>=999'" in rows["numpy"]
     assert rows["not-there"] == "not installed: pip install 'not-there>=1'"
     assert rows["also-not"] == "not installed: pip install 'neuprim[colmap]'"
@@ -64,7 +64,7 @@ def test_what_is_missing_or_too_old_says_how_to_install(monkeypatch: pytest.Monk
 
 @pytest.mark.parametrize("backend", [backend.name for backend in backends.available_backends()])
 def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert doctor._probe_backend(backend) is None
+    assert doctor._probe_doctor_backend(backend) is None
     genuine = rendering.render_lowered
 
     def dimmer(*args: Any) -> Any:
@@ -72,15 +72,15 @@ def test_a_backend_that_is_a_thousandth_off_does_not_work(backend: str, monkeypa
         return replace(output, rgb=0.999 * output.rgb)
 
     monkeypatch.setattr(rendering, "render_lowered", dimmer)
-    reason = doctor._probe_backend(backend)
+    reason = doctor._probe_doctor_backend(backend)
     assert reason is not None and reason.startswith("drew 0.86")
 
 
 def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doctor, "_probe_backend", lambda name: None)
+    monkeypatch.setattr(doctor, "_probe_doctor_backend", lambda name: None)
     monkeypatch.setattr(device, "cuda_unavailable", lambda: "torch finds no CUDA device")
     assert (
-        dict(doctor._list_devices())["used by runs"] == "no: torch finds no CUDA device"
+        dict(doctor._list_doctor_devices())["used by runs"] == "no: torch finds no CUDA device"
         and "used by runs" in report()[1]
     )
     monkeypatch.setattr(device, "cuda_unavailable", lambda: None)
@@ -88,6 +88,6 @@ def test_it_says_whether_runs_use_a_card_and_why_not(monkeypatch: pytest.MonkeyP
         "card", lambda: pytest.fail("loaded"), missing=lambda: "pip install 'neuprim[cuda]'", devices=("cuda",)
     )
     monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[-1:]))
-    assert dict(doctor._list_devices())["used by runs"] == "no: pip install 'neuprim[cuda]'"
+    assert dict(doctor._list_doctor_devices())["used by runs"] == "no: pip install 'neuprim[cuda]'"
     monkeypatch.setattr(backends, "TABLE", (replace(row, missing=lambda: None), *backends.TABLE[-1:]))
-    assert dict(doctor._list_devices())["used by runs"] == "yes"
+    assert dict(doctor._list_doctor_devices())["used by runs"] == "yes"

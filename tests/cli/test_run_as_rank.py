@@ -11,7 +11,7 @@ import torch
 import torch.distributed as dist
 
 from neuprim.cli import main
-from neuprim.cli.run_commands import _compose_for_rank, _select_rank_gpu, run_as_rank
+from neuprim.cli.run_commands import _compose_rank_arguments, _select_rank_gpu, run_command_as_rank
 from neuprim.config import compose
 from neuprim.core.compute import threads
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError
@@ -31,10 +31,10 @@ def test_all_ranks_write_where_the_first_one_does(tmp_path: Path, monkeypatch: p
 
     def work(group: ProcessGroup) -> Path:
         if group.is_first:
-            config = _compose_for_rank(WORDS, False, group)
+            config = _compose_rank_arguments(WORDS, False, group)
             return config.output_dir
         (tmp_path / "outputs" / "static-solids-2").mkdir()
-        return _compose_for_rank(WORDS, False, group).output_dir
+        return _compose_rank_arguments(WORDS, False, group).output_dir
 
     places = results(run_ranks(2, work))
     assert places[0] == places[1]
@@ -49,12 +49,12 @@ def test_what_the_first_rank_refuses_the_others_do_not_repeat(
     monkeypatch.chdir(tmp_path)
     (tmp_path / "taken").mkdir()
     (tmp_path / "taken" / "file").touch()
-    first, second = run_ranks(2, lambda group: _compose_for_rank([*WORDS, *words.split()], False, group))
+    first, second = run_ranks(2, lambda group: _compose_rank_arguments([*WORDS, *words.split()], False, group))
     assert isinstance(first, ConfigError) and isinstance(second, RankError) and second.reported
 
 
 def test_one_run_alone_is_shared(tmp_path: Path) -> None:
-    first, _ = run_ranks(2, lambda group: _compose_for_rank(WORDS, True, group))
+    first, _ = run_ranks(2, lambda group: _compose_rank_arguments(WORDS, True, group))
     assert isinstance(first, ConfigError)
     assert str(first).startswith("2 processes of torchrun fit one scene together; expected neither -m, --config")
 
@@ -98,8 +98,13 @@ def test_cores_are_shared_out(
     found: list[int] = []
     monkeypatch.setattr(threads, "machine_cores", lambda: machine)
     monkeypatch.setattr(process_group, "ProcessGroup", _Lonely)
-    monkeypatch.setattr("neuprim.cli.run_commands._fit_as_rank", lambda *_: found.append(threads.core_count()))
-    assert run_as_rank(TorchrunRank(0, ranks, 0, ranks, ""), [*WORDS, f"output_dir={tmp_path / 'out'}"], False) == 0
+    monkeypatch.setattr(
+        "neuprim.cli.run_commands._fit_with_rank_progress", lambda *_: found.append(threads.core_count())
+    )
+    assert (
+        run_command_as_rank(TorchrunRank(0, ranks, 0, ranks, ""), [*WORDS, f"output_dir={tmp_path / 'out'}"], False)
+        == 0
+    )
     assert found == [own] and threads.core_count() == machine
 
 
@@ -110,9 +115,9 @@ def test_a_bug_keeps_its_traceback_and_names_the_rank(
         raise ZeroDivisionError("a bug")
 
     monkeypatch.setattr(process_group, "ProcessGroup", _Lonely)
-    monkeypatch.setattr("neuprim.cli.run_commands._fit_as_rank", broken)
+    monkeypatch.setattr("neuprim.cli.run_commands._fit_with_rank_progress", broken)
     with pytest.raises(ZeroDivisionError):
-        run_as_rank(TorchrunRank(0, 2, 0, 2, ""), [*WORDS, f"output_dir={tmp_path / 'out'}"], False)
+        run_command_as_rank(TorchrunRank(0, 2, 0, 2, ""), [*WORDS, f"output_dir={tmp_path / 'out'}"], False)
     assert "neuprim: rank 0 failed:" in capsys.readouterr().err
 
 

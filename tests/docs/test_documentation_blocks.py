@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from neuprim.cli import COMMANDS
-from neuprim.cli.command import split_render_overrides
-from neuprim.cli.measure_commands import is_override
+from neuprim.cli.command import split_override_arguments
+from neuprim.cli.measure_commands import is_override_argument
 from neuprim.config import compose, compose_all
 from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
 from neuprim.config.overrides import drop_output_overrides
@@ -179,12 +179,12 @@ def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     elif name == "bench":
         compose(["scene=blender", "scene.path=DIR", *settings], False)
         rest = flags
-    elif name == "tradeoff" and is_override(args.run_dir):
+    elif name == "tradeoff" and is_override_argument(args.run_dir):
         typed = [word for word in (args.run_dir, *settings) if not word.startswith("budget=")]
         compose(take_launcher_overrides(typed)[1], False)
         rest = flags
     elif name in ("eval", "render", "tradeoff"):
-        _, rest = split_render_overrides(rest)
+        _, rest = split_override_arguments(rest)
     if name in ("render", "inspect", "export"):
         given, rest = split_conditions(rest, conditions)
         known = {condition: text for condition, text in given.items() if not PLACEHOLDER.search(text)}

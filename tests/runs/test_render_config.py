@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuprim.cli import main
-from neuprim.cli.command import RENDER_OVERRIDE_HEADS, split_render_overrides
+from neuprim.cli.command import RENDER_OVERRIDE_HEADS, split_override_arguments
 from neuprim.core.checkpoint import save_model
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
@@ -65,7 +65,7 @@ def test_overrides_round_trip(model: Primitives, config: RunRendering) -> None:
     defaults = RenderSettings()
     words = config.to_overrides(defaults)
     assert parse_run_rendering(words, defaults, model) == config
-    assert split_render_overrides(["--time", "0.5", "--", *words, "x=1"]) == (list(words), ["--time", "0.5", "x=1"])
+    assert split_override_arguments(["--time", "0.5", "--", *words, "x=1"]) == (list(words), ["--time", "0.5", "x=1"])
 
 
 def test_the_command_line_knows_the_keys() -> None:

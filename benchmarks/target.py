@@ -33,7 +33,7 @@ from shared.arguments import make_parser, require_folders
 from shared.records import RESULTS, read_record, update_record
 from shared.tables import DOCS, Run, Table, between_markers, make_table
 
-from neuprim.config import ConfigWithTask, compose, load_config_task
+from neuprim.config import Job, compose, load_config_task
 from neuprim.config.command_settings import SearchTarget
 from neuprim.core.checkpoint import load_model, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
@@ -149,7 +149,7 @@ def train_grid(name: str, data: Sequence[str], work: Path) -> dict[str, Any]:
             out = work / f"{name}-grid-{size}{'-' if less else ''}{less.rpartition('.')[2]}"
             config = compose([*words_of(name, data, out), f"model.primitives={size}", *([less] if less else [])])
             task = load_config_task(config)
-            dataset = dataset or load_dataset(ConfigWithTask(config, task))
+            dataset = dataset or load_dataset(Job(config, task))
             every = choose_target_hold_out(dataset)
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
             model, _ = load_model(out / "model.safetensors", task)

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 
-from neuprim.config import ConfigWithTask, compose
+from neuprim.config import Job, compose
 from neuprim.core.used_settings import build_settings
 from neuprim.runs.open import load_dataset
 
@@ -107,7 +107,7 @@ _SMALL = {
 def count_parameters(form: Form, task: str) -> int:
     """Of one primitive of the task's preset, colour included."""
     config = compose([f"task={task}", *_SMALL[task], *form.words], check_output=False)
-    job = ConfigWithTask.of(config)
+    job = Job.of(config)
     spec = job.task
     # without points: some forms learn more from voxels
     data = replace(load_dataset(job), points=None)

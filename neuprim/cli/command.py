@@ -20,7 +20,7 @@ from neuprim.core.io.trust import FLAG
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from neuprim.config.overrides import ConfigArguments
+    from neuprim.config.overrides import CommandLine
     from neuprim.core.task import TaskSpec
 
 TakeRest = Callable[[argparse.Namespace, list[str], argparse.ArgumentParser], list[str]]
@@ -188,7 +188,7 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
         print("  ".join([f"{first:{widths[0]}}", *cells]).rstrip())
 
 
-def describe_interrupted_command(directory: Path, typed: ConfigArguments) -> str:
+def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
     """Return what an interrupted run has, and the command that continues it."""
     begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
     state = "has the run up to here" if begun else "has no checkpoint yet"

@@ -106,7 +106,7 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 def _bench_command(args: argparse.Namespace) -> int:
     """List the tables, or run what stands for their rows."""
     from neuprim.cli.run_commands import run_command_here
-    from neuprim.config.overrides import ConfigArguments
+    from neuprim.config.overrides import CommandLine
     from neuprim.runs.open import read_metrics
     from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
 
@@ -127,7 +127,7 @@ def _bench_command(args: argparse.Namespace) -> int:
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
-        results.append((one, read_metrics(run_command_here(one.config, ConfigArguments(one.config.overrides)))))
+        results.append((one, read_metrics(run_command_here(one.config, CommandLine(one.config.overrides)))))
         print(*_describe_bench_result(*results[-1]), sep="\n", flush=True)
     print(*_describe_paper_averages(results), _PAPER_RULES, sep="\n")
     return 0

@@ -19,7 +19,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.command_settings import LauncherSettings, SearchTarget, ViewerSettings
-    from neuprim.config.overrides import ConfigArguments
+    from neuprim.config.overrides import CommandLine
     from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
     from neuprim.runs.launch.jobs import JobResult
     from neuprim.search.target_record import TargetRecord
@@ -85,14 +85,14 @@ def _run_command(args: argparse.Namespace) -> int:
         take_target_overrides,
         take_viewer_overrides,
     )
-    from neuprim.config.overrides import ConfigArguments, drop_output_overrides
+    from neuprim.config.overrides import CommandLine, drop_output_overrides
     from neuprim.core.train.distributed.process_group import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
     place = read_torchrun_rank()
     if place is not None:
         return run_command_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
-    typed = ConfigArguments(args.overrides, args.config)
+    typed = CommandLine(args.overrides, args.config)
     viewer, overrides = take_viewer_overrides(args.overrides)
     launcher, overrides = take_launcher_overrides(overrides)
     wanted, overrides = take_target_overrides(overrides)
@@ -106,7 +106,7 @@ def _run_command(args: argparse.Namespace) -> int:
         from neuprim.runs.sweep import read_sweep_overrides
 
         overrides = read_sweep_overrides(overrides)
-        typed = ConfigArguments([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
+        typed = CommandLine([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
     stored = None if args.config is None else read_stored_config(args.config)
     check = not args.cfg
     configs = compose_all(overrides, check, stored) if args.multirun else [compose(overrides, check, stored)]
@@ -127,7 +127,7 @@ def _run_command(args: argparse.Namespace) -> int:
 
 def run_command_here(
     config: RunConfig,
-    typed: ConfigArguments,
+    typed: CommandLine,
     viewer: ViewerSettings | None = None,
     launcher: LauncherSettings | None = None,
 ) -> Path:
@@ -153,7 +153,7 @@ def run_command_here(
 
 
 def _run_command_with_target(
-    config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: ConfigArguments
+    config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: CommandLine
 ) -> int:
     """Search for a model that reaches a target; print what was achieved and the run's directory."""
     from neuprim.cli.progress import RunProgress
@@ -199,7 +199,7 @@ RUN_COMMAND = Command("run", "fit a scene", _run_command, _add_run_arguments, _r
 
 
 def run_command_with_launcher(
-    configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: ConfigArguments
+    configs: Sequence[RunConfig], overrides: list[str], settings: LauncherSettings, typed: CommandLine
 ) -> int:
     """Launch the runs of a sweep, or a single run in another process; return the exit status.
 
@@ -226,7 +226,7 @@ def run_command_with_launcher(
 
 
 def _report_launched_runs(
-    configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: ConfigArguments
+    configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
 ) -> int:
     """Print failures, and raise KeyboardInterrupt with the command that continues; return the exit status: 2 for bad
     input, 1 for a bug."""
@@ -402,12 +402,12 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
     """Train, and show it on rank 0."""
     from neuprim.cli.progress import RunProgress
-    from neuprim.config.overrides import ConfigArguments
+    from neuprim.config.overrides import CommandLine
     from neuprim.runs.fit import ignore_run_event
     from neuprim.runs.run import run
 
     ranks = f"--nproc-per-node {group.place.local_size}" if group.size == group.place.local_size else "…"
-    typed = ConfigArguments(overrides)
+    typed = CommandLine(overrides)
     try:
         if not group.is_first:
             with warnings.catch_warnings():

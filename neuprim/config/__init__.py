@@ -2,7 +2,7 @@
 
 from neuprim.config.compose import compose, compose_all, preset_settings
 from neuprim.config.job import (
-    ConfigWithTask,
+    Job,
     current_config_provenance,
     find_config_plugins,
     find_config_scene,
@@ -14,7 +14,7 @@ from neuprim.config.stored_run import read_stored_config
 from neuprim.config.task_files import check_config_groups, check_scene_config, list_task_presets, read_task_config
 
 __all__ = [
-    "ConfigWithTask",
+    "Job",
     "RunConfig",
     "RunSettings",
     "check_config_groups",

@@ -16,14 +16,14 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True)
-class ConfigWithTask:
+class Job:
     """A configuration with the task that its name stands for, looked up once and handed on together."""
 
     config: RunConfig
     task: TaskSpec
 
     @classmethod
-    def of(cls, config: RunConfig) -> ConfigWithTask:
+    def of(cls, config: RunConfig) -> Job:
         """Load the task of a configuration. Raises as :func:`load_config_task`."""
         return cls(config, load_config_task(config, config.source))
 

@@ -36,7 +36,7 @@ class Assignment:
 
 
 @dataclass(frozen=True)
-class ConfigArguments:
+class CommandLine:
     """The arguments of ``neuprim run``: overrides, and the file of ``--config``."""
 
     overrides: Sequence[str]

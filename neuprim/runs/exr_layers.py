@@ -26,7 +26,7 @@ from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import draw_task_layer
-from neuprim.runs.render_config import RunRendering
+from neuprim.runs.render_config import RenderConfig
 from neuprim.version import __version__
 
 _MOST_LIGHTS = 128
@@ -65,7 +65,7 @@ class RunExrLayers:
     run_dir: Path
     task: TaskSpec
     channels: Channels
-    point: RunRendering
+    point: RenderConfig
     background: Tensor
     names: str | None = None
     half: bool = False

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from neuprim.config import ConfigWithTask
+from neuprim.config import Job
 from neuprim.core import checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
@@ -34,7 +34,7 @@ _PACE_WARMUP, _PACE_STEPS = 5, 20
 
 
 def make_run_finetune_trainer(
-    job: ConfigWithTask,
+    job: Job,
     dataset: Dataset,
     model: Primitives,
     steps: int,
@@ -73,7 +73,7 @@ def make_run_finetune_trainer(
     return trainer
 
 
-def count_run_finetune_steps(seconds: float, job: ConfigWithTask, dataset: Dataset, model: Primitives) -> int:
+def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
     """How many steps of fine-tuning fit into some seconds, at the measured pace; none in 0 seconds."""
     if seconds <= 0:
         return 0

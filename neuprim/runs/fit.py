@@ -12,7 +12,7 @@ from typing import Any
 
 import torch
 
-from neuprim.config import ConfigWithTask, RunConfig, current_config_provenance, find_config_plugins
+from neuprim.config import Job, RunConfig, current_config_provenance, find_config_plugins
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -94,12 +94,12 @@ def ignore_run_event(event: Event) -> None:
 # ---------------------------------------------------------------- fit
 
 
-TrainerFactory = Callable[[ConfigWithTask, Dataset, Loss], Trainer]
+TrainerFactory = Callable[[Job, Dataset, Loss], Trainer]
 """(job, its data, its loss) -> the trainer of a model that is there already."""
 
 
 @dataclass(frozen=True)
-class Fitted(ConfigWithTask):
+class Fitted(Job):
     """A job with its data and the trainer of its model; after :func:`fit` at the end of the budget.
 
     Attributes:
@@ -176,9 +176,9 @@ def prepare_training(
     if make is None:
         refuse_chunks(config, "this trains one model at once, and only a whole run can be fitted in chunks")
     backends.check_render_backend(config.renderer)
-    task = ConfigWithTask.of(config).task
+    task = Job.of(config).task
     config = replace(config, made_by=current_config_provenance(config, task))
-    job = ConfigWithTask(config, task)
+    job = Job(config, task)
     # what the loss or the task refuses must not cost the loading of the data or a training
     loss = make_run_loss(job)
     lpips = None if config.metrics.lpips is None else Lpips.load(config.metrics.lpips)
@@ -254,7 +254,7 @@ def measure_run_curve_point(trainer: Trainer) -> float:
 # ---------------------------------------------------------------- parts of a training
 
 
-def make_run_loss(job: ConfigWithTask) -> Loss:
+def make_run_loss(job: Job) -> Loss:
     """Make the loss of a job: its task's own, or the one that ``train.loss`` names.
 
     Raises:
@@ -269,7 +269,7 @@ def make_run_loss(job: ConfigWithTask) -> Loss:
     return guard_loss(made, job.plugins.loss)
 
 
-def make_run_trainer(job: ConfigWithTask, dataset: Dataset, loss: Loss, group: ProcessGroup | None = None) -> Trainer:
+def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup | None = None) -> Trainer:
     """Make a fresh model of a job and its trainer.
 
     Args:
@@ -339,7 +339,7 @@ def use_one_torch_thread_for_run() -> Iterator[None]:
 
 def is_chunked(config: RunConfig) -> bool:
     """Whether a scene is to be fitted in chunks; scenes without chunks may use the setting for something else."""
-    return config.scene.get("chunks") not in (None, 1) and ConfigWithTask.of(config).scene.spec.chunks is not None
+    return config.scene.get("chunks") not in (None, 1) and Job.of(config).scene.spec.chunks is not None
 
 
 def refuse_chunks(config: RunConfig, reason: str) -> None:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Any
 
-from neuprim.config import ConfigWithTask, RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.data.dataset import DatasetImages
 from neuprim.core.errors import DataError, NeuprimError
@@ -35,7 +35,7 @@ def load_run_ground_truth(
     Raises:
         NeuprimError: files or settings that the scene refuses, or its loader crashed.
     """
-    job = ConfigWithTask.of(config)
+    job = Job.of(config)
     make = job.scene.spec.truth
     if make is None:
         return None

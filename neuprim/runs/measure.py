@@ -21,7 +21,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.config import ConfigWithTask
+from neuprim.config import Job
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
@@ -216,7 +216,7 @@ def evaluate_run(
 
 
 def summarize_metrics(
-    job: ConfigWithTask,
+    job: Job,
     dataset: Dataset,
     model: Primitives,
     views: Sequence[ViewMetrics],

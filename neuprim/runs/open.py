@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import ConfigWithTask, RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.config.stored_run import refuse_untrusted_run_links, refuse_untrusted_settings
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model
@@ -41,7 +41,7 @@ def ignore_progress(text: str, fraction: float) -> None:
 
 
 @dataclass(frozen=True)
-class StoredRun(ConfigWithTask):
+class StoredRun(Job):
     """A finished run in a directory. ``task`` reads positions in the coordinates of the data's files.
 
     Attributes:
@@ -83,7 +83,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     config = RunConfig.from_yaml(run / "config.yaml")
     if not named:
         config = replace(config, source=None)
-    task = ConfigWithTask.of(config).task
+    task = Job.of(config).task
     warn_of_other_neuprim(config.made_by, config.source)
     model, header = load_model(model_file(run), task)
     config = replace(config, renderer=with_available_render_backend(config.renderer))
@@ -104,7 +104,7 @@ def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContex
     return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
 
 
-def load_dataset(job: ConfigWithTask, progress: Progress = ignore_progress) -> Dataset:
+def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
     """Load the data set of a job. That of a stored run lies as it did for the model, whatever was added to its files.
 
     Raises:

@@ -119,7 +119,7 @@ def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives, s
 
 
 @dataclass(frozen=True)
-class RunRendering:
+class RenderConfig:
     """How to draw a model.
 
     Attributes:
@@ -189,7 +189,7 @@ class RunRendering:
         return self.upsample(frame.rgb.cpu(), view.camera)
 
 
-def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, model: Primitives) -> RunRendering:
+def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, model: Primitives) -> RenderConfig:
     """Parse overrides of the rendering of a model, over default settings.
 
     Raises:
@@ -221,7 +221,7 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
     backends.check_backend_name(settings.backend)
     backends.check_backend_device(settings)
-    return RunRendering(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
+    return RenderConfig(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
 
 
 def _check_run_storage_format(group: str, name: Any) -> str:

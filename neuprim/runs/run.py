@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import ConfigWithTask, RunConfig, find_config_plugins
+from neuprim.config import Job, RunConfig, find_config_plugins
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_output_overrides, quote_override
 from neuprim.core.checkpoint import load_model
@@ -118,7 +118,7 @@ class ChunkPlan:
 
 def _load_chunks(config: RunConfig, events: Events) -> Chunks | None:
     """How the scene of a configuration is fitted in chunks; None for in one. Raises NeuprimError."""
-    job = ConfigWithTask.of(config)
+    job = Job.of(config)
     load = job.scene.spec.chunks
     assert load is not None, "the caller asked for chunks"
     context = make_run_scene_context(config, lambda text, fraction: events(Preparing(text, fraction)))
@@ -222,7 +222,7 @@ def train_in_chunks(
     record = record.resume(read_chunk_record(config.output_dir) if config.resume else None, more=False)
     record = _fit_chunks(plan, record, events, launcher)
 
-    def make(job: ConfigWithTask, dataset: Dataset, loss: Loss) -> Trainer:
+    def make(job: Job, dataset: Dataset, loss: Loss) -> Trainer:
         models = [load_model(model_file(own.output_dir), job.task)[0] for own in plan.configs]
         with attribute_errors(job.plugins.scene, "join"):
             model = plan.chunks.join(models)

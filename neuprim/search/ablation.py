@@ -18,7 +18,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import ConfigWithTask, RunConfig, compose, find_config_plugins, load_config_task
+from neuprim.config import Job, RunConfig, compose, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse_overrides, quote_override
@@ -32,7 +32,7 @@ from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.runs.launch.launcher import use_launcher_threads_for_runs
 from neuprim.runs.open import load_dataset
-from neuprim.runs.render_config import RunRendering
+from neuprim.runs.render_config import RenderConfig
 from neuprim.runs.run_directory import lock_run_directory
 from neuprim.search.ablation_plan import (
     CENTRE,
@@ -108,7 +108,7 @@ def run_ablation(
         stack.enter_context(lock_run_directory(folder, "set"))
         plan = None if before is None else _parse_ablation_plan(folder / TRADEOFF_FILE, before)
         render_ground_truth_before_run(centre, launcher, progress)
-        dataset = load_dataset(ConfigWithTask(centre, task), progress)
+        dataset = load_dataset(Job(centre, task), progress)
         check_dataset_views(dataset, task.conditions)
         views = choose_trial_views(dataset, request.views)
         if not views:
@@ -295,7 +295,7 @@ class _AblationSession(TradeoffSession):
             self._setups[run_dir] = load_tradeoff_setup(path, (), views, self.request.lpips, self._loaded)
         return self._setups[run_dir]
 
-    def point_setup(self, number: int) -> tuple[TradeoffSetup, RunRendering]:
+    def point_setup(self, number: int) -> tuple[TradeoffSetup, RenderConfig]:
         setup = self._setup(self.record.points[number].run_dir)
         return setup, setup.reference
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from neuprim.config import ConfigWithTask
+from neuprim.config import Job
 from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
 from neuprim.core.data.dataset_check import check_dataset_views
@@ -158,7 +158,7 @@ def _search_quantized_model(
 ) -> QuantizedModel:
     steps = request.steps
     if steps is None:
-        steps = count_run_finetune_steps(request.seconds, ConfigWithTask(data.config, data.task), data.dataset, model)
+        steps = count_run_finetune_steps(request.seconds, Job(data.config, data.task), data.dataset, model)
     if request.by_level:
         return finetune_for_table(data, model, table, steps, progress)
     tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from neuprim.config import ConfigWithTask, RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.core.channels import find_channels
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -220,7 +220,7 @@ class ModelShrinker:
         """Return the state after a round of fine-tuning."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
-            trainer = make_run_finetune_trainer(ConfigWithTask(self.config, self.task), self.dataset, model, steps)
+            trainer = make_run_finetune_trainer(Job(self.config, self.task), self.dataset, model, steps)
             trainer.zero_masks, left = mask_pruned_numbers(trainer.model), state.numbers
             for done in range(steps):
                 trainer.train_step()
@@ -303,7 +303,7 @@ def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction:
             dataset = replace(dataset, train=hold_out_views(dataset, request.hold_out).train)
         begun, steps = time.monotonic(), request.steps
         if steps is None:
-            steps = count_run_finetune_steps(request.seconds, ConfigWithTask(config, task), dataset, model)
+            steps = count_run_finetune_steps(request.seconds, Job(config, task), dataset, model)
         shrinker = ModelShrinker(config, task, dataset, request.tolerance, steps, progress)
         small, words = shrinker.shrink(model)
         seconds = time.monotonic() - begun
@@ -355,8 +355,6 @@ def _fit_pruned(
         overrides=[*(word for word in config.overrides if not word.startswith(replaced)), *own],
     )
     settings = drop_unused_run_rates(config.train, task, model)
-    trainer = Trainer(
-        model, dataset, make_run_loss(ConfigWithTask(config, task)), settings, config.renderer, config.seed
-    )
+    trainer = Trainer(model, dataset, make_run_loss(Job(config, task)), settings, config.renderer, config.seed)
     trainer.zero_masks = mask_pruned_numbers(trainer.model)
     return Fitted(config, task, dataset, find_channels(task, dataset), trainer)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from copy import copy
 from typing import NamedTuple
 
-from neuprim.config import ConfigWithTask, RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.core.compression import (
     BitTable,
     Quantizers,
@@ -175,7 +175,7 @@ def _tolerated_error_share(decibels: float) -> float:
 
 def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
     """Train a canonical model, rendering every image from quantized numbers."""
-    trainer = make_run_finetune_trainer(ConfigWithTask(data.config, data.task), data.dataset, model, steps)
+    trainer = make_run_finetune_trainer(Job(data.config, data.task), data.dataset, model, steps)
     trainer.zero_masks = mask_pruned_numbers(trainer.model)
     on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}
     trainer.fake_quantize = lambda params: fake_quantize(params, on_device)

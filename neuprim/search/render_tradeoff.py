@@ -20,7 +20,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.runs.fit import use_one_torch_thread_for_run
-from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RunRendering
+from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
 from neuprim.search.pareto import ParetoStep, combine_pareto_steps
 from neuprim.search.tradeoff_measuring import (
     ExactTradeoffImages,
@@ -67,7 +67,7 @@ _VALUES: dict[str, tuple[Any, ...]] = {
 """Settings of the renderer and their values."""
 
 
-def list_render_knobs(reference: RunRendering, model: Primitives) -> dict[str, list[RunRendering]]:
+def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
     """Return knob -> the configurations that change it alone; reductions of fields are density.NAME and colour.NAME."""
     cores, compared = core_count(), [name for name in backends.backend_names() if name != backends.REFERENCE]
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
@@ -134,7 +134,7 @@ class _RenderTradeoffSession(TradeoffSession):
         super().__init__(folder, request, record, progress)
         self.setup = setup
 
-    def point_setup(self, number: int) -> tuple[TradeoffSetup, RunRendering]:
+    def point_setup(self, number: int) -> tuple[TradeoffSetup, RenderConfig]:
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     @cached_property
@@ -143,7 +143,7 @@ class _RenderTradeoffSession(TradeoffSession):
         self.progress("exact images", 0.0)
         return self.render_exact(self.setup, _EXACT)
 
-    def single_changes(self, knobs: Mapping[str, list[RunRendering]]) -> Iterator[tuple[str, RunRendering]]:
+    def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
         """Yield what can be drawn here and differs; the record says what is left out."""
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
@@ -154,7 +154,7 @@ class _RenderTradeoffSession(TradeoffSession):
                 elif name != "backend" or self.setup.backend(config).name != base:
                     yield name, config
 
-    def measure(self, wanted: Sequence[tuple[str, RunRendering]], part: float) -> None:
+    def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
         """Measure images and bytes of the configurations that the record lacks."""
         for number, (knob, config) in enumerate(wanted):
             words, points = self.setup.overrides(config), self.record.points
@@ -179,7 +179,7 @@ class _RenderTradeoffSession(TradeoffSession):
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 
-    def combinations(self) -> list[RunRendering]:
+    def combinations(self) -> list[RenderConfig]:
         """Return earlier and new combinations of single changes, for time and for bytes."""
         base, *others = self.record.points
         faster, smaller, known = [], [], []

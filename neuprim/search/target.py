@@ -16,7 +16,7 @@ from typing import Any
 
 import torch
 
-from neuprim.config import ConfigWithTask, RunConfig, find_config_plugins, load_config_task
+from neuprim.config import Job, RunConfig, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings, SearchTarget
 from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
 from neuprim.core.compression import Quantizers
@@ -84,7 +84,7 @@ def run_target(
             events(Preparing(text, fraction))
 
         render_ground_truth_before_run(config, launcher, show_progress)
-        dataset = load_dataset(ConfigWithTask(config, task), show_progress)
+        dataset = load_dataset(Job(config, task), show_progress)
         check_dataset_views(dataset, task.conditions)
         record.hold_out = choose_target_hold_out(dataset)
         loaded = clock()

@@ -27,7 +27,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.report.tradeoff_page import TradeoffPicture, write_tradeoff_page
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
-from neuprim.runs.render_config import RunRendering, estimate_run_file_bytes, parse_run_rendering
+from neuprim.runs.render_config import RenderConfig, estimate_run_file_bytes, parse_run_rendering
 from neuprim.search.model_quality import EvalView, choose_trial_views, fill_masked
 from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord, write_tradeoff_csv
 from neuprim.version import __version__
@@ -52,20 +52,20 @@ class TradeoffSetup:
     model: Primitives
     dataset: Dataset
     channels: Channels
-    reference: RunRendering
+    reference: RenderConfig
     views: list[EvalView]
     file: Path
     lpips: Lpips | None = None
     _prepared: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
-    def overrides(self, config: RunRendering) -> tuple[str, ...]:
+    def overrides(self, config: RenderConfig) -> tuple[str, ...]:
         """Return what reproduces a configuration with ``neuprim render``."""
         return config.to_overrides(self.config.renderer)
 
-    def parse(self, overrides: Sequence[str]) -> RunRendering:
+    def parse(self, overrides: Sequence[str]) -> RenderConfig:
         return parse_run_rendering(overrides, self.config.renderer, self.model)
 
-    def prepare_model(self, config: RunRendering) -> Primitives:
+    def prepare_model(self, config: RenderConfig) -> Primitives:
         """Return the model as a configuration draws it, on its device; recent ones are cached."""
         changes = (tuple(config.reduced.items()), tuple(config.storage.items()))
         key = (*changes, config.settings.backend, config.settings.device)
@@ -77,13 +77,13 @@ class TradeoffSetup:
             self._prepared[key] = model
         return self._prepared[key]
 
-    def backend(self, config: RunRendering) -> backends.Backend:
+    def backend(self, config: RenderConfig) -> backends.Backend:
         """Return the backend that draws a configuration."""
         model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
         lowered = model.lower(view.camera, view.conditions, shaded=False)
         return backends.choose_backend(lowered, config.settings, view.camera)
 
-    def unsupported(self, config: RunRendering) -> str | None:
+    def unsupported(self, config: RenderConfig) -> str | None:
         """Return why a configuration cannot be drawn here; None if it can."""
         try:
             backends.check_backend_device(config.settings)
@@ -92,7 +92,7 @@ class TradeoffSetup:
             return str(error)
         return None
 
-    def renderer(self, config: RunRendering) -> Renderer:
+    def renderer(self, config: RenderConfig) -> Renderer:
         """Return what draws views of a configuration, with its model prepared."""
         model = self.prepare_model(config)
         return lambda view: config.render_view(model, view, self.dataset.background)
@@ -200,7 +200,7 @@ def render_exact_for_tradeoff(setup: TradeoffSetup, allowed: float, float64: boo
         float64: whether to use the reference backend, where that is decided already.
     """
     settings = replace(setup.reference.settings, alpha_min=0.0, transmittance_min=0.0)
-    oracle = RunRendering(replace(settings, backend=backends.REFERENCE, device="auto"))
+    oracle = RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
     model, view, background = setup.model, setup.views[0].view, setup.dataset.background.double()
     params = {name: value.detach().double() for name, value in model.params.items()}
     double = Primitives(model.density, model.colour, params)
@@ -215,7 +215,7 @@ def render_exact_for_tradeoff(setup: TradeoffSetup, allowed: float, float64: boo
     if float64 or (float64 is None and expected * len(setup.views) <= allowed):
         images = [oracle.render_view(double, v.view, background) for v in setup.views]
         return ExactTradeoffImages(images, True, None, size)
-    draw = setup.renderer(RunRendering(settings))
+    draw = setup.renderer(RenderConfig(settings))
     images = [draw(v.view).double() for v in setup.views]
     return ExactTradeoffImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size)
 
@@ -223,7 +223,7 @@ def render_exact_for_tradeoff(setup: TradeoffSetup, allowed: float, float64: boo
 # ---------------------------------------------------------------- one point
 
 
-def measure_point(setup: TradeoffSetup, knob: str, config: RunRendering, exact: ExactTradeoffImages) -> TradeoffPoint:
+def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig, exact: ExactTradeoffImages) -> TradeoffPoint:
     """Measure images and size of a configuration.
 
     Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
@@ -343,7 +343,7 @@ class TradeoffSession:
         self.folder, self.request, self.record, self.progress = folder, request, record, progress
         self.begun = time.monotonic()
 
-    def point_setup(self, number: int) -> tuple[TradeoffSetup, RunRendering]:
+    def point_setup(self, number: int) -> tuple[TradeoffSetup, RenderConfig]:
         """Return the setup of a point's model, and the configuration that draws the point."""
         raise NotImplementedError
 

@@ -16,7 +16,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from neuprim.config import ConfigWithTask, RunConfig, current_config_provenance, find_config_plugins, load_config_task
+from neuprim.config import Job, RunConfig, current_config_provenance, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.run_config import flatten
 from neuprim.core.data import Dataset
@@ -184,7 +184,7 @@ def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outc
     key = json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True)
     if key not in _trial_datasets:
         _trial_datasets.clear()
-        _trial_datasets[key] = load_dataset(ConfigWithTask.of(config), lambda text, part: events(Preparing(text, part)))
+        _trial_datasets[key] = load_dataset(Job.of(config), lambda text, part: events(Preparing(text, part)))
     return run_trial(Trial(config, data["hold_out"], data["views"]), _trial_datasets[key], events)
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from neuprim.core.errors import NeuprimError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.runs.render_config import RunRendering, parse_run_rendering
+from neuprim.runs.render_config import RenderConfig, parse_run_rendering
 from neuprim.search.tradeoff_record import TRADEOFF_FILE, TRADEOFF_FOLDER, read_tradeoff_record
 
 SMOOTH_SECONDS = 0.05  # that an image may take while the camera moves
@@ -47,7 +47,7 @@ class QualityLevel:
         pace: measured seconds per pixel of the window; None before the first image.
     """
 
-    config: RunRendering
+    config: RenderConfig
     ratio: float
     pace: float | None = None
 

@@ -17,7 +17,7 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.runs.open import load_dataset, load_run
-from neuprim.runs.render_config import RunRendering
+from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.controls import ConditionControls, PrimitiveControls, RenderControls, ViewControls
 from neuprim.viewer.quality import read_viewer_front
 from neuprim.viewer.render_queue import RenderQueue
@@ -159,7 +159,7 @@ def view_run(
     queue, scene = RenderQueue(), open_viewer_scene(run_dir, warn, progress)
     progress("preparing the renderer", 0.0)  # the first image compiles kernels, once per installation
     start = scene.start_view()
-    scene.draw(Viewpoint(start.camera.resized(32, 32), start.conditions), RunRendering(scene.settings))
+    scene.draw(Viewpoint(start.camera.resized(32, 32), start.conditions), RenderConfig(scene.settings))
     server = ViewerServer(settings, scene.name)
     try:
         SessionManager(server, scene, queue)

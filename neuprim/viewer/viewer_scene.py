@@ -24,7 +24,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.inspect.layers import colormap_bytes
 from neuprim.runs.measure import render_image
 from neuprim.runs.open import move_to_render_device
-from neuprim.runs.render_config import RunRendering
+from neuprim.runs.render_config import RenderConfig
 from neuprim.viewer.quality import Front
 from neuprim.webpage import PageView
 from neuprim.webpage.scene_page import held_out_webpage_views, initial_webpage_conditions
@@ -71,7 +71,7 @@ def list_viewer_quantities(channels: Channels) -> list[str]:
 
 
 def draw_viewer_picture(
-    model: Primitives, viewpoint: Viewpoint, config: RunRendering, background: Tensor, channels: Channels
+    model: Primitives, viewpoint: Viewpoint, config: RenderConfig, background: Tensor, channels: Channels
 ) -> Picture:
     """Draw a model that the render configuration was applied to.
 
@@ -149,7 +149,7 @@ class ViewerScene:
     front: Front = ()
     _cache: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
-    def prepare_model(self, config: RunRendering, view: View) -> Primitives:
+    def prepare_model(self, config: RenderConfig, view: View) -> Primitives:
         """Return the model with a render configuration applied, on its device; a few are cached."""
         model = self.model()
         if not config.reduced and not config.storage and model.device.type != "cpu":
@@ -162,7 +162,7 @@ class ViewerScene:
             self._cache[key] = move_to_render_device(config.prepare_model(model), config.settings, view)
         return self._cache[key]
 
-    def draw(self, viewpoint: Viewpoint, config: RunRendering) -> Picture:
+    def draw(self, viewpoint: Viewpoint, config: RenderConfig) -> Picture:
         """Draw the current model; see :func:`draw_viewer_picture`."""
         model = self.prepare_model(config, View("", viewpoint.camera, viewpoint.conditions))
         return draw_viewer_picture(model, viewpoint, config, self.background, self.channels)
@@ -182,7 +182,7 @@ class ViewerScene:
         index = self._view_indices()[name]
         view, pixels = self.dataset.test.view(index), self.dataset.test.pixels(index)
         truth = pixels.over(self.dataset.background)
-        model = self.prepare_model(RunRendering(self.settings), view)
+        model = self.prepare_model(RenderConfig(self.settings), view)
         drawn = render_image(model, view, self.settings, self.dataset.background)
         images = [np.asarray(to_uint8(self.channels.display(image)).numpy()) for image in (truth, drawn)]
         return ViewComparison(images[0], images[1], psnr(drawn, truth, pixels.mask))

@@ -12,7 +12,7 @@ import torch
 import neuprim
 from neuprim.cli import main
 from neuprim.cli.model_commands import print_export_report
-from neuprim.config import ConfigWithTask, RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.extensions import ExportReport
@@ -40,7 +40,7 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
 
     def load_run(run_dir: Path) -> Any:
         """A run without a model."""
-        return SimpleNamespace(directory=run_dir, task=ConfigWithTask.of(RunConfig.from_yaml(run_dir)).task)
+        return SimpleNamespace(directory=run_dir, task=Job.of(RunConfig.from_yaml(run_dir)).task)
 
     def render_run(run: Any, request: Any, **callbacks: Any) -> list[Path]:
         made.append((getattr(run, "directory", run), request))

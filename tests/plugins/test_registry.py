@@ -12,7 +12,7 @@ import pytest
 
 from neuprim import __version__
 from neuprim.cli import main
-from neuprim.config import ConfigWithTask, RunConfig, compose, compose_all
+from neuprim.config import Job, RunConfig, compose, compose_all
 from neuprim.core.errors import ConfigError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.plugins.registry import (
@@ -81,7 +81,7 @@ def test_a_scene_and_a_loss_of_other_packages_make_a_run(
     assert '"mse"' in (tmp_path / "r" / "metrics.jsonl").read_text()
     again = RunConfig.from_yaml(tmp_path / "r")
     assert (again.scene, again.train.loss) == ({"wobble": 2.0}, "extra")
-    assert load_dataset(ConfigWithTask(again, load_task("static"))).name == "two"
+    assert load_dataset(Job(again, load_task("static"))).name == "two"
     assert evaluate_run(tmp_path / "r")["psnr"] > 5
 
 

@@ -25,7 +25,7 @@ from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.plugins.returns import ReturnError
 from neuprim.runs.exr_layers import RunExrLayers
 from neuprim.runs.measure import render_light_sum
-from neuprim.runs.render_config import RunRendering
+from neuprim.runs.render_config import RenderConfig
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.tasks.relight.colour import LightNetwork
@@ -49,7 +49,7 @@ VIEW = View("a view", CAMERA, {"time": torch.tensor(0.4)})
 
 def layers(space: str = "linear", **changes: Any) -> RunExrLayers:
     return replace(
-        RunExrLayers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RunRendering(), BLUE), **changes
+        RunExrLayers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RenderConfig(), BLUE), **changes
     )
 
 
@@ -154,7 +154,7 @@ def test_a_layer_that_the_model_lacks_is_left_out_or_refused_by_name(tmp_path: P
 
 
 def test_a_lower_resolution_keeps_means_at_silhouettes(tmp_path: Path) -> None:
-    found, _ = written(tmp_path / "a.exr", layers(point=RunRendering(resolution=0.5)), volume(), VIEW)
+    found, _ = written(tmp_path / "a.exr", layers(point=RenderConfig(resolution=0.5)), volume(), VIEW)
     assert found["depth.Z"].shape == (16, 20)
     seen = found["depth.Z"][found["A"] > 0]
     small = drawn(volume(), replace(VIEW, camera=CAMERA.resized(10, 8))).depth

@@ -22,7 +22,7 @@ from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import (
     GROUPS,
     HEADS,
-    RunRendering,
+    RenderConfig,
     estimate_run_file_bytes,
     parse_run_rendering,
     run_storage_bytes,
@@ -41,7 +41,7 @@ def model(run_dir: Path) -> Primitives:
 
 
 CONFIGS = st.builds(
-    RunRendering,
+    RenderConfig,
     st.builds(
         RenderSettings,
         backend=st.sampled_from(("auto", "cpu", "reference")),
@@ -61,7 +61,7 @@ CONFIGS = st.builds(
 
 
 @given(CONFIGS)
-def test_overrides_round_trip(model: Primitives, config: RunRendering) -> None:
+def test_overrides_round_trip(model: Primitives, config: RenderConfig) -> None:
     defaults = RenderSettings()
     words = config.to_overrides(defaults)
     assert parse_run_rendering(words, defaults, model) == config
@@ -140,7 +140,7 @@ def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, t
     assert main(["render", str(run_dir), "--camera", "test", "--format", "npy", "--out", str(out), *words]) == 0
     assert np.array_equal(np.load(sorted(out.iterdir())[1]), image.numpy())
     small = replace(view, camera=view.camera.resized(12, 12))
-    half = RunRendering(run_config.renderer, 0.5).render_view(model, view, dataset.background)
+    half = RenderConfig(run_config.renderer, 0.5).render_view(model, view, dataset.background)
     plain = render_image(model, small, run_config.renderer, dataset.background).permute(2, 0, 1)[None]
     expected = torch.nn.functional.interpolate(plain, (24, 24), mode="bilinear")[0].permute(1, 2, 0)
     assert torch.equal(half, expected)

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from neuprim.config import ConfigWithTask
+from neuprim.config import Job
 from neuprim.core.compression import Quantizers, bit_table, canonical_model, fit_quantizers
 from neuprim.core.compression.quantizers import ColumnQuantizer
 from neuprim.core.data import Dataset
@@ -42,7 +42,7 @@ def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(ru
     stored = load_run(run_dir)
     config, task, model = stored.config, stored.task, stored.model
     assert 40 / LONG * START < LEAST_START
-    trainer = make_run_finetune_trainer(ConfigWithTask(config, task), dataset, model, 40)
+    trainer = make_run_finetune_trainer(Job(config, task), dataset, model, 40)
     spec = next(s for s in model.specs if s.name == "b2")
     usual = config.train.rates.get("b2", spec.lr) * config.train.final_rate
     assert trainer.rates()["b2"] == pytest.approx(LEAST_START * usual, rel=1e-6)
@@ -56,9 +56,9 @@ def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(ru
         (3 * LONG, START),
         (2 * LONG // 3, 2 * START / 3),
     ):  # of many steps they begin higher
-        assert make_run_finetune_trainer(ConfigWithTask(config, task), dataset, model, steps).rates()[
-            "b2"
-        ] == pytest.approx(start * usual, rel=1e-3)
+        assert make_run_finetune_trainer(Job(config, task), dataset, model, steps).rates()["b2"] == pytest.approx(
+            start * usual, rel=1e-3
+        )
 
 
 def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_dir: Path, dataset: Dataset) -> None:
@@ -68,7 +68,7 @@ def test_the_model_itself_stays_as_it_is_and_no_primitive_is_born_or_moved(run_d
     eager = replace(
         config, train=replace(config.train, population=replace(config.train.population, every=1, start=0.0, stop=1.0))
     )
-    trainer = make_run_finetune_trainer(ConfigWithTask(eager, task), dataset, model, 30)
+    trainer = make_run_finetune_trainer(Job(eager, task), dataset, model, 30)
     changes = [trainer.train_step().change for _ in range(30)]
     assert set(changes) == {None} and trainer.model.count == model.count
     assert all(torch.equal(model.params[name], value) for name, value in before.items())
@@ -83,14 +83,14 @@ def test_what_is_to_stay_zero_does_and_nothing_else(run_dir: Path, dataset: Data
     pruned = Primitives(
         model.density, model.colour, {**model.params, "sh_rest": model.params["sh_rest"].masked_fill(zero, 0.0)}
     )
-    trainer = make_run_finetune_trainer(ConfigWithTask(config, task), dataset, pruned, 20)
+    trainer = make_run_finetune_trainer(Job(config, task), dataset, pruned, 20)
     trainer.zero_masks = {"sh_rest": zero}
     for _ in range(20):
         trainer.train_step()
     after = trainer.model.params["sh_rest"].detach()
     assert bool((after[zero] == 0).all()) and not torch.equal(after[~zero], pruned.params["sh_rest"][~zero])
     tensors, header = trainer.state()
-    again = make_run_finetune_trainer(ConfigWithTask(config, task), dataset, pruned, 20)
+    again = make_run_finetune_trainer(Job(config, task), dataset, pruned, 20)
     again.load_state(tensors, header, "state")
     assert torch.equal(again.zero_masks["sh_rest"], zero)
 

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.config import ConfigWithTask, RunConfig, compose
+from neuprim.config import Job, RunConfig, compose
 from neuprim.config.command_settings import LauncherSettings, SearchTarget
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.runs.fit import Event, Note, Step
@@ -147,7 +147,7 @@ def test_an_interrupted_search_ends_like_one_that_was_not_and_test_views_decide_
 
 def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked, clock = list[int](), Clock()
-    dataset = load_dataset(ConfigWithTask(config(tmp_path / "run"), TASK))
+    dataset = load_dataset(Job(config(tmp_path / "run"), TASK))
 
     def launch(trials: list[Trial], settings: LauncherSettings, folder: Path, progress: Any) -> list[JobResult]:
         asked.append(len(trials))

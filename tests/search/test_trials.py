@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 import neuprim.runs.fit as fitting
-from neuprim.config import ConfigWithTask, RunConfig, compose
+from neuprim.config import Job, RunConfig, compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import write_json
@@ -99,7 +99,7 @@ def test_other_views_are_measured_and_not_trained_for(scene: Path, tmp_path: Pat
 
 def test_views_that_judge_are_not_learned_from(scene: Path, tmp_path: Path) -> None:
     config = config_of(scene, tmp_path / "t")
-    whole = load_dataset(ConfigWithTask(config, TASK))
+    whole = load_dataset(Job(config, TASK))
     learned = set[str]()
 
     def hear(event: Event) -> None:

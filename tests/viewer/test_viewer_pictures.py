@@ -24,7 +24,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.runs.measure import render_image
 from neuprim.runs.open import load_run
-from neuprim.runs.render_config import RunRendering, parse_run_rendering
+from neuprim.runs.render_config import RenderConfig, parse_run_rendering
 from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
@@ -69,7 +69,7 @@ def view_at(shows: str = COLOUR) -> Viewpoint:
 
 
 def test_colour_is_what_a_render_draws(model: Primitives) -> None:
-    picture = draw_viewer_picture(model, view_at(), RunRendering(SETTINGS), WHITE, RGB)
+    picture = draw_viewer_picture(model, view_at(), RenderConfig(SETTINGS), WHITE, RGB)
     expected = to_uint8(RGB.display(render_image(model, View("", view_at().camera), SETTINGS, WHITE))).numpy()
     assert picture.image.shape == (30, 40, 3) and picture.image.std() > 10 and picture.seconds > 0
     assert np.array_equal(picture.image, expected) and picture.caption == ""
@@ -77,7 +77,7 @@ def test_colour_is_what_a_render_draws(model: Primitives) -> None:
 
 def test_alpha_depth_and_single_channels(model: Primitives) -> None:
     assert list_viewer_quantities(RGB) == [COLOUR, ALPHA, DEPTH, "channel R", "channel G", "channel B"]
-    point = RunRendering(SETTINGS)
+    point = RenderConfig(SETTINGS)
     alpha = draw_viewer_picture(model, view_at(ALPHA), point, WHITE, RGB).image
     assert (alpha[..., 0] == alpha[..., 2]).all() and alpha.max() > 200 and alpha[0, 0].max() == 0
     depth = draw_viewer_picture(model, view_at(DEPTH), point, WHITE, RGB)
@@ -93,7 +93,7 @@ def test_alpha_depth_and_single_channels(model: Primitives) -> None:
 
 
 def test_lower_resolution_is_sent_as_it_was_drawn(model: Primitives) -> None:
-    assert draw_viewer_picture(model, view_at(), RunRendering(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (
+    assert draw_viewer_picture(model, view_at(), RenderConfig(SETTINGS, resolution=0.25), WHITE, RGB).image.shape == (
         8,
         10,
         3,
@@ -105,7 +105,7 @@ def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
     with pytest.raises(
         ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864 rays"
     ):
-        draw_viewer_picture(model, look, RunRendering(replace(SETTINGS, samples=16)), WHITE, RGB)
+        draw_viewer_picture(model, look, RenderConfig(replace(SETTINGS, samples=16)), WHITE, RGB)
 
 
 def test_levels_without_a_front_are_resolutions(model: Primitives) -> None:
@@ -297,7 +297,7 @@ def test_a_run_with_its_data(run_dir: Path) -> None:
     assert np.array_equal(found.truth, to_uint8(truth).numpy()) and np.array_equal(found.drawn, to_uint8(drawn).numpy())
     few = parse_run_rendering(["density.neurons=1"], scene.settings, scene.model())
     look = Viewpoint(view.camera, view.conditions)
-    assert not np.array_equal(scene.draw(look, few).image, scene.draw(look, RunRendering(scene.settings)).image)
+    assert not np.array_equal(scene.draw(look, few).image, scene.draw(look, RenderConfig(scene.settings)).image)
 
 
 def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path, tmp_path: Path) -> None:
@@ -309,7 +309,7 @@ def test_a_run_whose_data_are_gone_is_shown_without_held_out_views(run_dir: Path
     scene = open_viewer_scene(copy, told.append)
     assert scene.dataset is None and scene.list_views() == [] and len(told) == 1 and "no held-out views: " in told[0]
     start = scene.start_view()
-    image = scene.draw(Viewpoint(start.camera.resized(96, 54), start.conditions), RunRendering(scene.settings)).image
+    image = scene.draw(Viewpoint(start.camera.resized(96, 54), start.conditions), RenderConfig(scene.settings)).image
     assert image.std() > 10, "the model is in the picture"
     middle = image[18:36, 32:64].astype(float)
     assert np.abs(middle - image[0, 0]).mean() > np.abs(image.astype(float) - image[0, 0]).mean(), "and in its middle"
@@ -338,7 +338,7 @@ def test_a_model_on_a_card_is_drawn_and_asked_like_any(monkeypatch: pytest.Monke
         )
         start = scene.start_view()
         assert start.camera.viewmat.isfinite().all()
-        picture = scene.draw(look, RunRendering(settings)).image
+        picture = scene.draw(look, RenderConfig(settings)).image
         return (
             picture,
             list_viewer_ellipsoids(model, look, channels, 5).rows,

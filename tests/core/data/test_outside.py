@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.config import ConfigWithTask, compose
+from neuprim.config import Job, compose
 from neuprim.core import notices
 from neuprim.core.notices import NeuprimWarning
 from neuprim.runs.open import load_dataset
@@ -29,7 +29,7 @@ def test_one_line_names_the_first_and_their_number(tmp_path: Path, named: str, m
     with pytest.warns(
         NeuprimWarning, match=rf"data: 1 of its images lie outside of {folder}, the first {secret}; they are read"
     ) as said:
-        assert len(load_dataset(ConfigWithTask.of(config)).train) == 6
+        assert len(load_dataset(Job.of(config)).train) == 6
     assert len(said) == 1
 
 
@@ -37,5 +37,5 @@ def test_nothing_is_said_of_those_inside(tmp_path: Path, recwarn: pytest.Warning
     folder = tiny.write_blender(tmp_path / "data")
     (tmp_path / "link").symlink_to(folder)
     config = compose(["task=static", "scene=blender", f"scene.path={tmp_path / 'link'}"], check_output=False)
-    load_dataset(ConfigWithTask.of(config))
+    load_dataset(Job.of(config))
     assert not [w for w in recwarn if issubclass(w.category, NeuprimWarning)]

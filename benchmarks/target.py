@@ -35,7 +35,7 @@ from shared.tables import DOCS, Run, Table, between_markers, make_table
 
 from neuprim.config import Job, compose, load_config_task
 from neuprim.config.command_settings import SearchTarget
-from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.checkpoint import load_model_checkpoint, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
 from neuprim.runs.fit import Event, Note
@@ -152,7 +152,7 @@ def train_grid(name: str, data: Sequence[str], work: Path) -> dict[str, Any]:
             dataset = dataset or load_dataset(Job(config, task))
             every = choose_target_hold_out(dataset)
             outcome = run_trial(Trial(config, every, VIEWS), dataset)
-            model, _ = load_model(out / "model.safetensors", task)
+            model, _ = load_model_checkpoint(out / "model.safetensors", task)
             packed, text = out / "packed.neuprim", (out / "config.yaml").read_text(encoding="utf-8")
             save_compressed(packed, model, task.name, {}, bit_table(DEFAULT_LEVEL, (), model.specs), text)
             row = {"less": less, "primitives": size, "psnr": outcome.psnr, "bytes": packed.stat().st_size}

@@ -8,7 +8,7 @@ from typing import Any
 import pytest
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.validation import field_types, join_key, validate
+from neuprim.core.validation import field_types, join_setting_key, validate_settings
 from tests.settings_classes import bad_values, required, settings_classes, unbounded_numbers
 
 CLASSES = settings_classes()
@@ -41,7 +41,7 @@ def named(value: object) -> str:
 
 def refusal(cls: type, values: dict[str, Any]) -> str:
     with pytest.raises(ConfigError) as caught:
-        validate(cls, values, group(cls))
+        validate_settings(cls, values, group(cls))
     return str(caught.value)
 
 
@@ -60,8 +60,8 @@ def test_they_are_found() -> None:
 
 @pytest.mark.parametrize("cls", CLASSES, ids=named)
 def test_defaults_are_what_they_accept(cls: type) -> None:
-    made = validate(cls, required(cls), group(cls))
-    assert validate(cls, {f.name: getattr(made, f.name) for f in dataclasses.fields(cls)}, group(cls)) == made
+    made = validate_settings(cls, required(cls), group(cls))
+    assert validate_settings(cls, {f.name: getattr(made, f.name) for f in dataclasses.fields(cls)}, group(cls)) == made
 
 
 @pytest.mark.parametrize(("cls", "field"), FIELDS, ids=named)
@@ -72,7 +72,7 @@ def test_a_number_has_bounds_or_says_why_not(cls: type, field: str) -> None:
 @pytest.mark.parametrize(("cls", "field"), FIELDS, ids=named)
 def test_what_a_field_does_not_take_is_refused_in_one_line_with_its_key(cls: type, field: str) -> None:
     values = bad_values(field_types(cls)[field])
-    key = join_key(group(cls), field)
+    key = join_setting_key(group(cls), field)
     for value in values:
         text = refusal(cls, {**required(cls), field: value})
         assert text.startswith(key) and "\n" not in text, (value, text)
@@ -98,5 +98,7 @@ def test_python_code_is_told_the_same(cls: type, field: str) -> None:
 def test_a_name_that_is_nearly_a_field_is_told_the_field(cls: type, field: str) -> None:
     wrong = f"{field}s"
     text = refusal(cls, {**required(cls), wrong: 1})
-    assert text.startswith(f"{join_key(group(cls), wrong)}: no such setting; did you mean ") and "\n" not in text
-    assert repr(join_key(group(cls), field)) in text
+    assert (
+        text.startswith(f"{join_setting_key(group(cls), wrong)}: no such setting; did you mean ") and "\n" not in text
+    )
+    assert repr(join_setting_key(group(cls), field)) in text

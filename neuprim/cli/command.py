@@ -158,9 +158,9 @@ def take_condition_arguments(
 
 def refuse_argument(word: str, parser: argparse.ArgumentParser, task: TaskSpec | None = None) -> ConfigError:
     """Return the error for a word that is neither an argument of the command nor a condition of the task."""
-    from neuprim.core.conditions import flag
+    from neuprim.core.conditions import condition_flag
 
-    conditions = () if task is None else (flag(spec.name) for spec in task.conditions)
+    conditions = () if task is None else (condition_flag(spec.name) for spec in task.conditions)
     flags = [name for name in (*parser._option_string_actions, *conditions) if name.startswith("--")]
     place = "" if task is None else f" for task {task.name!r}"
     return ConfigError(f"{word}: no such argument of `{parser.prog}`{place}{nearest(word, flags)}")

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal, get_args
 
 from neuprim.config.overrides import take_settings
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.validation import Range, coerce, format_value, nonempty_text, validate_fields
+from neuprim.core.validation import Range, format_setting_value, nonempty_text, validate_fields, validate_value
 
 LOOPBACK = "127.0.0.1"
 LauncherName = Literal["inline", "processes", "ray", "slurm"]
@@ -100,7 +100,7 @@ def take_launcher_overrides(overrides: Sequence[str]) -> tuple[LauncherSettings,
     name, settings, others = take_settings(overrides, "launcher", LauncherSettings)
     if name is not None:
         if name not in LAUNCHERS:
-            raise ConfigError(f"launcher={format_value(name)}: no such launcher{nearest(str(name), LAUNCHERS)}")
+            raise ConfigError(f"launcher={format_setting_value(name)}: no such launcher{nearest(str(name), LAUNCHERS)}")
         settings = dataclasses.replace(settings, name=name)
     given = settings.given_settings()
     engines, pools = "ray or launcher=slurm", "processes, launcher=ray or launcher=slurm"
@@ -118,7 +118,7 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
     shown, settings, others = take_settings(overrides, "viewer", ViewerSettings)
     if shown is None:
         shown = len(others) < len(overrides)
-    return (settings if coerce(shown, bool, "viewer") else None), others
+    return (settings if validate_value(shown, bool, "viewer") else None), others
 
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
@@ -128,8 +128,8 @@ def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget,
     if len(others) == len(overrides):
         return None, others
     if whole is not None:
-        raise ConfigError(f"target={format_value(whole)}: expected one of {_TARGETS}")
-    asked = "target" if budget is None else f"budget={format_value(budget)}"
+        raise ConfigError(f"target={format_setting_value(whole)}: expected one of {_TARGETS}")
+    asked = "target" if budget is None else f"budget={format_setting_value(budget)}"
     if not target.given_settings():
         raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
     if budget is None:

@@ -61,7 +61,13 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
 from neuprim.core.train.distributed.process_group import read_torchrun_rank
 from neuprim.core.used_settings import build_settings
-from neuprim.core.validation import coerce, format_value, infer_type, refuse_unknown, validate
+from neuprim.core.validation import (
+    format_setting_value,
+    infer_type_to_validate,
+    validate_setting_names,
+    validate_settings,
+    validate_value,
+)
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.provenance import Provenance
 from neuprim.plugins.registry import (
@@ -247,7 +253,7 @@ def _compose_run_config(
         same_scene = scene.spec.name == split_plugin_name(config.scene_name)[1]
         below |= stored_settings(config, same_scene)
         if same_scene:
-            refuse_unknown(config.scene, declared, "scene")
+            validate_setting_names(config.scene, declared, "scene")
     if new_launch:
         below["train"]["views_per_step"] = base.tree["train"]["views_per_step"]
     plain = _resolve_config(base, {})
@@ -374,7 +380,7 @@ def _find_typed_value(values: Sequence[Assignment], group: str, name: str) -> An
 
 
 def _validate_settings(tree: Mapping[str, Any]) -> RunSettings:
-    return validate(RunSettings, {key: value for key, value in tree.items() if key not in ("scene", "task")})
+    return validate_settings(RunSettings, {key: value for key, value in tree.items() if key not in ("scene", "task")})
 
 
 def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence[str]) -> dict[str, Any]:
@@ -387,9 +393,9 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
             raise ConfigError(f"{where}: required and not given; expected {expected}")
         if key in paths and value is not None:
             if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():
-                raise ConfigError(f"{where}={format_value(value)}: expected a path (quote it: {where}='...')")
+                raise ConfigError(f"{where}={format_setting_value(value)}: expected a path (quote it: {where}='...')")
             value = str(value) if "://" in str(value) else str(Path(str(value)).expanduser().absolute())
-        result[key] = value if default == _REQUIRED else coerce(value, infer_type(default), where)
+        result[key] = value if default == _REQUIRED else validate_value(value, infer_type_to_validate(default), where)
     return result
 
 

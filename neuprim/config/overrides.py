@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.validation import validate
+from neuprim.core.validation import validate_settings
 
 T = TypeVar("T")
 
@@ -87,7 +87,7 @@ def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[A
         else:
             values[name] = assignment.value
     whole = values.pop("", None)
-    return whole, validate(cls, values, group), [text for text in overrides if text not in own]
+    return whole, validate_settings(cls, values, group), [text for text in overrides if text not in own]
 
 
 def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:

@@ -17,7 +17,7 @@ from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.used_settings import OPTIONAL
-from neuprim.core.validation import Range, join_key, validate, validate_fields
+from neuprim.core.validation import Range, join_setting_key, validate_fields, validate_settings
 from neuprim.plugins.provenance import Provenance
 from neuprim.plugins.registry import split_plugin_name
 
@@ -134,7 +134,7 @@ class RunConfig:
         """
         stored_keys = flatten(data)
         unused = tuple(name for name in OPTIONAL if name not in stored_keys)
-        stored = validate(_StoredConfig, data)
+        stored = validate_settings(_StoredConfig, data)
         if stored.output_dir is None:
             raise ConfigError("output_dir: missing; expected a directory")
         scene = dict(stored.scene)
@@ -213,6 +213,6 @@ def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
     """Return dotted names and values of nested settings."""
     found: dict[str, Any] = {}
     for key, value in node.items():
-        name = join_key(where, str(key))
+        name = join_setting_key(where, str(key))
         found |= flatten(value, name) if isinstance(value, Mapping) else {name: value}
     return found

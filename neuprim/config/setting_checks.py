@@ -11,7 +11,15 @@ from neuprim.config.run_config import RunSettings
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.used_settings import OPTIONAL
-from neuprim.core.validation import Option, coerce, field_types, format_value, join_key, option_type, refuse_unknown
+from neuprim.core.validation import (
+    Option,
+    field_types,
+    format_setting_value,
+    join_setting_key,
+    option_type_to_validate,
+    validate_setting_names,
+    validate_value,
+)
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
@@ -48,7 +56,7 @@ def check_config_key(assignment: Assignment, scene: Mapping[str, Any], scene_nam
 
 def _setting_names(cls: type, where: str = "") -> Iterator[str]:
     for own, hint in field_types(cls).items():
-        name = join_key(where, own)
+        name = join_setting_key(where, own)
         if dataclasses.is_dataclass(hint) and isinstance(hint, type):
             yield from _setting_names(hint, name)
         else:
@@ -87,14 +95,14 @@ def complete_task_options(
 ) -> dict[str, Any]:
     """Return every declared option, as given or its default; ``owner`` and ``where`` are for messages."""
     if not isinstance(given, Mapping):
-        raise ConfigError(f"{where}={format_value(given)}: expected entries, each as {where}.KEY=VALUE")
+        raise ConfigError(f"{where}={format_setting_value(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:
         if key not in declared:
             shared = [name for name in _setting_names(RunSettings) if name.rpartition(".")[2] == key]
             hint = f"; did you mean {' or '.join(map(repr, shared))}?" if shared else nearest(str(key), declared)
             raise ConfigError(f"{where}.{key}: {owner} has no such option{hint or '; it has none'}")
     return {
-        key: coerce(given.get(key, option[0]), option_type(option), f"{where}.{key}")
+        key: validate_value(given.get(key, option[0]), option_type_to_validate(option), f"{where}.{key}")
         for key, option in declared.items()
     }
 
@@ -126,7 +134,7 @@ def check_config_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
     if not spec.fields:
         return
     init = {"scale", "points", "surroundings", *(name for cls in spec.fields.values() for name in cls.init_settings)}
-    refuse_unknown(settings.model.init, init, "model.init")
+    validate_setting_names(settings.model.init, init, "model.init")
     try:
         own = [parameter for cls in spec.fields.values() for parameter in cls.every_parameter()]
     except TypeError:  # a field that cannot be made without settings

@@ -16,10 +16,10 @@ from neuprim.config.outputs import DEFAULT_TASK, config_output_directory, config
 from neuprim.config.run_config import RunConfig, flatten
 from neuprim.config.setting_checks import CHOICES
 from neuprim.config.task_files import read_task_config
-from neuprim.core.errors import ConfigError, cut
+from neuprim.core.errors import ConfigError, cut_error_text
 from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
 from neuprim.core.notices import warn_once
-from neuprim.core.validation import format_value
+from neuprim.core.validation import format_setting_value
 from neuprim.plugins.provenance import PluginVersion
 from neuprim.plugins.registry import BUILT_IN, TASKS, split_plugin_name
 
@@ -166,7 +166,8 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
 
 def _resumed_config_error(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
     return ConfigError(
-        f"{key}={format_value(typed)}: the run to resume was begun with {key}={format_value(was)} ({begun.source}); "
+        f"{key}={format_setting_value(typed)}: the run to resume was begun with "
+        f"{key}={format_setting_value(was)} ({begun.source}); "
         f"expected that, no {key}, or another output_dir"
     )
 
@@ -210,7 +211,7 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
             continue
         allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
         raise ConfigError(
-            f"{config.source}: {key} is {cut(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the "
+            f"{config.source}: {key} is {cut_error_text(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the "
             "environment does so for all runs"
         )
 

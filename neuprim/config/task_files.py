@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any
 from neuprim.config.overrides import Assignment, quote_override
 from neuprim.config.setting_checks import complete_task_options
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.validation import format_value, refuse_unknown
+from neuprim.core.validation import format_setting_value, validate_setting_names
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -59,7 +59,7 @@ def read_task_config(spec: TaskSpec) -> TaskChoices:
     who = f"task {spec.name!r}: {place}"
     node = read_task_yaml(find_config_package(spec) / place, who)
     try:
-        refuse_unknown(node, ("scene", "preset", "options"), "")
+        validate_setting_names(node, ("scene", "preset", "options"), "")
         scene, preset = node.get("scene") or spec.scenes[0].name, node.get("preset") or DEFAULT_PRESET
         for key, value, names in (
             ("scene", scene, [s.name for s in spec.scenes]),
@@ -128,7 +128,7 @@ def _read_with_defaults(
     own = read_task_yaml(root / folder / f"{name}.yaml", f"{who}{place}")
     names = own.pop("defaults", ["_self_"])
     if not isinstance(names, list) or not all(isinstance(entry, str) for entry in names):
-        raise ConfigError(f"{who}{place}: defaults={format_value(names)}: expected a list of names of files")
+        raise ConfigError(f"{who}{place}: defaults={format_setting_value(names)}: expected a list of names of files")
     names += [] if "_self_" in names else ["_self_"]
     parts = [own if n == "_self_" else _read_with_defaults(root, folder, n, who, (*readers, name)) for n in names]
     return omegaconf_to_plain(OmegaConf.merge(*parts), resolve=False)
@@ -208,18 +208,18 @@ def read_config_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping
 
 
 def _parse_config_effort_levels(node: Mapping[str, Any], presets: Sequence[str]) -> dict[int, Level]:
-    refuse_unknown(node, ("preset", "levels"), "")
+    validate_setting_names(node, ("preset", "levels"), "")
     preset, levels = node.get("preset"), node.get("levels")
     if preset not in presets:
-        raise ConfigError(f"preset={format_value(preset)}: no such preset{nearest(str(preset), presets)}")
+        raise ConfigError(f"preset={format_setting_value(preset)}: no such preset{nearest(str(preset), presets)}")
     if not isinstance(levels, Mapping) or list(levels) != list(LEVELS):
-        found = format_value(list(levels) if isinstance(levels, Mapping) else levels)
+        found = format_setting_value(list(levels) if isinstance(levels, Mapping) else levels)
         raise ConfigError(f"levels: found {found}; expected {LEVELS[0]} to {LEVELS[-1]}, in this order")
     made = {}
     for number, given in levels.items():
         if not isinstance(given, Mapping) or any(str(key).partition(".")[0] not in PRESET_GROUPS for key in given):
             groups = "settings of model, train and renderer by their dotted keys"
-            raise ConfigError(f"levels.{number}: found {format_value(given)}; expected {groups}")
+            raise ConfigError(f"levels.{number}: found {format_setting_value(given)}; expected {groups}")
         settings = tuple(Assignment(key, value, quote_override(key, value)) for key, value in given.items())
         made[number] = Level(str(preset), settings)
     return made

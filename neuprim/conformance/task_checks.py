@@ -31,7 +31,7 @@ from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.task import API_VERSION, Supervision
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.used_settings import build_settings, loss_settings
-from neuprim.core.validation import validate
+from neuprim.core.validation import validate_settings
 from neuprim.plugins.returns import (
     ReturnError,
     call_task_clips,
@@ -95,7 +95,7 @@ def check_description(t: TaskUnderTest) -> None:
 def _require_accepted(t: TaskUnderTest, where: str, model: dict[str, Any], options: dict[str, Any]) -> None:
     try:
         complete = complete_task_options(t.task.options, options, f"task {t.task.name!r}")
-        t.task.check(build_settings(t.task, validate(ModelSettings, model, "model"), complete))
+        t.task.check(build_settings(t.task, validate_settings(ModelSettings, model, "model"), complete))
     except ConfigError as error:
         t.require(False, where, f"a setting that is refused ({error})", "settings that the task accepts")
 
@@ -319,7 +319,7 @@ def check_save_load(t: TaskUnderTest) -> None:
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
         path = Path(folder) / "model.safetensors"
         checkpoint.save_model(path, model, t.task.name, {})
-        loaded = checkpoint.load_model(path, t.task)[0]
+        loaded = checkpoint.load_model_checkpoint(path, t.task)[0]
         _require_equal_tensors(t, "after loading", model.params, loaded.params)
         _require_equal_tensors(t, "after folding twice", canonical.params, canonical_model(canonical).params)
         for view in t.views[:3]:
@@ -332,5 +332,5 @@ def check_save_load(t: TaskUnderTest) -> None:
         for _ in range(2):
             again = Primitives(model.density, model.colour, stored[-1])
             checkpoint.save_compressed(Path(folder) / "model.neuprim", again, t.task.name, {}, LEVELS[1])
-            stored.append(checkpoint.load_model(Path(folder) / "model.neuprim", t.task)[0].params)
+            stored.append(checkpoint.load_model_checkpoint(Path(folder) / "model.neuprim", t.task)[0].params)
         _require_equal_tensors(t, "compressed twice", stored[1], stored[2])

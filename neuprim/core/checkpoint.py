@@ -18,7 +18,7 @@ from safetensors.torch import save_file
 from torch import Tensor
 
 from neuprim.core import compression
-from neuprim.core.errors import CheckpointError, cut, nearest
+from neuprim.core.errors import CheckpointError, cut_error_text, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.plain import finite_number, load_json
 from neuprim.core.model.fields import ColourField, DensityField
@@ -73,18 +73,20 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
 def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("kind") != kind:
         found = header.get("kind") if isinstance(header, dict) else type(header).__name__
-        raise CheckpointError(f"{path}: kind is {cut(repr(found))}; expected {kind!r}")
+        raise CheckpointError(f"{path}: kind is {cut_error_text(repr(found))}; expected {kind!r}")
     if header.get("format") != FORMAT:
         raise CheckpointError(
-            f"{path}: format version is {cut(repr(header.get('format')))}; this neuprim reads {FORMAT}"
+            f"{path}: format version is {cut_error_text(repr(header.get('format')))}; this neuprim reads {FORMAT}"
         )
     for name in _NUMBERS:  # in any header; null: not known
         number = 0.0 if header.get(name) is None else finite_number(header[name])
         if number is None or number < 0:
-            raise CheckpointError(f"{path}: {name} is {cut(repr(header[name]))}; expected a number of at least 0")
+            raise CheckpointError(
+                f"{path}: {name} is {cut_error_text(repr(header[name]))}; expected a number of at least 0"
+            )
     background = header.get("background", [])
     if not isinstance(background, list) or any(finite_number(value) is None for value in background):
-        raise CheckpointError(f"{path}: background is {cut(repr(background))}; expected finite numbers")
+        raise CheckpointError(f"{path}: background is {cut_error_text(repr(background))}; expected finite numbers")
     return header
 
 
@@ -167,7 +169,7 @@ def save_compressed(
     }
 
 
-def stored_config(path: Path) -> str | None:
+def checkpoint_config(path: Path) -> str | None:
     """Return the text of the ``config.yaml`` in a compressed model; None where it has none."""
     return compression.read_compressed(path)[2]
 
@@ -187,7 +189,7 @@ def read_header_extra(header: Mapping[str, Any]) -> dict[str, Any]:
     return {key: value for key, value in header.items() if key not in own}
 
 
-def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
+def load_model_checkpoint(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     """Return the model in ``path`` and its header.
 
     Raises:
@@ -195,8 +197,10 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     """
     header = read_header(path, "model")
     if header.get("task") != task.name:
-        raise CheckpointError(f"{path}: written for task {cut(repr(header.get('task')))}; expected {task.name!r}")
-    density, colour = (_read_field(path, header, task, kind) for kind in ("density", "colour"))
+        raise CheckpointError(
+            f"{path}: written for task {cut_error_text(repr(header.get('task')))}; expected {task.name!r}"
+        )
+    density, colour = (_read_checkpoint_field(path, header, task, kind) for kind in ("density", "colour"))
     _, tensors = read_tensors(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
         found = f"{type(density).__name__} and {type(colour).__name__}"
@@ -216,21 +220,23 @@ def load_model(path: Path, task: TaskSpec) -> tuple[Primitives, dict[str, Any]]:
     return model, header
 
 
-def _read_field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
+def _read_checkpoint_field(path: Path, header: Mapping[str, Any], task: TaskSpec, kind: str) -> Any:
     entry, known = header.get(kind), task.fields or {}
     name, settings = (entry.get("class"), entry.get("settings")) if isinstance(entry, dict) else (None, None)
     if not isinstance(name, str) or not isinstance(settings, dict):
         expected = "{'class': ..., 'settings': {...}}"
-        raise CheckpointError(f"{path}: header field {kind!r} is {cut(repr(entry))}; expected {expected}")
+        raise CheckpointError(f"{path}: header field {kind!r} is {cut_error_text(repr(entry))}; expected {expected}")
     if name not in known:
-        who = f"unknown {kind} field {cut(name)!r} for task {task.name!r}"
+        who = f"unknown {kind} field {cut_error_text(name)!r} for task {task.name!r}"
         raise CheckpointError(f"{path}: {who}{nearest(name, known)}")
     for key, value in settings.items():
         plain = isinstance(value, int | float | str | list | None)
         if not plain or (isinstance(value, int) and abs(value) > 10_000):
-            raise CheckpointError(f"{path}: {kind} setting {cut(key)}={cut(repr(value))} is not plausible")
+            raise CheckpointError(
+                f"{path}: {kind} setting {cut_error_text(key)}={cut_error_text(repr(value))} is not plausible"
+            )
     try:
         return known[name](**settings)
     except (TypeError, ValueError) as error:
-        refused = f"{kind} field {name!r} refused its settings {cut(str(settings))}"
+        refused = f"{kind} field {name!r} refused its settings {cut_error_text(str(settings))}"
         raise CheckpointError(f"{path}: {refused}: {error}") from error

@@ -29,14 +29,14 @@ Warn = Callable[[str], None]
 """Called with one line for the user."""
 
 
-def _silent(text: str) -> None:
+def _ignore_condition_warning(text: str) -> None:
     pass
 
 
 # ---------------------------------------------------------------- names
 
 
-def flag(name: str) -> str:
+def condition_flag(name: str) -> str:
     """How messages name a condition: ``"--light-intensity"`` for ``light_intensity``; every command takes it."""
     return "--" + name.replace("_", "-")
 
@@ -70,7 +70,7 @@ def split_conditions(
                 raise ConfigError(f"{word}: expected a value after it")
             text = queue.pop(0)
         if name in found:
-            raise ConfigError(f"{flag(name)}: given twice")
+            raise ConfigError(f"{condition_flag(name)}: given twice")
         found[name] = text
     return found, rest
 
@@ -79,7 +79,7 @@ def split_conditions(
 
 
 def read_conditions(
-    specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _silent
+    specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _ignore_condition_warning
 ) -> dict[str, list[Tensor]]:
     """Return name -> values, one per frame, of the conditions that were given, in the task's order.
 
@@ -91,27 +91,31 @@ def read_conditions(
     given = [spec for spec in specs if spec.name in texts]
     said = {}
     for spec in given:
-        found = _read_condition(spec, texts[spec.name], _silent)
-        if len(found) > 1 and _with_frame_count(spec, texts[spec.name], len(found)) is None:
+        found = _read_condition(spec, texts[spec.name], _ignore_condition_warning)
+        if len(found) > 1 and _condition_with_frame_count(spec, texts[spec.name], len(found)) is None:
             said[spec.name] = len(found)
     count = max(said.values(), default=0)
     lengths = {
-        spec.name: None if spec.name in said or not count else _with_frame_count(spec, texts[spec.name], count)
+        spec.name: None
+        if spec.name in said or not count
+        else _condition_with_frame_count(spec, texts[spec.name], count)
         for spec in given
     }
     return {spec.name: _read_condition(spec, lengths[spec.name] or texts[spec.name], warn) for spec in given}
 
 
-def count_common_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
+def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
     """Return how many frames conditions have together; those of one value hold it in all frames, others must agree."""
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if len(set(counts.values())) > 1:
-        each = " and ".join(f"{flag(name)} {texts[name]} has {count} frames" for name, count in counts.items())
+        each = " and ".join(
+            f"{condition_flag(name)} {texts[name]} has {count} frames" for name, count in counts.items()
+        )
         raise ConfigError(f"{each}; expected as many of each, or one of them without a number of its own")
     return max(counts.values(), default=1)
 
 
-def _with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
+def _condition_with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
     """The text in so many frames; None where it says its number, or is a single value or a list."""
     if spec.shape:
         return spec.in_frames(text, count)
@@ -123,49 +127,53 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
     parts = [part.strip() for part in text.split(",")] if not spec.shape else [text]
     values: list[Tensor] = []
     for part in parts:
-        values += _read_number_or_range(spec, part)
+        values += _read_condition_number_or_range(spec, part)
         if len(values) > _MOST:  # before the next part takes more memory
-            shown = f"{flag(spec.name)} {text[:40]}..."
+            shown = f"{condition_flag(spec.name)} {text[:40]}..."
             raise ConfigError(f"{shown}: {len(values)} values and more; expected at most {_MOST}")
     _check_condition_range(spec, text, values, warn)
     return values
 
 
-def _read_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
+def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
     """Read one number or range; a range that the task does not read is made of numbers that it does."""
     try:
-        return _parse_condition(spec, text)
+        return _parse_condition_value(spec, text)
     except NeuprimError:
         found = None if spec.shape else _RANGE.fullmatch(text)
         if found is None:
             raise
         first, last = float(found[1]), float(found[2])
         try:
-            ends = [value for end in (first, last) for value in _parse_condition(spec, _format_number(end))]
+            ends = [
+                value for end in (first, last) for value in _parse_condition_value(spec, _format_condition_number(end))
+            ]
         except NeuprimError:
             pass  # the task's message about the whole text says more than one about an end
         else:
             count = FRAMES if found[3] is None else int(found[3])
             if not 2 <= count <= _MOST:
                 expected = f"FIRST:LAST or FIRST:LAST:COUNT, 2 to {_MOST} frames"
-                raise ConfigError(f"{flag(spec.name)} {text}: expected {expected}") from None
+                raise ConfigError(f"{condition_flag(spec.name)} {text}: expected {expected}") from None
             dtype = ends[0].dtype if ends[0].is_floating_point() else torch.float64
             numbers = torch.linspace(first, last, count, dtype=dtype).tolist()
-            return [value for x in numbers for value in _parse_condition(spec, _format_number(x))]
+            return [value for x in numbers for value in _parse_condition_value(spec, _format_condition_number(x))]
         raise
 
 
-def _parse_condition(spec: ConditionSpec, text: str) -> list[Tensor]:
+def _parse_condition_value(spec: ConditionSpec, text: str) -> list[Tensor]:
     try:
         values = spec.parse(text)
     except ValueError as error:  # as float("x") raises it; the text is the user's
-        raise ConfigError(f"{flag(spec.name)} {text}: cannot be read ({' '.join(str(error).split())})") from error
+        raise ConfigError(
+            f"{condition_flag(spec.name)} {text}: cannot be read ({' '.join(str(error).split())})"
+        ) from error
     if not values:
-        raise ConfigError(f"{flag(spec.name)} {text}: stands for no value; expected at least one")
+        raise ConfigError(f"{condition_flag(spec.name)} {text}: stands for no value; expected at least one")
     return list(values)
 
 
-def _format_number(number: float) -> str:
+def _format_condition_number(number: float) -> str:
     """As a user would write it: whole numbers without a point, others exact."""
     return repr(number).removesuffix(".0")
 
@@ -173,7 +181,7 @@ def _format_number(number: float) -> str:
 def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
     """Elementwise; the range's ends are rounded as the values are, so that 0.3 lies within 0 to 0.3."""
     low, high = spec.range
-    shown = f"{flag(spec.name)} {text}"
+    shown = f"{condition_flag(spec.name)} {text}"
     for value in values:
         if not bool(torch.isfinite(value).all()):
             raise ConfigError(f"{shown}: {_first_where(value, ~torch.isfinite(value)):g}; expected finite numbers")
@@ -195,26 +203,26 @@ def _first_where(value: Tensor, where: Tensor) -> float:
 # ---------------------------------------------------------------- frames of an export
 
 
-def export_frames(
+def conditions_per_frame(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
 ) -> list[dict[str, Tensor]]:
     """Return a mapping of every condition of the task per frame; all must be given, of one frame unless ``several``."""
     for spec in specs:
         if spec.name not in texts:
-            what = f"{flag(spec.name)}: required, as the model depends on it ({spec.unit})"
-            raise ConfigError(f"{what}; for example {flag(spec.name)} {_example_condition(spec)}")
+            what = f"{condition_flag(spec.name)}: required, as the model depends on it ({spec.unit})"
+            raise ConfigError(f"{what}; for example {condition_flag(spec.name)} {_example_condition_text(spec)}")
     found = read_conditions(specs, texts)
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if counts and not several:
         name = next(iter(counts))
-        raise ConfigError(f"{flag(name)} {texts[name]}: {counts[name]} values; expected one value")
-    frames = count_common_frames(texts, found)
+        raise ConfigError(f"{condition_flag(name)} {texts[name]}: {counts[name]} values; expected one value")
+    frames = count_condition_frames(texts, found)
     return [{name: values[i if len(values) > 1 else 0] for name, values in found.items()} for i in range(frames)]
 
 
-def _example_condition(spec: ConditionSpec) -> str:
+def _example_condition_text(spec: ConditionSpec) -> str:
     """A text that is within the range."""
     low, high = spec.range
     usual = 1.0 if spec.shape else 0.5
     value = usual if low <= usual <= high else (low + high) / 2
-    return ",".join([_format_number(value)] * math.prod(spec.shape))
+    return ",".join([_format_condition_number(value)] * math.prod(spec.shape))

@@ -105,7 +105,7 @@ class Environment:
         if not 1 <= count <= MAX_LIGHTS:
             raise ConfigError(f"{count} lights for an environment; expected 1 to {MAX_LIGHTS}")
         directions, irradiance = [], []
-        for r0, r1, c0, c1 in _cut_into_rectangles(self._moment, self._flux @ _LUMINANCE, count):
+        for r0, r1, c0, c1 in _cut_environment_into_rectangles(self._moment, self._flux @ _LUMINANCE, count):
             flux, moment = self._flux[r0:r1, c0:c1].sum((0, 1)), self._moment[r0:r1, c0:c1].sum((0, 1))
             length = np.linalg.norm(moment)
             if length <= 1e-9 * float(flux @ _LUMINANCE):  # light from all sides alike has no direction; any is as good
@@ -192,7 +192,7 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
     return np.stack(flux), np.stack(moment)
 
 
-def _cut_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
+def _cut_environment_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
     """At most ``count`` rectangles (first row, end, first column, end) with energy, which together have all of it."""
     rows, columns = weight.shape
     table = np.zeros((rows + 1, columns + 1, 4))
@@ -205,7 +205,7 @@ def _cut_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple
     done: list[tuple[int, int, int, int]] = []
     while queue and len(queue) + len(done) < count:
         _, box = heapq.heappop(queue)
-        parts = _cut_rectangle(table, box, 1e-12 * total)
+        parts = _cut_environment_rectangle(table, box, 1e-12 * total)
         if not parts:
             done.append(box)
         for part in parts:
@@ -224,7 +224,9 @@ def _direction_spread(sums: Array) -> Array:
     return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
 
 
-def _cut_rectangle(table: Array, box: tuple[int, int, int, int], least: float) -> list[tuple[int, int, int, int]]:
+def _cut_environment_rectangle(
+    table: Array, box: tuple[int, int, int, int], least: float
+) -> list[tuple[int, int, int, int]]:
     """The two parts of the best cut; none if no cut lowers the spread by ``least``."""
     r0, r1, c0, c1 = box
     whole = _sum_rectangle(table, box)

@@ -61,7 +61,7 @@ class FormError(NeuprimError):
     """A field handed over tensors that cannot be used; the message names field, method and tensor."""
 
 
-def cut(text: str, most: int = 80) -> str:
+def cut_error_text(text: str, most: int = 80) -> str:
     """Return a value's text as messages show it; what files and users gave goes into a message through this."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 

@@ -16,12 +16,12 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, read_stored_channels
-from neuprim.core.conditions import export_frames
+from neuprim.core.conditions import conditions_per_frame
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
-from neuprim.core.validation import Option, Range, coerce
+from neuprim.core.validation import Option, Range, validate_value
 from neuprim.core.volumes.density_truth import DensityGridSource
 
 
@@ -79,25 +79,25 @@ class ExportJob:
 
     def frames(self, several: bool = False) -> list[dict[str, Tensor]]:
         """Return the task's conditions of each frame that the user named; one frame unless ``several``."""
-        return export_frames(self.run.task.conditions, self.conditions, several)
+        return conditions_per_frame(self.run.task.conditions, self.conditions, several)
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
         """Return an option that is a finite number from ``low`` to ``high``, or None; raises ConfigError otherwise."""
-        value: float | None = coerce(self.options[name], Annotated[float, Range(low, high)] | None, name)
+        value: float | None = validate_value(self.options[name], Annotated[float, Range(low, high)] | None, name)
         return value
 
     def count(self, name: str, low: int, high: int) -> int | None:
         """Return an option that is a whole number, as :meth:`number`."""
-        value: int | None = coerce(self.options[name], Annotated[int, Range(low, high)] | None, name)
+        value: int | None = validate_value(self.options[name], Annotated[int, Range(low, high)] | None, name)
         return value
 
     def choice(self, name: str, *offered: str) -> str:
         """Return an option that is one of those offered; raises ConfigError otherwise."""
-        return str(coerce(self.options[name], Literal[offered], name))
+        return str(validate_value(self.options[name], Literal[offered], name))
 
     def flag(self, name: str) -> bool:
         """Return an option that is true or false; raises ConfigError otherwise."""
-        return bool(coerce(self.options[name], bool, name))
+        return bool(validate_value(self.options[name], bool, name))
 
 
 @dataclass(frozen=True)

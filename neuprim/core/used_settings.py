@@ -45,7 +45,7 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
     Args:
         options: values by name; what is missing takes its default, others are left out.
     """
-    return _track_settings("model", vars(model), task, options, f"task {task.name!r}")
+    return _track_used_settings("model", vars(model), task, options, f"task {task.name!r}")
 
 
 def loss_settings(
@@ -53,10 +53,10 @@ def loss_settings(
 ) -> Mapping[str, Any]:
     """As :func:`build_settings`: return what makes a loss of the task or of the ``train.loss`` that owns it."""
     who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
-    return _track_settings("train", vars(train), owner, options, who)
+    return _track_used_settings("train", vars(train), owner, options, who)
 
 
-def _track_settings(
+def _track_used_settings(
     group: str, values: Mapping[str, Any], spec: TaskSpec | LossExtension, options: Mapping[str, Any], owner: str
 ) -> TrackedMapping:
     used = {k: v for k, v in values.items() if f"{group}.{k}" not in OPTIONAL or f"{group}.{k}" in spec.uses}

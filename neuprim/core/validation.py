@@ -5,7 +5,7 @@
         count: Annotated[int, Range(1, 16)] = 3
         form: Literal["sine", "cosine"] = "sine"
 
-    validate(Waves, {"cuont": 4}, "model.density")
+    validate_settings(Waves, {"cuont": 4}, "model.density")
     # ConfigError: model.density.cuont: no such setting; did you mean 'model.density.count'?
 
 Types are ``bool``, ``int``, ``float``, ``str``, ``Path``, ``list``, ``Literal``, ``tuple``, ``dict``, other settings
@@ -24,7 +24,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-from neuprim.core.errors import ConfigError, cut, nearest
+from neuprim.core.errors import ConfigError, cut_error_text, nearest
 
 T = TypeVar("T")
 
@@ -118,7 +118,7 @@ def nonempty_text(says: str) -> Accepts:
 # ---------------------------------------------------------------- settings from plain values
 
 
-def validate(cls: type[T], values: object, where: str = "") -> T:
+def validate_settings(cls: type[T], values: object, where: str = "") -> T:
     """An instance of the settings dataclass ``cls``.
 
     Args:
@@ -131,15 +131,19 @@ def validate(cls: type[T], values: object, where: str = "") -> T:
     if isinstance(values, cls):
         return values
     if not isinstance(values, Mapping):
-        raise ConfigError(f"{where}={format_value(values)}: expected settings, each as {where}.KEY=VALUE")
+        raise ConfigError(f"{where}={format_setting_value(values)}: expected settings, each as {where}.KEY=VALUE")
     hints = field_types(cls)
-    refuse_unknown(values, hints, where)
+    validate_setting_names(values, hints, where)
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
-            name = join_key(where, field.name)
+            name = join_setting_key(where, field.name)
             raise ConfigError(f"{name}: required and not given; expected {_describe_expected(hints[field.name], name)}")
     return cls(
-        **{name: coerce(values[name], hint, join_key(where, name)) for name, hint in hints.items() if name in values}
+        **{
+            name: validate_value(values[name], hint, join_setting_key(where, name))
+            for name, hint in hints.items()
+            if name in values
+        }
     )
 
 
@@ -151,37 +155,39 @@ def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str,
         where: dotted name of the group, for messages.
         offered: name -> type, as on a settings dataclass; or a tuple of the values to choose from.
     """
-    refuse_unknown(found, offered, where)
+    validate_setting_names(found, offered, where)
     for key, value in found.items():
-        hint = _choice_type(offered[key])
-        made = coerce(value, hint, join_key(where, key))
+        hint = _choice_type_to_validate(offered[key])
+        made = validate_value(value, hint, join_setting_key(where, key))
         if made != value or (isinstance(made, int) and isinstance(value, float)):
             # "1e-3" for a number, 3 for text, 4.0 for a whole number: the field gets the value itself
-            raise _UnfitValue(join_key(where, key), value, _describe_expected(hint, join_key(where, key)))
+            raise _UnfitValue(
+                join_setting_key(where, key), value, _describe_expected(hint, join_setting_key(where, key))
+            )
 
 
 def validate_fields(settings: Any, where: str) -> None:
-    """Check and convert the fields of a settings dataclass in its ``__post_init__``, as :func:`validate` does."""
+    """Check and convert a settings dataclass in its ``__post_init__``, as :func:`validate_settings` does."""
     for name, hint in field_types(type(settings)).items():
         value = getattr(settings, name)
-        made = coerce(value, hint, join_key(where, name))
+        made = validate_value(value, hint, join_setting_key(where, name))
         if made is not value:
             object.__setattr__(settings, name, made)  # frozen ones too, before anybody has seen them
 
 
-def coerce(value: Any, hint: Any, where: str) -> Any:
+def validate_value(value: Any, hint: Any, where: str) -> Any:
     """Return ``value`` as the annotated type ``hint``, within its bounds; a ConfigError names ``where``."""
-    plain, notes = _split_annotation(hint)
+    plain, notes = _split_validation_type(hint)
     if get_origin(plain) in (Union, types.UnionType):
-        return _coerce_union(value, get_args(plain), where)
-    made = _coerce_plain(value, plain, notes, where)
+        return _validate_union_value(value, get_args(plain), where)
+    made = _validate_plain_value(value, plain, notes, where)
     for note in notes:
         if isinstance(note, Range | Accepts) and not note.accepts(made):
             raise _UnfitValue(where, value, note.says or note.words("a whole number" if plain is int else "a number"))
     return made
 
 
-def infer_type(default: Any) -> Any:
+def infer_type_to_validate(default: Any) -> Any:
     """The type of an option that is declared by its default alone; null accepts anything."""
     if default is None:
         return Any
@@ -192,12 +198,12 @@ def infer_type(default: Any) -> Any:
     return type(default)
 
 
-def option_type(option: Option) -> Any:
+def option_type_to_validate(option: Option) -> Any:
     """What an option's values are converted to."""
-    return _choice_type(option[2]) if len(option) == 3 else infer_type(option[0])
+    return _choice_type_to_validate(option[2]) if len(option) == 3 else infer_type_to_validate(option[0])
 
 
-def _choice_type(kind: Any) -> Any:
+def _choice_type_to_validate(kind: Any) -> Any:
     return Literal[kind] if isinstance(kind, tuple) else kind
 
 
@@ -208,35 +214,35 @@ class _UnfitValue(ConfigError):
     """A value that is not what its field expects."""
 
     def __init__(self, where: str, value: object, expected: str) -> None:
-        super().__init__(f"{where}={format_value(value)}: expected {expected}")
+        super().__init__(f"{where}={format_setting_value(value)}: expected {expected}")
         self.where, self.expected = where, expected
 
 
-def refuse_unknown(values: Iterable[object], names: Iterable[str], where: str) -> None:
+def validate_setting_names(values: Iterable[object], names: Iterable[str], where: str) -> None:
     """Raises ConfigError for the first of ``values`` that is none of ``names``, with the nearest that are."""
     known = list(names)
     for key in values:
         if key not in known:
-            hint = nearest(str(key), known, prefix=join_key(where, "")) or "; there is none"
-            raise ConfigError(f"{cut(join_key(where, str(key)))}: no such setting{hint}")
+            hint = nearest(str(key), known, prefix=join_setting_key(where, "")) or "; there is none"
+            raise ConfigError(f"{cut_error_text(join_setting_key(where, str(key)))}: no such setting{hint}")
 
 
-def join_key(where: str, name: str) -> str:
+def join_setting_key(where: str, name: str) -> str:
     """The dotted key of a setting in a group, which is empty at the root."""
     return f"{where}.{name}" if where else name
 
 
-def format_value(value: object) -> str:
+def format_setting_value(value: object) -> str:
     """Return a value as users type it, cut where it is long; text that reads as something else is quoted."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if not isinstance(value, str):
-        return cut(" ".join(str(value).split()))
-    special = value.lower() in ("", "null", "true", "false") or _reads_as_number(value)
-    return cut(repr(value) if special or not value.isprintable() else value)
+        return cut_error_text(" ".join(str(value).split()))
+    special = value.lower() in ("", "null", "true", "false") or _setting_reads_as_number(value)
+    return cut_error_text(repr(value) if special or not value.isprintable() else value)
 
 
-def _reads_as_number(value: str) -> bool:
+def _setting_reads_as_number(value: str) -> bool:
     try:
         float(value)
     except ValueError:
@@ -246,7 +252,7 @@ def _reads_as_number(value: str) -> bool:
 
 def _describe_expected(hint: Any, where: str) -> str:
     """What a field expects."""
-    plain, notes = _split_annotation(hint)
+    plain, notes = _split_validation_type(hint)
     says = next((note.says for note in notes if isinstance(note, Accepts)), "")
     if says:
         return says
@@ -285,12 +291,12 @@ def field_types(cls: type) -> Mapping[str, Any]:
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
-def _split_annotation(hint: Any) -> tuple[Any, tuple[Any, ...]]:
+def _split_validation_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:
     """The type without its notes, and these."""
     return (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
 
 
-def _coerce_union(value: Any, options: tuple[Any, ...], where: str) -> Any:
+def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> Any:
     """The value as the first of the types that it is one of."""
     if value is None and type(None) in options:
         return None
@@ -298,7 +304,7 @@ def _coerce_union(value: Any, options: tuple[Any, ...], where: str) -> Any:
     for option in options:
         if option is not type(None):
             try:
-                return coerce(value, option, where)
+                return validate_value(value, option, where)
             except _UnfitValue as error:
                 if error.where != where:  # inside of a group that is the right one
                     raise
@@ -307,43 +313,43 @@ def _coerce_union(value: Any, options: tuple[Any, ...], where: str) -> Any:
     raise _UnfitValue(where, value, expected)
 
 
-def _coerce_plain(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
+def _validate_plain_value(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
     """``value`` as a type without notes; they are for the message alone."""
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
     if dataclasses.is_dataclass(kind) and isinstance(kind, type):
-        return validate(kind, value, where)
+        return validate_settings(kind, value, where)
     if origin is Literal:
         if any(value == a and type(value) is type(a) for a in args):
             return value
     elif isinstance(origin, type) and issubclass(origin, Mapping):
         if isinstance(value, Mapping):
-            return _coerce_entries(value, args, where)
-        raise ConfigError(f"{where}={format_value(value)}: expected entries, each as {where}.KEY=VALUE")
+            return _validate_entries(value, args, where)
+        raise ConfigError(f"{where}={format_setting_value(value)}: expected entries, each as {where}.KEY=VALUE")
     elif origin in (tuple, list):
         items = (
             args[:1] * len(value) if isinstance(value, list | tuple) and (origin is list or args[-1] is ...) else args
         )
         if isinstance(value, list | tuple) and len(items) == len(value):
             try:
-                return origin(coerce(v, item, where) for v, item in zip(value, items, strict=True))
+                return origin(validate_value(v, item, where) for v, item in zip(value, items, strict=True))
             except _UnfitValue:  # said of the whole list, below
                 pass
-    elif (made := _coerce_scalar(value, kind)) is not None:
+    elif (made := _validate_scalar(value, kind)) is not None:
         return made
     hint = Annotated[kind, *notes] if notes else kind
     raise _UnfitValue(where, value, _describe_expected(hint, where))
 
 
-def _coerce_entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dict[str, Any]:
+def _validate_entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dict[str, Any]:
     names, kind = args
     if get_origin(names) is Literal:
-        refuse_unknown(value, get_args(names), where)
-    return {str(k): coerce(v, kind, join_key(where, str(k))) for k, v in value.items()}
+        validate_setting_names(value, get_args(names), where)
+    return {str(k): validate_value(v, kind, join_setting_key(where, str(k))) for k, v in value.items()}
 
 
-def _coerce_scalar(value: Any, kind: Any) -> Any:
+def _validate_scalar(value: Any, kind: Any) -> Any:
     """``value`` as a ``kind``, or None where it is none."""
     truth = isinstance(value, bool)
     if kind is bool:

@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.channels import Channels
 from neuprim.core.compute.device import HOST
-from neuprim.core.conditions import Warn, flag, read_conditions
+from neuprim.core.conditions import Warn, condition_flag, read_conditions
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.model.fields import Conditions, ConditionSpec
 from neuprim.core.model.geometry import Geometry
@@ -158,7 +158,7 @@ class InspectionFrame:
         """
         missing = [name for name in self.needed if name not in self.conditions]
         if missing:
-            raise ConfigError(f"the primitives' colours depend on the {missing[0]}; give {flag(missing[0])}")
+            raise ConfigError(f"the primitives' colours depend on the {missing[0]}; give {condition_flag(missing[0])}")
         low, high = self.box
         center = torch.from_numpy((low + high) / 2).float()
         eye = center + torch.tensor([1.0, -1.6, 0.7]) * float(np.linalg.norm(high - low))
@@ -208,7 +208,7 @@ class _GivenConditions(dict[str, Tensor]):
     """Conditions of a frame; using one that was not given is an error that asks for it."""
 
     def __missing__(self, name: str) -> Tensor:
-        raise ConfigError(f"this needs the {name}; give {flag(name)}")
+        raise ConfigError(f"this needs the {name}; give {condition_flag(name)}")
 
 
 def read_inspected_conditions(

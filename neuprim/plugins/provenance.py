@@ -15,7 +15,7 @@ from packaging.version import InvalidVersion, Version
 
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.notices import warn_once
-from neuprim.core.validation import Accepts, validate
+from neuprim.core.validation import Accepts, validate_settings
 from neuprim.plugins.registry import (
     BUILT_IN,
     FoundScene,
@@ -108,7 +108,7 @@ class Provenance:
     @classmethod
     def from_dict(cls, value: object) -> Provenance:
         """Read :meth:`to_dict`'s values from an untrusted file."""
-        return validate(cls, value, "made_by")
+        return validate_settings(cls, value, "made_by")
 
     def origins(self) -> dict[str, str]:
         """Kind -> package and version, for people."""

@@ -15,7 +15,7 @@ from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.render.layer_frame import COMMON, LIGHTS, LayerSpec
 from neuprim.core.task import SceneSpec, TaskSpec
 from neuprim.core.used_settings import OPTIONAL
-from neuprim.core.validation import coerce, option_type
+from neuprim.core.validation import option_type_to_validate, validate_value
 
 _NESTED: dict[str, type] = {kind.__name__: kind for kind in (SceneSpec, ConditionSpec, LayerSpec)}
 _FUNCTIONS = ("Callable", "Display", "Illuminate")
@@ -146,7 +146,7 @@ def _check_spec_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
         plain = isinstance(entry[0], bool | int | float | str | list | Mapping | None)
         _require_member(plain, f"{where} has a default of type {type(entry[0]).__name__}; expected what YAML can hold")
         try:
-            coerce(entry[0], option_type(tuple(entry)), where)
+            validate_value(entry[0], option_type_to_validate(tuple(entry)), where)
         except ConfigError as error:
             raise _InvalidMember(f"the default of {error}") from None
     names = [name for name in OPTIONAL if name.startswith(groups)]

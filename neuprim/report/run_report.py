@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from neuprim.core.conditions import flag
+from neuprim.core.conditions import condition_flag
 from neuprim.core.io.files import write_text
 from neuprim.core.metrics import metric_from_json
 from neuprim.core.model.fields import ConditionSpec
@@ -425,7 +425,7 @@ def _report_commands_section(run: ReportedRun, conditions: Sequence[ConditionSpe
     lines = [(f"neuprim eval {folder}", "measure again"), (orbit, "fly around the scene")]
     for spec in conditions:
         if spec.sweep:
-            command = f"{orbit} {flag(spec.name)} {shlex.quote(spec.sweep)}"
+            command = f"{orbit} {condition_flag(spec.name)} {shlex.quote(spec.sweep)}"
             lines.append((command, f"fly around it while the {spec.name.replace('_', ' ')} changes"))
     items = "".join(f"<li><code>{escape(line)}</code><span>{escape(what)}</span></li>" for line, what in lines)
     return section("Go on", f'<ul class="commands">{items}</ul>')

@@ -16,7 +16,7 @@ import torch
 
 from neuprim.core import checkpoint
 from neuprim.core.compression import is_compressed
-from neuprim.core.conditions import flag, named, read_conditions, split_conditions
+from neuprim.core.conditions import condition_flag, named, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.files import StagedOutput, refuse_existing, staged_output, write_json
@@ -114,7 +114,7 @@ def _parse_run_export_options(
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_conditions(words, specs, bare=False)
     if conditions and not exporter.conditions:
-        raise ConfigError(f"{flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
+        raise ConfigError(f"{condition_flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
     given = set()
     for word in rest:
         key, equals, text = word.partition("=")
@@ -229,7 +229,7 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise ConfigError(f"--out {out}: exists and is not an empty folder")
     if name is None and is_compressed(path):
-        config = checkpoint.stored_config(path)
+        config = checkpoint.checkpoint_config(path)
         if config is None:
             raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
         return _write_imported_run(path, out, config, lambda folder: shutil.copyfile(path, folder / COMPRESSED))

@@ -12,7 +12,7 @@ from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import read_json_record, write_json
-from neuprim.core.validation import coerce, validate
+from neuprim.core.validation import validate_settings, validate_value
 from neuprim.runs.ground_truth import render_ground_truth_of_runs
 from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher, launch_jobs
@@ -115,12 +115,12 @@ def read_launch_record(file: Path, what: str) -> LaunchRecord | None:
     """
 
     def parse(data: Mapping[str, Any]) -> LaunchRecord:
-        words = coerce(data["words"], tuple[str, ...], "words")
-        runs = tuple(validate(LaunchedRun, run, "runs") for run in data["runs"])
+        words = validate_value(data["words"], tuple[str, ...], "words")
+        runs = tuple(validate_settings(LaunchedRun, run, "runs") for run in data["runs"])
         for run in runs:
             if Path(run.name).name != run.name or run.name in ("", ".", ".."):
                 raise ValueError(f"name {run.name!r} is no folder's")
-        return LaunchRecord(file, words, runs, coerce(data.get("joined_steps"), int | None, "joined_steps"))
+        return LaunchRecord(file, words, runs, validate_value(data.get("joined_steps"), int | None, "joined_steps"))
 
     return read_json_record(file, what, RECORD_HINT, _FORMAT, parse)
 

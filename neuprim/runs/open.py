@@ -10,7 +10,7 @@ from typing import Any
 from neuprim.config import Job, RunConfig
 from neuprim.config.stored_run import refuse_untrusted_run_links, refuse_untrusted_settings
 from neuprim.core.cameras.world import World
-from neuprim.core.checkpoint import load_model
+from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
@@ -85,7 +85,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
         config = replace(config, source=None)
     task = Job.of(config).task
     warn_of_other_neuprim(config.made_by, config.source)
-    model, header = load_model(model_file(run), task)
+    model, header = load_model_checkpoint(model_file(run), task)
     config = replace(config, renderer=with_available_render_backend(config.renderer))
     stored = StoredRun(config, task, run, model, header, task)
     if any(spec.place for spec in task.conditions) and not stored.world.identity:

@@ -31,7 +31,7 @@ from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.reduction import KINDS, reduce_model, reduction_names, validate_reduction
 from neuprim.core.render import RenderSettings, backends, render
-from neuprim.core.validation import Range, coerce, validate
+from neuprim.core.validation import Range, validate_settings, validate_value
 
 HEADS = ("renderer", "resolution", "density", "colour", "store")
 """First parts of the keys."""
@@ -200,7 +200,7 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
     for assignment in parse_overrides(overrides):
         head, dot, name = assignment.key.partition(".")
         if head == "resolution" and not dot:
-            resolution = coerce(assignment.value, _Resolution, "resolution")
+            resolution = validate_value(assignment.value, _Resolution, "resolution")
         elif head == "renderer" and dot:
             values[name] = assignment.value
         elif head in KINDS and dot:
@@ -216,7 +216,7 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
                 *reduction_names(model.density, model.colour),
             ]
             raise ConfigError(f"{assignment.key}: no setting of rendering{nearest(assignment.key, known)}")
-    settings = validate(RenderSettings, values, "renderer")
+    settings = validate_settings(RenderSettings, values, "renderer")
     if settings.near == "auto":
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
     backends.check_backend_name(settings.backend)

@@ -12,7 +12,7 @@ from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, read_stored_channels
-from neuprim.core.conditions import count_common_frames, flag, read_conditions
+from neuprim.core.conditions import condition_flag, count_condition_frames, read_conditions
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
@@ -192,7 +192,7 @@ class _RenderSession:
         illumination = self.task.environment(image, environment.samples, facts)
         clash = sorted(self.request.conditions.keys() & illumination.conditions[0].keys())
         if clash:
-            raise ConfigError(f"{flag(clash[0])} and --environment: give one of them")
+            raise ConfigError(f"{condition_flag(clash[0])} and --environment: give one of them")
         return illumination
 
     def _load_views(self) -> tuple[list[View], float | None]:
@@ -334,7 +334,7 @@ def set_run_view_conditions(
         :func:`neuprim.core.conditions.read_conditions`.
     """
     given = read_conditions(task.conditions, texts, warn)
-    frames = count_common_frames(texts, given)
+    frames = count_condition_frames(texts, given)
     if frames > 1:
         count = max(frames, len(views))
         digits = max(3, len(str(count - 1)))
@@ -348,7 +348,8 @@ def set_run_view_conditions(
         for view in animated:
             if spec.name not in view.conditions:
                 raise ConfigError(
-                    f"view {view.name} has no {spec.name}, which task {task.name!r} needs; give {flag(spec.name)}"
+                    f"view {view.name} has no {spec.name}, which task {task.name!r} needs; "
+                    f"give {condition_flag(spec.name)}"
                 )
     return animated, frames > 1
 

@@ -17,7 +17,7 @@ from typing import Any
 from neuprim.config import Job, RunConfig, find_config_plugins
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_output_overrides, quote_override
-from neuprim.core.checkpoint import load_model
+from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.metrics.image import format_metrics
@@ -223,7 +223,7 @@ def train_in_chunks(
     record = _fit_chunks(plan, record, events, launcher)
 
     def make(job: Job, dataset: Dataset, loss: Loss) -> Trainer:
-        models = [load_model(model_file(own.output_dir), job.task)[0] for own in plan.configs]
+        models = [load_model_checkpoint(model_file(own.output_dir), job.task)[0] for own in plan.configs]
         with attribute_errors(job.plugins.scene, "join"):
             model = plan.chunks.join(models)
         steps = record.joined_steps

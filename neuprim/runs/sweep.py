@@ -14,7 +14,7 @@ from pathlib import Path
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_output_overrides, parse_overrides, swept_override_keys
-from neuprim.core.errors import ConfigError, DataError, cut
+from neuprim.core.errors import ConfigError, DataError, cut_error_text
 from neuprim.core.io.files import write_text
 from neuprim.report.run_record import ReportedRun, read_reported_run
 from neuprim.report.sweep_page import SweepPageRun, write_sweep_page
@@ -53,7 +53,8 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
     for word in before.words:
         if "${" in word:  # a file must not read the environment; see neuprim.config.compose
             raise ConfigError(
-                f"{before.file}: {cut(word)} refers to something outside of the file; type the sweep's words again, "
+                f"{before.file}: {cut_error_text(word)} refers to something outside of the file; "
+                f"type the sweep's words again, "
                 f"with resume=true"
             )
     return [*before.words, *words]

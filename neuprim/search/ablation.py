@@ -26,7 +26,7 @@ from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
-from neuprim.core.validation import validate
+from neuprim.core.validation import validate_settings
 from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.executors import count_parallel_jobs
@@ -388,6 +388,6 @@ def _resume_ablation_set(
 
 def _parse_ablation_plan(file: Path, record: TradeoffRecord) -> AblationPlan | None:
     try:
-        return validate(AblationPlan, record.facts["plan"], "plan") if "plan" in record.facts else None
+        return validate_settings(AblationPlan, record.facts["plan"], "plan") if "plan" in record.facts else None
     except ConfigError as error:
         raise DataError(f"{file}: damaged ({error}); delete the folder to train anew") from error

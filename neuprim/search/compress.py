@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from neuprim.config import Job
-from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
+from neuprim.core.checkpoint import load_model_checkpoint, read_header_extra, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
 from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, NeuprimError
@@ -141,7 +141,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
         measured: dict[str, tuple[float, float]] = {}
         if dataset is not None:
             progress("measuring test views", 0.0)
-            decoded, _ = load_model(final, task)
+            decoded, _ = load_model_checkpoint(final, task)
             before, after = (measure_quality(one, task, dataset, config.renderer) for one in (model, decoded))
             measured = {name: (before[i], after[i]) for i, name in enumerate(("psnr", "ssim"))}
     parameters = tuple(

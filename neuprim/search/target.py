@@ -18,7 +18,7 @@ import torch
 
 from neuprim.config import Job, RunConfig, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings, SearchTarget
-from neuprim.core.checkpoint import load_model, read_header_extra, save_compressed
+from neuprim.core.checkpoint import load_model_checkpoint, read_header_extra, save_compressed
 from neuprim.core.compression import Quantizers
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
@@ -252,7 +252,7 @@ def _prune_full_run(
         record.why.append("nothing could be pruned")
         return before
     task = load_config_task(runner.config)
-    model, _ = load_model(made.run_dir / "model.safetensors", task)
+    model, _ = load_model_checkpoint(made.run_dir / "model.safetensors", task)
     held = _measure_target_held_out(runner, model)
     old, new = (count_compressed_trial_bytes(one, task) for one in (before.run_dir, made.run_dir))
     kept = predictor.margin(held) >= 0 and new < old
@@ -273,7 +273,7 @@ def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before
     With a limit of bytes alone, quantize as finely as it allows.
     """
     target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
-    model, header = load_model(before.run_dir / "model.safetensors", task)
+    model, header = load_model_checkpoint(before.run_dir / "model.safetensors", task)
     text = (before.run_dir / "config.yaml").read_text(encoding="utf-8")
     margin = predictor.margin(before.held)
     least = 0.0 if margin >= 0 else margin - ALLOWANCE
@@ -297,7 +297,7 @@ def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before
         most = 1e6 * target.megabytes
         quantizers, share = search.find_finest(lambda tried: save(tried) <= most, _FIRST_SHARE)
     size = save(quantizers)
-    decoded, _ = load_model(file, task)
+    decoded, _ = load_model_checkpoint(file, task)
     test = dict(zip(_MEASURES, measure_quality(decoded, task, runner.dataset, runner.config.renderer), strict=True))
     facts = {**before.facts, "rounding": share, "file": str(file)}
     return replace(before, held=_measure_target_held_out(runner, decoded), packed=size, test=test, facts=facts)

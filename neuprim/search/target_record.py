@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from neuprim.core.io.files import read_json_record, write_json
-from neuprim.core.validation import validate
+from neuprim.core.validation import validate_settings
 
 TARGET_FILE, _FORMAT = "target.json", 1
 
@@ -151,7 +151,7 @@ def read_target_record(folder: Path) -> TargetRecord | None:
 
 
 def _parse_target_record(data: Mapping[str, Any]) -> TargetRecord:
-    record = validate(TargetRecord, {f.name: data[f.name] for f in fields(TargetRecord)})
+    record = validate_settings(TargetRecord, {f.name: data[f.name] for f in fields(TargetRecord)})
     for attempt in record.attempts:
         if not (attempt.primitives > 0 and attempt.steps > 0 and Path(attempt.folder).name == attempt.folder):
             raise ValueError("attempts: expected positive primitives and steps, and settings that name a folder")

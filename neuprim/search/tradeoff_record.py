@@ -16,7 +16,7 @@ from typing import Annotated, Any
 
 from neuprim.core.io.files import read_json_record, write_json, write_text
 from neuprim.core.metrics import metric_from_json, metric_to_json
-from neuprim.core.validation import Range, coerce, validate
+from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.search.pareto import Objectives, pareto_front
 
 _FORMAT = 1
@@ -139,7 +139,7 @@ class TradeoffPoint:
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := metric_from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in (*_DRAWN, *(_TRAINED if data.get("run_dir") else ()))}
-        return replace(validate(cls, {**own, "quality": {}}, "points"), quality=quality)
+        return replace(validate_settings(cls, {**own, "quality": {}}, "points"), quality=quality)
 
 
 def name_variant(turned: Sequence[str], length: float) -> str:
@@ -223,8 +223,8 @@ def read_tradeoff_record(path: Path) -> TradeoffRecord | None:
 
     def parse(data: Mapping[str, Any]) -> TradeoffRecord:
         points = [TradeoffPoint.from_dict(entry) for entry in data["points"]]
-        left_out = [validate(LeftOutPoint, entry, "left_out") for entry in data["left_out"]]
-        speed, size = (coerce(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
+        left_out = [validate_settings(LeftOutPoint, entry, "left_out") for entry in data["left_out"]]
+        speed, size = (validate_value(data["front"][name], list[int], f"front.{name}") for name in ("speed", "size"))
         if not points or not all(0 <= number < len(points) for number in (*speed, *size)):
             raise ValueError(f"front: expected numbers of the {len(points)} points")
         known = ("format", "same", "points", "left_out", "front")

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from neuprim.config import RunConfig, load_config_task
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.core.checkpoint import load_model, save_compressed
+from neuprim.core.checkpoint import load_model_checkpoint, save_compressed
 from neuprim.core.compression import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
@@ -155,7 +155,7 @@ class TrialRunner:
 def count_compressed_trial_bytes(folder: Path, task: TaskSpec) -> int:
     """Return the bytes of a run's model when compressed at the default level."""
     file, config = folder / "packed.neuprim", (folder / "config.yaml").read_text(encoding="utf-8")
-    model, _ = load_model(folder / "model.safetensors", task)
+    model, _ = load_model_checkpoint(folder / "model.safetensors", task)
     save_compressed(file, model, task.name, {}, bit_table(DEFAULT_LEVEL, (), model.specs), config)
     size = file.stat().st_size
     file.unlink()

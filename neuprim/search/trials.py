@@ -22,7 +22,7 @@ from neuprim.config.run_config import flatten
 from neuprim.core.data import Dataset
 from neuprim.core.errors import DataError, NeuprimError
 from neuprim.core.io.files import read_json_record, write_json
-from neuprim.core.validation import validate
+from neuprim.core.validation import validate_settings
 from neuprim.runs.fit import Event, Events, Finishing, Note, Preparing, Step, ignore_run_event
 from neuprim.runs.launch.jobs import ENDED, JobResult, JobStatus, LaunchJob
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
@@ -97,7 +97,7 @@ def read_trial(folder: Path) -> TrialRecord | None:
     what, instead = "the record of a trial", "delete its folder to train anew"
 
     def parse(data: Mapping[str, Any]) -> TrialRecord:
-        return validate(TrialRecord, {name: data[name] for name in ("asked", "views", "outcome")})
+        return validate_settings(TrialRecord, {name: data[name] for name in ("asked", "views", "outcome")})
 
     return read_json_record(folder / TRIAL_FILE, what, instead, _FORMAT, parse)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
-from neuprim.core.conditions import flag, read_conditions
+from neuprim.core.conditions import condition_flag, read_conditions
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.geometry import Geometry
@@ -65,9 +65,9 @@ class ConditionControls:
             slider = gui.add_slider(name, low, high, (high - low) / 1000, start)
             slider.on_update(lambda _: self._on_slider(spec, slider.value))
         hint = f"{spec.unit}; as `neuprim render` takes it"
-        text = gui.add_text(flag(name), self._format(spec), hint=hint)
+        text = gui.add_text(condition_flag(name), self._format(spec), hint=hint)
         handle = self._add_handle(spec)
-        hint = f"{flag(name)} {spec.sweep}, or the values above where they are several"
+        hint = f"{condition_flag(name)} {spec.sweep}, or the values above where they are several"
         play = gui.add_checkbox(f"play {name}", False, hint=hint)
 
         def update(value: Tensor, typed: bool = False) -> None:

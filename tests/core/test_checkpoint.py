@@ -45,7 +45,7 @@ def refused(path: Path, task: TaskSpec = TASK) -> str:
     machine does."""
     start = time.thread_time()
     with pytest.raises(CheckpointError) as caught:
-        checkpoint.load_model(path, task)
+        checkpoint.load_model_checkpoint(path, task)
     assert time.thread_time() - start < 1.0
     assert str(path) in str(caught.value)
     return str(caught.value)
@@ -64,7 +64,7 @@ def rewrite(
 
 
 def test_round_trip(saved: Path) -> None:
-    again, header = checkpoint.load_model(saved, TASK)
+    again, header = checkpoint.load_model_checkpoint(saved, TASK)
     torch.manual_seed(0)
     first = checkpoint.read_tensors(saved, "model")[1]
     assert list(again.params) == [s.name for s in again.specs]

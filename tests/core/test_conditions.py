@@ -10,7 +10,13 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.conditions import FRAMES, count_common_frames, export_frames, read_conditions, split_conditions
+from neuprim.core.conditions import (
+    FRAMES,
+    conditions_per_frame,
+    count_condition_frames,
+    read_conditions,
+    split_conditions,
+)
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.tasks.relight.lighting import light_orbit_in_frames, parse_light_positions
@@ -139,9 +145,9 @@ def test_numbers_that_are_not_finite_are_always_refused(text: str) -> None:
 
 
 def test_an_export_has_every_condition_in_each_frame() -> None:
-    frames = export_frames(SPECS, {"sun": "1,2,0", "wavelength_shift": "0,1"}, several=True)
+    frames = conditions_per_frame(SPECS, {"sun": "1,2,0", "wavelength_shift": "0,1"}, several=True)
     assert [(float(f["wavelength_shift"]), f["sun"].tolist()) for f in frames] == [(0.0, [1, 2, 0]), (1.0, [1, 2, 0])]
-    assert export_frames((), {}) == [{}]
+    assert conditions_per_frame((), {}) == [{}]
     for texts, several, expected in (
         ({"wavelength_shift": "0,1", "sun": "0,0,0"}, False, "--wavelength-shift 0,1: 2 values; expected one value"),
         (
@@ -156,7 +162,7 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
         ),
     ):
         with pytest.raises(ConfigError, match=expected):
-            export_frames(SPECS, texts, several)
+            conditions_per_frame(SPECS, texts, several)
 
 
 # ---------------------------------------------------------------- two animations at once
@@ -186,6 +192,6 @@ def lengths(time: str, light: str) -> tuple[int, int]:
 def test_an_animation_without_a_length_takes_the_others(time: str, light: str, count: int) -> None:
     assert lengths(time, light) == (count, count)
     found = read_conditions([TIME, LIGHT], {"time": time, "light": light})
-    assert count_common_frames({}, found) == count
+    assert count_condition_frames({}, found) == count
     assert float(found["time"][0]) == pytest.approx(float(time.replace(":", ",").split(",")[0]))
     assert len({tuple(place.tolist()) for place in found["light"]}) == count, "once round, no place twice"

@@ -13,13 +13,13 @@ import pytest
 from neuprim.core.errors import ConfigError
 from neuprim.core.validation import (
     Range,
-    coerce,
-    infer_type,
+    infer_type_to_validate,
     nonempty_text,
-    option_type,
-    validate,
+    option_type_to_validate,
     validate_choices,
     validate_fields,
+    validate_settings,
+    validate_value,
 )
 
 
@@ -46,7 +46,7 @@ class Outer:
 
 def test_what_loses_nothing_is_converted() -> None:
     values = {"path": 123, "inner": {"size": 32.0}, "exposure": "1e-3", "rates": {"a": 1}, "range": [0, 1]}
-    made = validate(Outer, {**values, "free": object}, "scene")
+    made = validate_settings(Outer, {**values, "free": object}, "scene")
     assert made.path == Path("123") and made.inner == Inner(size=32) and isinstance(made.inner.size, int)
     assert (
         made.exposure == 1e-3
@@ -54,8 +54,8 @@ def test_what_loses_nothing_is_converted() -> None:
         and made.range == (0.0, 1.0)
         and made.free is object
     )
-    assert validate(Outer, {"path": "x", "exposure": "auto", "inner": Inner(9)}).inner.size == 9
-    assert validate(Outer, made) is made
+    assert validate_settings(Outer, {"path": "x", "exposure": "auto", "inner": Inner(9)}).inner.size == 9
+    assert validate_settings(Outer, made) is made
 
 
 @pytest.mark.parametrize(
@@ -89,7 +89,7 @@ def test_what_loses_nothing_is_converted() -> None:
 )
 def test_one_line_with_key_value_and_what_is_expected(values: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError) as caught:
-        validate(Outer, values, "scene")
+        validate_settings(Outer, values, "scene")
     assert str(caught.value) == message
 
 
@@ -109,7 +109,7 @@ def test_python_code_is_checked_too_and_rules_between_fields_see_converted_value
     with pytest.raises(ConfigError, match=r"^scene\.low=-1: expected a number of at least 0$"):
         replace(Verified(), low=-1)
     with pytest.raises(ConfigError, match=r"^scene\.low=2: expected at most scene\.high, 1$"):
-        validate(Verified, {"low": "2"}, "scene")
+        validate_settings(Verified, {"low": "2"}, "scene")
 
 
 def test_free_settings_take_hints_types_and_tuples() -> None:
@@ -131,8 +131,8 @@ def test_free_settings_take_hints_types_and_tuples() -> None:
 
 
 def test_options_have_the_type_of_their_default_or_their_own() -> None:
-    assert option_type((1.0, "help")) is float and option_type((None, "help")) is Any
-    assert option_type(("a", "help", ("a", "b"))) == Literal["a", "b"]
-    assert coerce([3], infer_type([1, 2]), "x") == [3]
+    assert option_type_to_validate((1.0, "help")) is float and option_type_to_validate((None, "help")) is Any
+    assert option_type_to_validate(("a", "help", ("a", "b"))) == Literal["a", "b"]
+    assert validate_value([3], infer_type_to_validate([1, 2]), "x") == [3]
     with pytest.raises(ConfigError, match=r"^x=3: expected a list such as \[1, 2\]$"):
-        coerce(3, infer_type([1, 2]), "x")
+        validate_value(3, infer_type_to_validate([1, 2]), "x")

@@ -327,7 +327,7 @@ def _read_compressed(folder: Path) -> None:
     from neuprim.tasks.static import TASK
 
     for path in sorted(folder.glob("*.neuprim")):
-        checkpoint.load_model(path, TASK)
+        checkpoint.load_model_checkpoint(path, TASK)
 
 
 def _read_run(folder: Path) -> None:

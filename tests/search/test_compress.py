@@ -141,7 +141,7 @@ def test_training_views_decide_how_coarse_numbers_are(whole: Path, tmp_path: Pat
     base, sizes = quality(model), []
     for tolerance in (0.05, 0.3, 1.5):
         made = compress_run(whole, tolerance=tolerance, steps=steps, out=tmp_path / f"{tolerance}")
-        assert base - quality(checkpoint.load_model(made.file, task)[0]) <= tolerance + 1e-4
+        assert base - quality(checkpoint.load_model_checkpoint(made.file, task)[0]) <= tolerance + 1e-4
         assert made.steps == steps and any("the last bit of every number" in note for note in made.notes)
         sizes.append(sum(parameter.after for parameter in made.parameters))
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.9 * sizes[0]

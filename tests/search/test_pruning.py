@@ -83,7 +83,7 @@ def test_every_command_reads_it(left: Path, tmp_path: Path) -> None:
     again = import_run_directory(tmp_path / "model.npz", tmp_path / "again")
     assert evaluate_run(again)["psnr"] == pytest.approx(evaluate_run(left)["psnr"], abs=1e-5)
     small = compress_run(CompressRequest(left, level=1, out=tmp_path / "small.neuprim"))
-    back, _ = checkpoint.load_model(small.file, load_run(left).task)
+    back, _ = checkpoint.load_model_checkpoint(small.file, load_run(left).task)
     model = load_run(left).model
     assert count_unpruned_numbers(back) <= count_unpruned_numbers(model)  # what is zero comes back as zero
     assert small.measured["psnr"][0] - small.measured["psnr"][1] < 0.2

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import DataError, cut
+from neuprim.core.errors import DataError, cut_error_text
 from neuprim.core.io.plain import finite_number, load_json
 
 _MISSING = object()
@@ -24,7 +24,7 @@ def _describe_json(value: Any) -> str:
         return f"a list of {len(value)}"
     if isinstance(value, dict):
         return "an object"
-    return cut(json.dumps(value), 60)
+    return cut_error_text(json.dumps(value), 60)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class JsonReader:
         matrix = self.array(key, (len(rows), 4), expected)
         last = torch.tensor([[0.0, 0.0, 0.0, 1.0]], dtype=torch.float64)
         if len(rows) == 4 and (matrix[3] - last[0]).abs().max() > 1e-6:
-            raise DataError(f"{self.where}: {key}[3] is {cut(str(rows[3]))}; expected 0 0 0 1")
+            raise DataError(f"{self.where}: {key}[3] is {cut_error_text(str(rows[3]))}; expected 0 0 0 1")
         return torch.cat([matrix[:3], last])
 
     def objects(self, key: str) -> Iterator[JsonReader]:

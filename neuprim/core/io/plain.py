@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import yaml
 
-from neuprim.core.errors import DataError, cut
+from neuprim.core.errors import DataError, cut_error_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -53,14 +53,14 @@ def load_yaml(text: str) -> Any:
 
 def _parse_int(text: str) -> int:
     if len(text.lstrip("-")) > _MAX_DIGITS or not -(2**63) <= int(text) < 2**64:
-        raise ValueError(f"{cut(text)} has more than 64 bits")
+        raise ValueError(f"{cut_error_text(text)} has more than 64 bits")
     return int(text)
 
 
 def _parse_float(text: str) -> float:
     value = float(text)
     if math.isinf(value):
-        raise ValueError(f"{cut(text)} is larger than any number here")
+        raise ValueError(f"{cut_error_text(text)} is larger than any number here")
     return value
 
 
@@ -86,7 +86,7 @@ class _PlainYamlLoader(yaml.SafeLoader):
             value = None
         if value is None or (kind == "int" and not -(2**63) <= value < 2**64):
             raise yaml.constructor.ConstructorError(
-                None, None, f"{cut(node.value)} is larger than any number here", node.start_mark
+                None, None, f"{cut_error_text(node.value)} is larger than any number here", node.start_mark
             )
         return value
 

@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
-from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError, cut
+from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NeuprimError, cut_error_text
 from neuprim.core.io.files import atomic_path, checked_atomic_path, fill_folder
 
 MAX_WAIT = 60.0  # seconds to wait for a shared folder that disappeared
@@ -37,9 +37,9 @@ def open_store(address: str, copies: Path) -> Store:
     """
     protocol, is_url, path = address.partition("://")
     if "::" in address or (is_url and protocol not in PROTOCOLS):
-        what = "a chain of protocols" if "::" in address else f"protocol {cut(protocol)!r}"
+        what = "a chain of protocols" if "::" in address else f"protocol {cut_error_text(protocol)!r}"
         expected = f"a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER"
-        raise ConfigError(f"{cut(address)}: {what}; expected {expected}")
+        raise ConfigError(f"{cut_error_text(address)}: {what}; expected {expected}")
     if not is_url:
         return Store.local(Path(address).expanduser().absolute())
     if protocol in ("file", "local"):

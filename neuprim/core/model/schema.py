@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 import torch
 from torch import Tensor
 
-from neuprim.core.validation import Range, coerce
+from neuprim.core.validation import Range, validate_value
 
 RateUnit = Literal["absolute", "extent"]
 """What a learning rate is a multiple of; see :class:`ParameterSpec`."""
@@ -67,11 +67,11 @@ class InitContext:
     def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
         """Return ``settings[name]``, strictly between ``low`` and ``high``, or raise ConfigError."""
         bounds = Range(above=low, below=high)
-        return float(coerce(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
+        return float(validate_value(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
 
     def choice(self, name: str, *offered: str) -> str:
         """Return ``settings[name]``, one of those offered (default: the first), or raise ConfigError."""
-        return str(coerce(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
+        return str(validate_value(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from neuprim.core.errors import ConfigError, one_line
 from neuprim.core.io.plain import load_json
-from neuprim.core.validation import validate
+from neuprim.core.validation import validate_settings
 
 if TYPE_CHECKING:
     from neuprim.runs.fit import Event, Events
@@ -147,6 +147,6 @@ def read_status(file: Path) -> JobStatus | None:
     """Return the status in a file; None where there is none that can be read."""
     try:
         data: Any = load_json(file.read_text(encoding="utf-8"))
-        return validate(JobStatus, {f.name: data[f.name] for f in fields(JobStatus)})
+        return validate_settings(JobStatus, {f.name: data[f.name] for f in fields(JobStatus)})
     except (OSError, ValueError, KeyError, TypeError, RecursionError, ConfigError):
         return None

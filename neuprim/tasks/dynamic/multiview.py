@@ -44,7 +44,7 @@ from neuprim.core.data.transforms_json import TransformsLayout, read_image_frame
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
-from neuprim.core.validation import Accepts, validate
+from neuprim.core.validation import Accepts, validate_settings
 
 _AUTO = "auto"
 _TimeRange = tuple[float, float]
@@ -58,7 +58,7 @@ def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) ->
         DataError: missing or damaged files, wrong or missing fields, times that are missing or out of range, impossible
             cameras, empty splits.
     """
-    options = validate(MultiviewSettings, settings, "scene")
+    options = validate_settings(MultiviewSettings, settings, "scene")
     folder = find_data_folder(options.path)
     name, single = folder.resolve().name, folder / "transforms.json"
     files = {split: folder / f"transforms_{split}.json" for split in (options.train_split, options.test_split)}

@@ -41,7 +41,7 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.images import read_image
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
-from neuprim.core.validation import Accepts, Range, validate
+from neuprim.core.validation import Accepts, Range, validate_settings
 from neuprim.scenes.lit import NEAR_LIGHTS, PARTS, LitSettings, generate_lit_solids
 from neuprim.tasks.relight.lighting import Lighting, olat_percentile_exposure
 
@@ -67,7 +67,7 @@ class OlatSettings(FolderSettings):
 
 def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load the OLAT scene in the folder ``settings["path"]``, in linear light over the exposure."""
-    options = validate(OlatSettings, settings, "scene")
+    options = validate_settings(OlatSettings, settings, "scene")
     folder = find_data_folder(options.path)
     train, test = read_image_splits(
         folder,
@@ -180,7 +180,7 @@ class LitSolidsSettings(LitSettings):
 
 def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=lit_solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
-    options = validate(LitSolidsSettings, settings, "scene")
+    options = validate_settings(LitSolidsSettings, settings, "scene")
     drawn = LitSettings(**{f.name: getattr(options, f.name) for f in fields(LitSettings)})
     folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
     reading = {"background": options.background, "hold_out": options.hold_out}

@@ -53,7 +53,7 @@ from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
-from neuprim.core.validation import nonempty_text, validate
+from neuprim.core.validation import nonempty_text, validate_settings
 from neuprim.scenes.room import RoomSettings, generate_room
 from neuprim.scenes.solids import SolidsSettings, generate_solids
 
@@ -71,7 +71,7 @@ class BlenderSettings(FolderSettings):
 
 def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load a NeRF-synthetic folder; straight-alpha PNG is premultiplied in its stored sRGB values."""
-    asked = validate(BlenderSettings, settings, "scene")
+    asked = validate_settings(BlenderSettings, settings, "scene")
     folder = find_data_folder(asked.path)
 
     def read(split: str) -> list[ImageFrame]:
@@ -99,7 +99,7 @@ class NerfstudioSettings(FolderSettings):
 
 def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load a nerfstudio or instant-ngp capture; photographs are undistorted and masked."""
-    asked = validate(NerfstudioSettings, settings, "scene")
+    asked = validate_settings(NerfstudioSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     path = folder / "transforms.json"
     document = JsonReader.open(path)
@@ -130,7 +130,7 @@ class ColmapSettings(FolderSettings):
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load a COLMAP project with its points; photographs are undistorted, and what they do not show is masked."""
-    asked = validate(ColmapSettings, settings, "scene")
+    asked = validate_settings(ColmapSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     model = folder / asked.model
     if asked.model == "auto":
@@ -246,12 +246,12 @@ def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud 
 
 def load_solids_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
-    folder = generate_solids(validate(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
+    folder = generate_solids(validate_settings(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def load_room_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=room``: drawn on first use, read from ``context.cache_dir`` afterwards."""
-    folder = generate_room(validate(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
+    folder = generate_room(validate_settings(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
     dataset = load_nerfstudio({"path": str(folder)}, context)
     return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

@@ -41,7 +41,7 @@ def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: i
     task, model = example(name)
     path = tmp_path / "m.neuprim"
     checkpoint.save_compressed(path, model, task.name, {"background": [0.5], "note": "naïve"}, LEVELS[level])
-    again, header = checkpoint.load_model(path, task)
+    again, header = checkpoint.load_model_checkpoint(path, task)
     assert header["note"] == "naïve" and header["primitives"] == model.count and header["background"] == [0.5]
     assert type(again.density) is type(model.density) and again.colour.settings() == model.colour.settings()
     wanted, made = stored(model, LEVELS[level])
@@ -67,13 +67,13 @@ def test_a_bit_says_who_does_without_a_piece(tmp_path: Path, name: str) -> None:
     files = []
     for path in (tmp_path / "0", tmp_path / "1"):
         checkpoint.save_compressed(path, pruned, task.name, {}, LEVELS[3])
-        pruned, _ = checkpoint.load_model(path, task)
+        pruned, _ = checkpoint.load_model_checkpoint(path, task)
         files.append(path.read_bytes())
     assert files[0] == files[1]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(codec, "_MIN_MASKED", 2.0)
         checkpoint.save_compressed(tmp_path / "2", pruned, task.name, {}, LEVELS[3])
-    plain, _ = checkpoint.load_model(tmp_path / "2", task)
+    plain, _ = checkpoint.load_model_checkpoint(tmp_path / "2", task)
     assert all(torch.equal(value, plain.params[key]) for key, value in pruned.params.items())
     if prunable_units_of_model(model.density, model.colour):
         assert len(files[0]) < 0.95 * (tmp_path / "2").stat().st_size
@@ -143,7 +143,7 @@ def test_words_that_mean_nothing(level: int, word: str, message: str) -> None:
 def test_rounded_tensors_are_what_comes_back_with_their_own_gradients(tmp_path: Path, name: str) -> None:
     task, model = example(name)
     checkpoint.save_compressed(tmp_path / "m", model, task.name, {}, LEVELS[4])
-    again, _ = checkpoint.load_model(tmp_path / "m", task)
+    again, _ = checkpoint.load_model_checkpoint(tmp_path / "m", task)
     wanted, made = stored(model, LEVELS[4])
     leaves = {key: value.clone().requires_grad_() for key, value in wanted.params.items()}
     found = fake_quantize(leaves, made)
@@ -189,7 +189,7 @@ def test_every_column_brings_the_error_that_it_may(tmp_path: Path, name: str) ->
             assert bool((brought < 1.25 * error).all()) and bool((brought > 0.7 * error)[varied].all()), spec.name
     path = tmp_path / "m"
     checkpoint.save_compressed(path, whole, task.name, {}, made)
-    again = checkpoint.load_model(path, task)[0]
+    again = checkpoint.load_model_checkpoint(path, task)[0]
     rows = codec.storage_order(whole, made)
     for key in (k for k in back if k != "quats"):
         assert torch.equal(again.params[key], back[key][rows]), key

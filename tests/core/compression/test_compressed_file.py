@@ -44,7 +44,7 @@ def refused(path: Path, *words: str) -> str:
     does."""
     start = time.thread_time()
     with pytest.raises(CheckpointError) as caught:
-        checkpoint.load_model(path, TASK)
+        checkpoint.load_model_checkpoint(path, TASK)
     assert time.thread_time() - start < 1.0
     message = str(caught.value)
     assert str(path) in message and "\n" not in message
@@ -141,8 +141,8 @@ def test_the_documentation_is_all_that_a_reader_needs(tmp_path: Path, name: str,
     task, model = example(name, 25)
     checkpoint.save_compressed(tmp_path / "m", model, task.name, {"note": "naïve"}, LEVELS[level], CONFIG_TEXT)
     header, found, text = read_by_the_book((tmp_path / "m").read_bytes())
-    again, wanted = checkpoint.load_model(tmp_path / "m", task)
-    assert header == wanted and text == CONFIG_TEXT == checkpoint.stored_config(tmp_path / "m")
+    again, wanted = checkpoint.load_model_checkpoint(tmp_path / "m", task)
+    assert header == wanted and text == CONFIG_TEXT == checkpoint.checkpoint_config(tmp_path / "m")
     assert found.keys() == again.params.keys()
     for key, value in again.params.items():
         assert found[key].tobytes() == value.numpy().tobytes(), key
@@ -206,7 +206,7 @@ def assembled(
 def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
     path = tmp_path / "any name"
     path.write_bytes(by_hand())
-    model, header = checkpoint.load_model(path, TASK)
+    model, header = checkpoint.load_model_checkpoint(path, TASK)
     p = model.params
     assert p["means"].tolist() == [[-1.0, 0.0, 1.0], [2.0, 2.0, 2.0]]
     assert p["log_scales"].tolist() == [[-2.0, -2.0, 0.5], [-1.0, 0.0, 0.5]]
@@ -214,7 +214,7 @@ def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
     assert p["quats"][1].tolist() == pytest.approx([0.5**0.5, 0.0, -(0.5**0.5), 0.0])
     assert p["b2"].tolist() == [[258.0], [4095.0]] and p["sh_dc"].tolist() == [[0.5] * 3] * 2
     assert p["W1"].shape == (2, 0, 3)
-    assert header["task"] == "static" and checkpoint.stored_config(path) is None and is_compressed(path)
+    assert header["task"] == "static" and checkpoint.checkpoint_config(path) is None and is_compressed(path)
     assert checkpoint.read_header(path, "model") == header
     with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
         checkpoint.read_header(path, "checkpoint")
@@ -238,7 +238,7 @@ def test_sparse_columns_by_hand(tmp_path: Path) -> None:
         (0, b"\x01\x02", [1.0, 2.0]),
     ):
         (tmp_path / "m").write_bytes(by_hand(first=rows, sections={"b2": sparse(mask_of, codes)}))
-        assert checkpoint.load_model(tmp_path / "m", TASK)[0].params["b2"].flatten().tolist() == wanted
+        assert checkpoint.load_model_checkpoint(tmp_path / "m", TASK)[0].params["b2"].flatten().tolist() == wanted
 
 
 def zstd(data: bytes, **options: Any) -> bytes:
@@ -346,11 +346,11 @@ from pathlib import Path
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
 from neuprim.tasks.static import TASK
-checkpoint.load_model(Path(sys.argv[1]), TASK)
+checkpoint.load_model_checkpoint(Path(sys.argv[1]), TASK)
 before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
 for name in sys.argv[2:]:
     try:
-        checkpoint.load_model(Path(name), TASK)
+        checkpoint.load_model_checkpoint(Path(name), TASK)
         raise SystemExit(f"{name} was read")
     except CheckpointError:
         pass

@@ -9,7 +9,7 @@ import pytest
 import yaml
 
 from neuprim.core.checkpoint import read_header, write_tensors
-from neuprim.core.errors import CheckpointError, cut, one_line
+from neuprim.core.errors import CheckpointError, cut_error_text, one_line
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.io.plain import finite_number, load_json, load_yaml
 
@@ -56,7 +56,7 @@ def test_a_header_with_anything_but_numbers_is_one_line(tmp_path: Path, key: str
 
 
 def test_messages_are_short() -> None:
-    assert cut("x" * 80) == "x" * 80 and cut("x" * 10**6) == "x" * 77 + "..."
+    assert cut_error_text("x" * 80) == "x" * 80 and cut_error_text("x" * 10**6) == "x" * 77 + "..."
     assert len(str(JsonReader({"a": "x" * 10**6}, "f").fail("a", "a number"))) < 150
     message = one_line(CheckpointError("f: key is " + "x" * 10**6 + "; expected a number")) or ""
     assert len(message) < 1600 and message.startswith("f: key is x") and message.endswith("; expected a number")

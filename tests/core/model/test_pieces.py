@@ -130,7 +130,7 @@ def file(tmp_path: Path, task: TaskSpec) -> Path:
 
 
 def test_a_pruned_model_loads_as_it_was(file: Path, task: TaskSpec) -> None:
-    model, header = checkpoint.load_model(file, task)
+    model, header = checkpoint.load_model_checkpoint(file, task)
     assert checkpoint.read_header(file, "model")["sparse"] and "sparse" not in header  # the model in memory is whole
     expected = pruned(made(CosineDensity(2, edge=2, gain=True), SphericalHarmonics(3)))
     assert all(torch.equal(model.params[name], value) for name, value in expected.params.items())
@@ -164,5 +164,5 @@ def test_files_that_lie_are_refused(lie: str, file: Path, task: TaskSpec) -> Non
     change(tensors)
     save_file({name: t.contiguous() for name, t in tensors.items()}, str(file), metadata=metadata)
     with pytest.raises(CheckpointError) as caught:
-        checkpoint.load_model(file, task)
+        checkpoint.load_model_checkpoint(file, task)
     assert expected in str(caught.value) and str(file) in str(caught.value)

@@ -153,7 +153,7 @@ def test_a_part_of_time_can_be_taken_away() -> None:
 def test_files_keep_seams_and_labels(tmp_path: Path) -> None:
     whole = join_time_chunks(three(), [0, 1, 2], SEAMS)
     checkpoint.save_model(tmp_path / "model.safetensors", whole, "dynamic", {})
-    again, _ = checkpoint.load_model(tmp_path / "model.safetensors", TASK)
+    again, _ = checkpoint.load_model_checkpoint(tmp_path / "model.safetensors", TASK)
     assert again.density.settings() == whole.density.settings()
     assert torch.equal(again.params["chunk"], whole.params["chunk"])
 

@@ -15,7 +15,7 @@ from scipy import ndimage
 from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
-from neuprim.core.validation import Accepts, Range, Unbounded, field_types, refuse_unknown, validate_fields
+from neuprim.core.validation import Accepts, Range, Unbounded, field_types, validate_fields, validate_setting_names
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance
 
 Axis = Literal["y", "z"]
@@ -198,7 +198,7 @@ def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
     Raises:
         ConfigError: no such setting, a value of another form, or an impossible one.
     """
-    refuse_unknown(changes, field_types(Optics), "scene.optics")
+    validate_setting_names(changes, field_types(Optics), "scene.optics")
     light = changes.get("light")
     if optics.light is not None and isinstance(light, Mapping):
         changes = {**changes, "light": {**vars(optics.light), **light}}

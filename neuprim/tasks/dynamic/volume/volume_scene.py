@@ -25,7 +25,7 @@ from neuprim.core.io.vdb import VdbFrame, vdb_sequence
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunk, Chunks, SceneContext
-from neuprim.core.validation import Accepts, Range, coerce, nonempty_text, validate, validate_fields
+from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fields, validate_settings, validate_value
 from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.scenes.smoke.smoke_scenes import MAX_TIMESTEPS, Resolution, simulate_smoke
 from neuprim.tasks.dynamic.time_density import ChunkOverlaps, TimeDensity
@@ -144,7 +144,7 @@ def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the 
         ConfigError: another form than "all", "FIRST:LAST" or "FIRST:LAST:STEP".
         DataError: none of the frames exists.
     """
-    wanted = _vdb_frame_range(coerce(frames, Frames, "scene.frames"))
+    wanted = _vdb_frame_range(validate_value(frames, Frames, "scene.frames"))
     if wanted is None:
         return list(numbers)
     chosen = [n for n in numbers if n in wanted]
@@ -222,7 +222,7 @@ def open_volume_source(settings: Mapping[str, Any], context: SceneContext) -> Ca
 def _prepare_vdb_scene(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> _PreparedVdbScene:
-    options = validate(VdbSceneSettings, settings, "scene")
+    options = validate_settings(VdbSceneSettings, settings, "scene")
     options.resolve_optics()  # report typing errors before anything is simulated
     if options.vdb is not None:
         folder, name = options.vdb, options.vdb.name

@@ -17,7 +17,7 @@ from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
-from neuprim.core.validation import nonempty_text, validate
+from neuprim.core.validation import nonempty_text, validate_settings
 from neuprim.scenes.image_set import Progress, hash_settings
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, Daylight, daylight_radiance
@@ -55,7 +55,7 @@ class MeshSettings(SolidsSettings):
 
 def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     """Load ``scene=mesh``, drawn on first use; raises DataError for a damaged model or files outside its folder."""
-    asked = validate(MeshSettings, settings, "scene")
+    asked = validate_settings(MeshSettings, settings, "scene")
     folder = generate_mesh_images(asked, context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import load_blender
 

@@ -23,23 +23,23 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.conformance.field_checks import (
-    check_activity,
-    check_gradients,
-    check_integral,
-    check_reductions,
-    check_scaling,
-    check_split,
+    check_activity_conformance,
+    check_gradients_conformance,
+    check_integral_conformance,
+    check_reductions_conformance,
+    check_scaling_conformance,
+    check_split_conformance,
 )
 from neuprim.conformance.task_checks import (
-    check_channels,
-    check_conditions,
-    check_description,
-    check_evaluation,
-    check_fields,
-    check_loss,
-    check_parameters,
-    check_resume,
-    check_save_load,
+    check_channels_conformance,
+    check_conditions_conformance,
+    check_description_conformance,
+    check_evaluation_conformance,
+    check_fields_conformance,
+    check_loss_conformance,
+    check_parameters_conformance,
+    check_resume_conformance,
+    check_save_load_conformance,
 )
 from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest
 from neuprim.core.errors import FormError
@@ -48,23 +48,23 @@ from neuprim.core.task import TaskSpec
 __all__ = ["CHECKS", "ConformanceError", "check_task", "checks", "named_checks"]
 
 CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
-    function.__name__.removeprefix("check_"): function
+    function.__name__.removeprefix("check_").removesuffix("_conformance"): function
     for function in (
-        check_description,
-        check_fields,
-        check_parameters,
-        check_evaluation,
-        check_loss,
-        check_channels,
-        check_activity,
-        check_integral,
-        check_gradients,
-        check_scaling,
-        check_split,
-        check_reductions,
-        check_resume,
-        check_save_load,
-        check_conditions,
+        check_description_conformance,
+        check_fields_conformance,
+        check_parameters_conformance,
+        check_evaluation_conformance,
+        check_loss_conformance,
+        check_channels_conformance,
+        check_activity_conformance,
+        check_integral_conformance,
+        check_gradients_conformance,
+        check_scaling_conformance,
+        check_split_conformance,
+        check_reductions_conformance,
+        check_resume_conformance,
+        check_save_load_conformance,
+        check_conditions_conformance,
     )
 }
 """Every check by name, in reading order."""
@@ -97,7 +97,9 @@ def _run_check(subject: TaskUnderTest, name: str) -> None:
     except FormError as error:  # it names field, method and tensor
         raise ConformanceError(f"{where}: {error}") from error
     except (Exception, SystemExit) as error:  # whatever a task's code does, the message must name the task
-        text = f"stopped by {type(error).__name__}: {' '.join(str(error).split())}{_find_task_line(error)}"
+        text = (
+            f"stopped by {type(error).__name__}: {' '.join(str(error).split())}{_find_conformance_failure_line(error)}"
+        )
         raise ConformanceError(f"{where}: {text}") from error
 
 
@@ -125,7 +127,7 @@ def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] |
     return pytest.mark.parametrize("check", [pytest.param(run, id=name) for name, run in found.items()])
 
 
-def _find_task_line(error: BaseException) -> str:
+def _find_conformance_failure_line(error: BaseException) -> str:
     """Return e.g. ``" in Waves.on_split (fields.py, line 12)"``, the innermost line of the task's own code, or ""."""
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = str(frame.f_globals.get("__name__", ""))

@@ -25,7 +25,7 @@ _STEPS = (1e-5, 1e-6)
 """Steps of the finite differences: a pixel that flips at a silhouette differs only at one of them."""
 
 
-def _double_view(view: View) -> View:
+def _double_view_under_test(view: View) -> View:
     """Return the view with camera and conditions in float64."""
     conditions = {k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()}
     return replace(view, camera=replace(view.camera, viewmat=view.camera.viewmat.double()), conditions=conditions)
@@ -34,11 +34,11 @@ def _double_view(view: View) -> View:
 # ---------------------------------------------------------------- activity and integrals
 
 
-def _active_rows(active: ActivePrimitives) -> Tensor:
+def _active_rows_under_test(active: ActivePrimitives) -> Tensor:
     return torch.arange(active.geometry.count) if active.rows is None else active.rows
 
 
-def _integrate(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
+def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
     """Integrate along chords by Gauss-Legendre quadrature on eight panels; also return the greatest |sigma|."""
     o, d, t0, t1 = ray
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
@@ -49,7 +49,9 @@ def _integrate(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) 
     return (sigma * (w / 16).repeat(8)).sum(-1) * (t1 - t0), sigma.abs().amax(-1)
 
 
-def points_inside(geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95) -> Tensor:
+def conformance_points_inside(
+    geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95
+) -> Tensor:
     """Draw (M, 3) float64 points, one uniform in ``reach`` of the ellipsoid of each of ``rows`` (M,)."""
     direction = _random_directions(len(rows), generator)
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
@@ -67,7 +69,7 @@ def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) 
     Returns:
         origins, directions, and both ends of the chord along the ray, float64.
     """
-    point = points_inside(geometry, rows, generator)
+    point = conformance_points_inside(geometry, rows, generator)
     d = _random_directions(len(rows), generator)
     whiten = geometry.rotations.double()[rows].transpose(1, 2) / geometry.scales.double()[rows][:, :, None]
     y, v = ((whiten @ x[:, :, None])[..., 0] for x in (point - geometry.means.double()[rows], d))
@@ -77,12 +79,12 @@ def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) 
     return point - far[:, None] * d, d, far + (-b - root) / a, far + (-b + root) / a
 
 
-def check_activity(t: TaskUnderTest) -> None:
+def check_activity_conformance(t: TaskUnderTest) -> None:
     """Primitives that the density leaves out of a frame absorb nothing in it; active rows are in ascending order."""
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
-    for view in map(_double_view, t.views):
+    for view in map(_double_view_under_test, t.views):
         rows = model.density.active_rows(params, view.conditions)
         if rows is None:
             continue
@@ -90,19 +92,19 @@ def check_activity(t: TaskUnderTest) -> None:
         t.require(fine, "density.active_rows", f"{rows.dtype} {rows.tolist()}", "ascending int64 rows")
         left_out = torch.ones(model.count, dtype=torch.bool).index_fill_(0, rows, False).nonzero()[:, 0]
         moved = model.density.move(params, model.geometry, view.conditions)
-        points = points_inside(moved, left_out, generator)
+        points = conformance_points_inside(moved, left_out, generator)
         sigma = model.density.density(params, model.geometry, left_out, points, view.conditions)
         where = "density.active_rows: density of a primitive that it leaves out"
         t.require(not bool(sigma.any()), where, sigma.abs().max() if len(sigma) else 0, 0)
 
 
-def check_integral(t: TaskUnderTest) -> None:
+def check_integral_conformance(t: TaskUnderTest) -> None:
     """Optical depths of the lowered density equal the integral of ``density`` along whole chords and parts of them."""
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(4)
     count = 0
     with torch.no_grad():
-        for view in map(_double_view, t.views):
+        for view in map(_double_view_under_test, t.views):
             active = model.active(view.conditions)
             geometry, form = model.lower_density(view.conditions)
             prim = torch.arange(geometry.count).repeat(_RAYS)
@@ -115,15 +117,15 @@ def check_integral(t: TaskUnderTest) -> None:
             whole, first, second = (form.optical_depth(PrimitiveChords.of(geometry, prim, *ray)) for ray in rays)
             shape = tuple(whole.shape)
             t.require(shape == tuple(prim.shape), "density.lower: integral", f"shape {shape}", tuple(prim.shape))
-            expected, peak = _integrate(active, prim, rays[0])
+            expected, peak = _integrate_under_test(active, prim, rays[0])
             for where, found, wanted in (
                 ("chord", whole, expected),
-                ("part of a chord", second, _integrate(active, prim, rays[2])[0]),
+                ("part of a chord", second, _integrate_under_test(active, prim, rays[2])[0]),
                 ("chord in two parts", first + second, whole),
             ):
                 error = (found - wanted).abs() / ((t1 - t0) * peak + 1e-30)
                 i = int(error.argmax())
-                row = int(_active_rows(active)[prim[i]])
+                row = int(_active_rows_under_test(active)[prim[i]])
                 place = f"density.lower: integral of a {where}, primitive {row}, view {view.name}"
                 t.require(bool((error <= 1e-5).all()), place, f"{float(found[i]):.6g}", f"{float(wanted[i]):.6g}")
     t.require(count > 0, "density.active_rows", "no primitive in any view", "some")
@@ -132,7 +134,7 @@ def check_integral(t: TaskUnderTest) -> None:
 # ---------------------------------------------------------------- gradients
 
 
-class _FixedShading(ColourField):
+class _ShadingUnderTest(ColourField):
     """A colour field whose shading is given; shading carries no gradient, so finite differences must not change it."""
 
     def __init__(self, model: Primitives, conditions: Conditions) -> None:
@@ -153,35 +155,35 @@ class _FixedShading(ColourField):
         return self.colour.lower(params, geometry, camera, conditions)
 
 
-def _leaf_parameters(model: Primitives) -> dict[str, Tensor]:
+def _leaf_parameters_under_test(model: Primitives) -> dict[str, Tensor]:
     """Replace the model's parameters by leaves that collect gradients, and return them."""
     model.params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
     return model.params
 
 
-def _image_objective(model: Primitives, view: View, seed: int) -> Tensor:
+def _conformance_objective(model: Primitives, view: View, seed: int) -> Tensor:
     """Return a smooth scalar that depends on everything visible."""
     out = render(model, view.camera, view.conditions, EXACT)
     weight = torch.rand(out.rgb.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) + 0.5
     return (out.rgb * weight).sum() + out.alpha.square().sum()
 
 
-def check_gradients(t: TaskUnderTest) -> None:
+def check_gradients_conformance(t: TaskUnderTest) -> None:
     """Every parameter gets a gradient from some view, and gradients agree with finite differences in float64."""
     model = t.perturbed_model()
-    params = _leaf_parameters(model)
-    for i, view in enumerate(map(_double_view, t.views)):
-        _image_objective(model, view, i).backward()
+    params = _leaf_parameters_under_test(model)
+    for i, view in enumerate(map(_double_view_under_test, t.views)):
+        _conformance_objective(model, view, i).backward()
     for name, value in params.items():
         if value.numel():
             where = f"{t.lower_method(name)}gradient of {name}"
             t.require(value.grad is not None, where, "none: the image does not depend on it", "one")
             t.require_finite(where, value.grad)
             t.require(bool(value.grad.any()), where, "zero in all views", "other than zero")  # type: ignore[union-attr]
-    for view in list(map(_double_view, t.views))[:2]:
-        frozen = Primitives(model.density, _FixedShading(model, view.conditions), model.params)
-        params = _leaf_parameters(frozen)
-        _image_objective(frozen, view, 0).backward()
+    for view in list(map(_double_view_under_test, t.views))[:2]:
+        frozen = Primitives(model.density, _ShadingUnderTest(model, view.conditions), model.params)
+        params = _leaf_parameters_under_test(frozen)
+        _conformance_objective(frozen, view, 0).backward()
         for name, value in params.items():
             if value.numel():
                 grad = torch.zeros_like(value) if value.grad is None else value.grad
@@ -199,7 +201,7 @@ def _compare_with_differences(t: TaskUnderTest, model: Primitives, view: View, n
             changed.reshape(-1)[entry] += sign * step
             model.params = {**constants, name: changed}
             with torch.no_grad():
-                values.append(float(_image_objective(model, view, 0)))
+                values.append(float(_conformance_objective(model, view, 0)))
         model.params = leaves
         return (values[0] - values[1]) / (2 * step)
 
@@ -217,14 +219,14 @@ _MASS_EACH, _MASS_MEAN = 0.25, 0.05
 """Relative error of the mass of one pair of children, and on average, where splits are not exact."""
 
 
-def check_scaling(t: TaskUnderTest) -> None:
+def check_scaling_conformance(t: TaskUnderTest) -> None:
     """``scale_density`` multiplies the density by its factor, and two copies at half the density look like one."""
     model = t.perturbed_model()
     factor = torch.linspace(0.25, 2.0, model.count, dtype=torch.float64)
     own = model.of(model.density)
     before = {name: value.clone() for name, value in own.items()}
     scaled = model.density.scale_density(own, factor)
-    _require_same_layout(t, "density.scale_density", scaled, before)
+    _require_conforming_layout(t, "density.scale_density", scaled, before)
     for name, value in own.items():
         same = torch.equal(value, before[name])
         t.require(same, f"density.scale_density: {name}", "changed in place", "a new tensor")
@@ -232,12 +234,12 @@ def check_scaling(t: TaskUnderTest) -> None:
     twice = {name: torch.cat([value, value]) for name, value in {**model.params, **half}.items()}
     copies = Primitives(model.density, model.colour, twice)
     with torch.no_grad():
-        for i, view in enumerate(map(_double_view, t.views)):
+        for i, view in enumerate(map(_double_view_under_test, t.views)):
             active = model.active(view.conditions)
             local = torch.arange(active.geometry.count).repeat(4)
             rows, x = (
-                _active_rows(active)[local],
-                points_inside(active.geometry, local, torch.Generator().manual_seed(i)),
+                _active_rows_under_test(active)[local],
+                conformance_points_inside(active.geometry, local, torch.Generator().manual_seed(i)),
             )
             one, other = (model.density.density(p, model.geometry, rows, x, view.conditions) for p in (own, scaled))
             _require_close(t, "density.scale_density: density", other, one * factor[rows], rows)
@@ -248,7 +250,7 @@ def check_scaling(t: TaskUnderTest) -> None:
             t.require(ok, where, f"a change of {change:.3g}", 0)
 
 
-def check_split(t: TaskUnderTest) -> None:
+def check_split_conformance(t: TaskUnderTest) -> None:
     """Children continue their parent's density inside themselves, or hold its mass where ``exact_split`` is False."""
     model = t.perturbed_model()
     old, parents, colours = model.geometry, model.of(model.density), model.of(model.colour)
@@ -259,8 +261,8 @@ def check_split(t: TaskUnderTest) -> None:
     for sign in (1.0, -1.0):
         new = Geometry(old.means + sign * step, old.log_scales + shrink, old.quats)
         child = model.density.on_split(dict(parents), old, new)
-        _require_same_layout(t, "density.on_split", child, parents)
-        _require_same_layout(t, "colour.on_split", model.colour.on_split(dict(colours), old, new), colours)
+        _require_conforming_layout(t, "density.on_split", child, parents)
+        _require_conforming_layout(t, "colour.on_split", model.colour.on_split(dict(colours), old, new), colours)
         children.append((child, new))
     divided = model.density.divide(parents, old)
     if divided is not None:
@@ -268,23 +270,25 @@ def check_split(t: TaskUnderTest) -> None:
         fine = mask.dtype == torch.bool and mask.shape == (model.count,)
         t.require(fine, "density.divide: mask", mask.dtype, "bool (N,)")
         t.require(place.count == 2 * model.count, "density.divide: geometry", f"{place.count} rows", 2 * model.count)
-        _require_same_layout(t, "density.divide", halves, {k: torch.cat([v, v]) for k, v in parents.items()})
+        _require_conforming_layout(t, "density.divide", halves, {k: torch.cat([v, v]) for k, v in parents.items()})
     if not model.density.exact_split:
-        _compare_masses(t, model, children)
+        _require_conforming_masses(t, model, children)
         return
     generator = torch.Generator().manual_seed(6)
-    for view in map(_double_view, t.views):
-        rows = _active_rows(model.active(view.conditions)).repeat(4)
+    for view in map(_double_view_under_test, t.views):
+        rows = _active_rows_under_test(model.active(view.conditions)).repeat(4)
         for child, new in children:
-            x = points_inside(model.density.move(child, new, view.conditions), rows, generator)
+            x = conformance_points_inside(model.density.move(child, new, view.conditions), rows, generator)
             found = model.density.density(child, new, rows, x, view.conditions)
             expected = model.density.density(parents, old, rows, x, view.conditions)
             _require_close(t, "density.on_split: density of a child inside it", found, expected, rows)
 
 
-def _compare_masses(t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]) -> None:
+def _require_conforming_masses(
+    t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]
+) -> None:
     """Compare integrals of |sigma| over parents and children: where sigma varies, one pair may be off, the mean not."""
-    view = _double_view(t.views[0])
+    view = _double_view_under_test(t.views[0])
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
     ball = ball[ball.norm(dim=-1) < 1]
 
@@ -307,7 +311,7 @@ def _compare_masses(t: TaskUnderTest, model: Primitives, children: list[tuple[di
     t.require(abs(mean) <= _MASS_MEAN, f"{where} a primitive, on average", f"{1 + mean:.3f} times its parent's", 1)
 
 
-def check_reductions(t: TaskUnderTest) -> None:
+def check_reductions_conformance(t: TaskUnderTest) -> None:
     """A field that can do with less of something becomes a field of the task that has fewer numbers and draws."""
     model = t.perturbed_model(torch.float32)
     for kind, field in (("density", model.density), ("colour", model.colour)):
@@ -334,7 +338,9 @@ def _check_reduced(t: TaskUnderTest, model: Primitives, kind: str, field: Field,
     t.draw(where, less, t.views[0])
 
 
-def _require_same_layout(t: TaskUnderTest, where: str, found: dict[str, Tensor], expected: dict[str, Tensor]) -> None:
+def _require_conforming_layout(
+    t: TaskUnderTest, where: str, found: dict[str, Tensor], expected: dict[str, Tensor]
+) -> None:
     t.require(set(found) == set(expected), where, f"tensors {sorted(found)}", sorted(expected))
     for name, value in expected.items():
         a, b = (f"{x.dtype} {tuple(x.shape)}" for x in (found[name], value))

@@ -15,7 +15,12 @@ from torch import Tensor
 from neuprim.config import check_config_groups, list_task_presets, preset_settings, read_task_config
 from neuprim.config.setting_checks import complete_task_options
 from neuprim.config.task_files import Level, read_config_effort_levels
-from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest, drawn_range, random_condition
+from neuprim.conformance.task_under_test import (
+    ConformanceError,
+    TaskUnderTest,
+    conformance_range,
+    random_conformance_condition,
+)
 from neuprim.core import checkpoint
 from neuprim.core.channels import find_channels
 from neuprim.core.compression import LEVELS, canonical_model
@@ -47,7 +52,7 @@ from neuprim.plugins.returns import (
 from neuprim.plugins.spec_validation import validate_spec
 
 
-def check_description(t: TaskUnderTest) -> None:
+def check_description_conformance(t: TaskUnderTest) -> None:
     """The TaskSpec is valid, its scenes, presets, efforts and tunable settings compose, and typos are refused."""
     problem = validate_spec(t.task)
     t.require(problem is None, "TaskSpec", problem, "members as documented in neuprim.core.task.TaskSpec")
@@ -67,7 +72,7 @@ def check_description(t: TaskUnderTest) -> None:
             for name in given:
                 expected = ", ".join(sorted(known))
                 t.require(name in known, f"{where}: train.{group}.{name}", "no such parameter", expected)
-        _require_accepted(t, where, asdict(settings.model), choice.options)
+        _require_task_under_test_accepts(t, where, asdict(settings.model), choice.options)
     for scene in t.task.scenes:
         preset_settings(t.task, choice.preset, scene.name)
     for name, values in call_task_tunable_settings(t.task, build_settings(t.task, t.settings.model, t.options)).items():
@@ -78,7 +83,9 @@ def check_description(t: TaskUnderTest) -> None:
             for part in path:
                 node = node.setdefault(part, {})
             node[last] = value
-            _require_accepted(t, f"tunable_settings: {name}={value}", tree["model"], tree["task"]["options"])
+            _require_task_under_test_accepts(
+                t, f"tunable_settings: {name}={value}", tree["model"], tree["task"]["options"]
+            )
     for group in ("density", "colour"):
         changed: dict[str, Any] = {group: {**getattr(t.settings.model, group), "no_such_setting": 1}}
         where = f"TaskSpec.check with model.{group}.no_such_setting=1"
@@ -92,7 +99,9 @@ def check_description(t: TaskUnderTest) -> None:
             )
 
 
-def _require_accepted(t: TaskUnderTest, where: str, model: dict[str, Any], options: dict[str, Any]) -> None:
+def _require_task_under_test_accepts(
+    t: TaskUnderTest, where: str, model: dict[str, Any], options: dict[str, Any]
+) -> None:
     try:
         complete = complete_task_options(t.task.options, options, f"task {t.task.name!r}")
         t.task.check(build_settings(t.task, validate_settings(ModelSettings, model, "model"), complete))
@@ -100,7 +109,7 @@ def _require_accepted(t: TaskUnderTest, where: str, model: dict[str, Any], optio
         t.require(False, where, f"a setting that is refused ({error})", "settings that the task accepts")
 
 
-def check_fields(t: TaskUnderTest) -> None:
+def check_fields_conformance(t: TaskUnderTest) -> None:
     """A field is rebuilt from its class and JSON-able settings with the same parameters; other settings are refused."""
     for kind, field in zip(("density", "colour"), t.build_fields(), strict=True):
         name, listed = type(field).__name__, t.task.fields or {}
@@ -121,7 +130,7 @@ def check_fields(t: TaskUnderTest) -> None:
         t.require(False, f"{name}(no_such_setting=1)", "it was accepted", "TypeError, so that damage is noticed")
 
 
-def check_parameters(t: TaskUnderTest) -> None:
+def check_parameters_conformance(t: TaskUnderTest) -> None:
     """Names of parameters are unique; shapes, rates and start values are valid and depend on nothing but the seed."""
     taken = {s.name for s in GEOMETRY_SPECS}
     for kind, spec in t.parameter_specs():
@@ -147,7 +156,7 @@ def check_parameters(t: TaskUnderTest) -> None:
         t.require(torch.equal(value, other.params[spec.name]), f"{where}s of one seed", "different ones", "equal ones")
 
 
-def check_evaluation(t: TaskUnderTest) -> None:
+def check_evaluation_conformance(t: TaskUnderTest) -> None:
     """What the task measures, films and displays of its example can be used, and its orbit has every condition."""
     task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
     channels = find_channels(task, data)
@@ -180,7 +189,7 @@ def check_evaluation(t: TaskUnderTest) -> None:
         t.require(not missing, f"orbit: view {view.name}", f"no {', '.join(missing)}", "every condition of the task")
 
 
-def check_channels(t: TaskUnderTest) -> None:
+def check_channels_conformance(t: TaskUnderTest) -> None:
     """A colour built for grey images has one channel and for five bands five, or ``build`` refuses such data."""
     if t.task.example is not None or t.task.channels:
         return  # only the task knows what data of other channels would look like, or there are no others
@@ -209,7 +218,7 @@ def check_channels(t: TaskUnderTest) -> None:
 # ---------------------------------------------------------------- conditions
 
 
-def check_conditions(t: TaskUnderTest) -> None:
+def check_conditions_conformance(t: TaskUnderTest) -> None:
     """Each condition parses text and refuses nonsense, any value in its range draws, and a missing one is refused."""
     model = t.perturbed_model(torch.float32)
     view = t.views[0]
@@ -219,25 +228,25 @@ def check_conditions(t: TaskUnderTest) -> None:
         _check_condition_parsing(t, spec, where)
         generator = torch.Generator().manual_seed(9)
         ends = [torch.full(spec.shape, float(end)) for end in spec.range]
-        for value in (*ends, random_condition(spec, generator)):
-            t.draw(f"{where} = {value.tolist()}", model, _with_condition(view, spec, value))
+        for value in (*ends, random_conformance_condition(spec, generator)):
+            t.draw(f"{where} = {value.tolist()}", model, _conformance_view(view, spec, value))
         others = {name: value for name, value in view.conditions.items() if name != spec.name}
         try:
             render(model, view.camera, others, t.settings.renderer)
         except (KeyError, NeuprimError) as error:
             t.require(spec.name in str(error), f"message without {where}", repr(str(error)), "one that names it")
             continue
-        values = [random_condition(spec, generator) for _ in range(2)]
-        images = [t.draw(where, model, _with_condition(view, spec, value)) for value in values]
+        values = [random_conformance_condition(spec, generator) for _ in range(2)]
+        images = [t.draw(where, model, _conformance_view(view, spec, value)) for value in values]
         t.require(torch.equal(*images), f"a frame without {where}", "it was drawn", "KeyError or ConfigError")
 
 
-def _with_condition(view: View, spec: ConditionSpec, value: Tensor) -> View:
+def _conformance_view(view: View, spec: ConditionSpec, value: Tensor) -> View:
     return replace(view, conditions={**view.conditions, spec.name: value})
 
 
 def _check_condition_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
-    low, high = drawn_range(spec)
+    low, high = conformance_range(spec)
     expected = torch.full(spec.shape, low + 0.25 * (high - low))
     text = ",".join(f"{x:g}" for x in expected.flatten().tolist())
     values = spec.parse(text)
@@ -259,15 +268,15 @@ def _check_condition_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) 
 _STEPS = 4  # before the checkpoint and again after it; the population changes twice in each half
 
 
-def _training_supervision(t: TaskUnderTest, index: int) -> Supervision:
+def _conformance_supervision(t: TaskUnderTest, index: int) -> Supervision:
     pixels = t.dataset.train.pixels(index)
     return Supervision(t.dataset.train.view(index), pixels.mask, pixels.alpha)
 
 
-def check_loss(t: TaskUnderTest) -> None:
+def check_loss_conformance(t: TaskUnderTest) -> None:
     """The loss is one finite number with a finite gradient, least where image and truth agree, also under a mask."""
     loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
-    frame = _training_supervision(t, 0)
+    frame = _conformance_supervision(t, 0)
     truth = t.dataset.train.pixels(0).over(t.dataset.background)
     off = (truth + 0.2 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(2))).requires_grad_()
     value, parts = loss(off, truth, frame)
@@ -285,7 +294,7 @@ def check_loss(t: TaskUnderTest) -> None:
     t.require(least < value.item(), "loss of the truth itself", f"{least:g}", f"less than {value.item():g}")
 
 
-def check_resume(t: TaskUnderTest) -> None:
+def check_resume_conformance(t: TaskUnderTest) -> None:
     """2N steps equal N steps, a checkpoint on disk and N more steps, bit for bit."""
     whole, first, second = (t.trainer(2 * _STEPS) for _ in range(3))
     for _ in range(2 * _STEPS):
@@ -312,7 +321,7 @@ def _require_equal_tensors(t: TaskUnderTest, where: str, a: dict[str, Tensor], b
         t.require(same, f"{where}: {name}", "different values", "equal bits")
 
 
-def check_save_load(t: TaskUnderTest) -> None:
+def check_save_load_conformance(t: TaskUnderTest) -> None:
     """A model comes back from its files with the same bits and picture; compressing it again changes nothing more."""
     model = t.perturbed_model(torch.float32)
     canonical = canonical_model(model)

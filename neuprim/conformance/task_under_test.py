@@ -60,7 +60,7 @@ class TaskUnderTest:
     def with_channels(self, channels: int) -> TaskUnderTest:
         """Return the same with a synthetic data set of this number of colour channels."""
         other = copy(self)
-        other.dataset = synthetic_dataset(self.task.conditions, channels)
+        other.dataset = conformance_dataset(self.task.conditions, channels)
         return other
 
     def require(self, ok: bool, where: str, found: object, expected: object) -> None:
@@ -102,7 +102,7 @@ class TaskUnderTest:
         """The task's own example, or a synthetic one with the conditions and channels that it declares."""
         if self.task.example is not None:
             return self.task.example()
-        return synthetic_dataset(self.task.conditions, len(self.task.channels) or 3)
+        return conformance_dataset(self.task.conditions, len(self.task.channels) or 3)
 
     @property
     def views(self) -> list[View]:
@@ -160,22 +160,24 @@ _DISTANCE = 2.5
 _NEAR_ZERO = 3.0
 
 
-def drawn_range(spec: ConditionSpec) -> tuple[float, float]:
+def conformance_range(spec: ConditionSpec) -> tuple[float, float]:
     """Return the part of a condition's range that checks draw from: at most 3 from zero if the range allows it."""
     low, high = max(spec.range[0], -_NEAR_ZERO), min(spec.range[1], _NEAR_ZERO)
     return (low, high) if low < high else spec.range
 
 
-def random_condition(spec: ConditionSpec, generator: torch.Generator, shape: tuple[int, ...] | None = None) -> Tensor:
-    """Draw a float32 value of the condition's shape, uniform in :func:`drawn_range`."""
-    low, high = drawn_range(spec)
+def random_conformance_condition(
+    spec: ConditionSpec, generator: torch.Generator, shape: tuple[int, ...] | None = None
+) -> Tensor:
+    """Draw a float32 value of the condition's shape, uniform in :func:`conformance_range`."""
+    low, high = conformance_range(spec)
     return low + (high - low) * torch.rand(spec.shape if shape is None else shape, generator=generator)
 
 
-class _Views(ViewSet):
+class _ConformanceViews(ViewSet):
     def __init__(self, views: list[View], channels: int) -> None:
         settings = RenderSettings(backend=REFERENCE)
-        frames = [render_lowered(_ellipsoids(channels), view.camera, settings) for view in views]
+        frames = [render_lowered(_conformance_ellipsoids(channels), view.camera, settings) for view in views]
         self.views, self.images = views, [Pixels(frame.rgb, frame.alpha) for frame in frames]
 
     def __len__(self) -> int:
@@ -188,15 +190,19 @@ class _Views(ViewSet):
         return self.images[index]
 
 
-def synthetic_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
+def conformance_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
     """Make six training and two test views, 10 x 9 pixels, sRGB, of ellipsoids of constant density on grey.
 
     The conditions have random values, which the images do not depend on.
     """
     generator = torch.Generator().manual_seed(7)
-    cameras = [_ring_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
+    cameras = [_conformance_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
     views = [
-        View(f"{'train' if i < 6 else 'test'}{i % 6}", c, {s.name: random_condition(s, generator) for s in conditions})
+        View(
+            f"{'train' if i < 6 else 'test'}{i % 6}",
+            c,
+            {s.name: random_conformance_condition(s, generator) for s in conditions},
+        )
         for i, c in enumerate(cameras)
     ]
 
@@ -204,12 +210,14 @@ def synthetic_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) 
         means = 1.4 * (torch.rand(count, 3, generator=generator) - 0.5)
         colours = 0.2 + 0.6 * torch.rand(count, channels, generator=generator)
         scalars = [spec for spec in conditions if spec.shape == ()]
-        return PointCloud(means, colours, {spec.name: random_condition(spec, generator, (count,)) for spec in scalars})
+        return PointCloud(
+            means, colours, {spec.name: random_conformance_condition(spec, generator, (count,)) for spec in scalars}
+        )
 
     return Dataset(
         name="conformance example",
-        train=_Views(views[:6], channels),
-        test=_Views(views[6:], channels),
+        train=_ConformanceViews(views[:6], channels),
+        test=_ConformanceViews(views[6:], channels),
         start=start,
         extent=camera_extent(cameras[:6]),
         background=torch.full((channels,), 0.3),
@@ -219,14 +227,14 @@ def synthetic_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) 
     )
 
 
-def _ring_camera(angle: float, height: float) -> Camera:
+def _conformance_camera(angle: float, height: float) -> Camera:
     eye = _DISTANCE * torch.tensor([math.cos(angle), math.sin(angle), height], dtype=torch.float64)
     focal = 0.5 * _WIDTH / math.tan(0.35)
     pose = look_at(eye, torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     return Camera(pose, focal, focal, _WIDTH / 2, _HEIGHT / 2, _WIDTH, _HEIGHT)
 
 
-def _ellipsoids(channels: int) -> LoweredPrimitives:
+def _conformance_ellipsoids(channels: int) -> LoweredPrimitives:
     geometry = Geometry(
         torch.tensor([[-0.35, 0.0, 0.0], [0.4, 0.1, 0.05], [0.0, -0.2, 0.4]]),
         torch.tensor([[0.4, 0.25, 0.3], [0.3, 0.35, 0.25], [0.2, 0.3, 0.2]]).log(),

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.conformance import CHECKS, ConformanceError, named_checks
-from neuprim.conformance.task_under_test import synthetic_dataset
+from neuprim.conformance.task_under_test import conformance_dataset
 from neuprim.core.cameras.projections import AnyCamera
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import ConfigError
@@ -192,7 +192,7 @@ def timed(
 
 def bare() -> Dataset:
     """Three channels, and no conditions."""
-    return synthetic_dataset(())
+    return conformance_dataset(())
 
 
 # ---------------------------------------------------------------- losses

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuprim.conformance.field_checks import points_inside, random_chords
+from neuprim.conformance.field_checks import conformance_points_inside, random_chords
 from neuprim.core.errors import FormError
 from neuprim.core.model.densities.cosine import cosine_density
 from neuprim.core.model.fields import Cosine
@@ -48,7 +48,7 @@ def test_densities_and_line_integrals_add_up(name: str) -> None:
     assert both.W1.shape == (COUNT, first.W1.shape[1] + second.W1.shape[1], 3) and both.b2.shape == first.b2.shape
     generator = torch.Generator().manual_seed(1)
     prim = torch.arange(COUNT).repeat(8)
-    x = points_inside(geometry, prim, generator)
+    x = conformance_points_inside(geometry, prim, generator)
     found, a, b = (cosine_density(f, geometry, prim, x) for f in (both, first, second))
     assert (found - a - b).abs().max() <= 1e-12 * a.abs().max() and b.abs().max() > 0.1
     ray = random_chords(geometry, prim, generator)

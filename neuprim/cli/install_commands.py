@@ -129,9 +129,9 @@ def _add_new_task_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _new_task_command(arguments: argparse.Namespace) -> int:
-    from neuprim.plugins.new_task import write_task_package
+    from neuprim.plugins.new_task import write_plugin_package
 
-    print(*write_task_package(arguments.name, arguments.out), sep="\n")
+    print(*write_plugin_package(arguments.name, arguments.out), sep="\n")
     return 0
 
 

@@ -76,7 +76,7 @@ from neuprim.plugins.registry import (
     FoundScene,
     PluginInfo,
     UnknownPlugin,
-    find_scene,
+    find_registered_scene,
     qualified_plugin_name,
     split_plugin_name,
 )
@@ -227,7 +227,7 @@ def _select_task_scene_and_preset(choices: Mapping[str, str | None]) -> _Selecti
     level = choose_config_effort_level(spec, choices[EFFORT], choices["preset"], names)
     preset = choices["preset"] or (defaults.preset if level is None else level.preset)
     scene_name = choices["scene"] or defaults.scene
-    scene = find_scene(spec, scene_name)
+    scene = find_registered_scene(spec, scene_name)
     check_scene_config(spec, scene.spec.name, scene.config_package)
     if preset not in names:
         raise ConfigError(f"preset={preset}: task {spec.name!r} has no such preset{nearest(preset, names)}")

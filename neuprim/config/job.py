@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from neuprim.config.run_config import RunConfig
 from neuprim.plugins.attribution import RunPlugins
 from neuprim.plugins.provenance import Provenance, load_recorded_plugin
-from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_scene
+from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_registered_scene
 
 if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
@@ -55,7 +55,7 @@ def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = Non
     """
     if config.made_by.scene is None:
         own = [scene for scene in task.scenes if scene.name == config.scene_name]
-        return FoundScene(own[0], task.config_package) if own else find_scene(task, config.scene_name)
+        return FoundScene(own[0], task.config_package) if own else find_registered_scene(task, config.scene_name)
     info, extension = load_recorded_plugin(SCENES, config.made_by.scene, file, f"{config.task}.{config.scene_name}")
     return FoundScene(extension.scene, extension.config_package, info)
 

@@ -17,7 +17,7 @@ from neuprim.version import __version__
 _TEMPLATE_SUFFIX = ".in"
 
 
-def write_task_package(name: str, out: Path | None = None) -> list[str]:
+def write_plugin_package(name: str, out: Path | None = None) -> list[str]:
     """Write a package with the task ``name`` and return lines that say what to do next.
 
     Args:

@@ -131,7 +131,7 @@ def load_recorded_plugin(
     try:
         info, spec = group.load_with_info(qualified_plugin_name(plugin.package, entry or plugin.name))
     except UnknownPlugin as error:
-        raise ConfigError(_prefix_config_file(file, missing_plugin_message(group, plugin))) from error
+        raise ConfigError(_prefix_provenance_file(file, missing_plugin_message(group, plugin))) from error
     if not info.built_in:
         _warn_of_plugin_version(file, plugin, group.kind, PluginVersion.of(info))
     return info, spec
@@ -146,11 +146,13 @@ def missing_plugin_message(group: PluginGroup[Any], plugin: PluginVersion) -> st
     )
 
 
-def warn_of_other_neuprim(made_by: Provenance, file: Path | None = None) -> None:
+def warn_of_other_provenance(made_by: Provenance, file: Path | None = None) -> None:
     """Warn if another minor version of neuprim made a run; patch versions keep results."""
-    if _minor_version(made_by.neuprim) != _minor_version(__version__):
+    if _minor_provenance_version(made_by.neuprim) != _minor_provenance_version(__version__):
         warn_once(
-            _prefix_config_file(file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}")
+            _prefix_provenance_file(
+                file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"
+            )
         )
 
 
@@ -165,7 +167,7 @@ def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> Non
             f"{file}: written for task {before.task.name!r} of {before.task.origin}; "
             f"this run's task is that of {now.task.origin}"
         )
-    warn_of_other_neuprim(before, file)
+    warn_of_other_provenance(before, file)
     for kind, old in before.plugins.items():
         new = now.plugins.get(kind)
         if new is not None and new.qualified_name == old.qualified_name and canonicalize_name(old.package) != BUILT_IN:
@@ -175,14 +177,14 @@ def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> Non
 def _warn_of_plugin_version(file: Path | None, plugin: PluginVersion, kind: str, installed: PluginVersion) -> None:
     if installed.version != plugin.version:
         text = f"this run was made by {plugin.origin} ({kind} {plugin.name}); installed is {installed.origin}"
-        warn_once(_prefix_config_file(file, text))
+        warn_once(_prefix_provenance_file(file, text))
 
 
-def _prefix_config_file(file: Path | None, text: str) -> str:
+def _prefix_provenance_file(file: Path | None, text: str) -> str:
     return text if file is None else f"{file}: {text}"
 
 
-def _minor_version(version: str) -> object:
+def _minor_provenance_version(version: str) -> object:
     try:
         return Version(version).release[:2]
     except InvalidVersion:

@@ -293,7 +293,7 @@ class FoundScene:
     added_by: PluginInfo | None = None
 
 
-def find_scene(task: TaskSpec, word: str) -> FoundScene:
+def find_registered_scene(task: TaskSpec, word: str) -> FoundScene:
     """Find the scene that ``NAME`` or ``PACKAGE:NAME`` chooses; a bare name means the task's own, if it has that one.
 
     Raises as :meth:`PluginGroup.load`.

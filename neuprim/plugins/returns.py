@@ -39,7 +39,7 @@ def check_fields(density: object, colour: object, dataset: Dataset) -> None:
     """Check that a task's ``build`` returned two fields, the colour with the data set's channels."""
     for name, field, kind in (("density", density, DensityField), ("colour", colour, ColourField)):
         expected = f"a neuprim.core.model.fields.{kind.__name__}"
-        check_returns(isinstance(field, kind), f"build: {name}", _describe_type(field), expected)
+        check_returns(isinstance(field, kind), f"build: {name}", _describe_returned_type(field), expected)
     channels = getattr(colour, "channels", None)
     expected = f"{dataset.channels}, as data set {dataset.name!r} has"
     check_returns(channels == dataset.channels, "build: channels of the colour", channels, expected)
@@ -48,12 +48,12 @@ def check_fields(density: object, colour: object, dataset: Dataset) -> None:
 def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
     """Check one result of a loss (:data:`~neuprim.core.task.Loss`) for this rendered image."""
     number = isinstance(value, Tensor) and not value.dim()
-    check_returns(number, "value", _describe_type(value), "one number as a tensor")
+    check_returns(number, "value", _describe_returned_type(value), "one number as a tensor")
     gradient = value.requires_grad or not rendered.requires_grad
     check_returns(gradient, "value", "no gradient", "one that depends on the rendered image")
-    check_returns(isinstance(parts, dict), "parts", _describe_type(parts), "a dictionary of names to numbers")
+    check_returns(isinstance(parts, dict), "parts", _describe_returned_type(parts), "a dictionary of names to numbers")
     for name, part in parts.items():
-        check_returns(isinstance(part, int | float), f"part {name!r}", _describe_type(part), "a number")
+        check_returns(isinstance(part, int | float), f"part {name!r}", _describe_returned_type(part), "a number")
 
 
 def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
@@ -72,7 +72,7 @@ def call_task_metrics(
 ) -> dict[str, float]:
     """Return the task's own metrics of a test view by name; they may be +inf."""
     function = f"metrics of test view {dataset.test.view(index).name}"
-    metrics = _check_text_keys(task.metrics(dataset, index, rendered, truth), function)
+    metrics = _check_returned_keys(task.metrics(dataset, index, rendered, truth), function)
     for name, value in metrics.items():
         number = isinstance(value, int | float) and not math.isnan(value) and value != -math.inf
         check_returns(number, f"{function}: {name}", repr(value), "a number")
@@ -82,18 +82,18 @@ def call_task_metrics(
 
 def call_task_diagnose(task: TaskSpec, dataset: Dataset, model: Primitives) -> dict[str, Any]:
     """Return the task's own numbers of a model."""
-    return _check_json(task.diagnose(dataset, model), "diagnose")
+    return _check_returned_json(task.diagnose(dataset, model), "diagnose")
 
 
 def call_task_facts(task: TaskSpec, dataset: Dataset) -> dict[str, Any]:
     """Return what a model's header keeps of its data: the scene's "up" and "center", and what the task adds."""
     own = {"up": [float(x) for x in dataset.up], "center": [float(x) for x in dataset.center]}
-    return {**own, **_check_json(task.facts(dataset), "facts")}
+    return {**own, **_check_returned_json(task.facts(dataset), "facts")}
 
 
 def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
     """Return the films that the task makes of its data."""
-    clips = _check_list(task.clips(dataset), "clips", Clip)
+    clips = _check_returned_list(task.clips(dataset), "clips", Clip)
     for clip in clips:
         count = len(dataset.test if clip.source is None else clip.source)
         wrong = [i for i in clip.views if not isinstance(i, int) or not 0 <= i < count]
@@ -104,7 +104,7 @@ def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
 
 def call_task_orbit(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]:
     """Return views that circle the scene, with the task's conditions."""
-    views = _check_list(task.orbit(dataset, frames), "orbit", View)
+    views = _check_returned_list(task.orbit(dataset, frames), "orbit", View)
     check_returns(len(views) > 0, "orbit", "no views", "some")
     return views
 
@@ -113,7 +113,7 @@ def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> d
     """Return the settings that trade quality for speed or size: name -> values worth training."""
     found = task.tunable_settings(settings)
     expected = "a dictionary of setting names to values"
-    check_returns(isinstance(found, Mapping), "tunable_settings", _describe_type(found), expected)
+    check_returns(isinstance(found, Mapping), "tunable_settings", _describe_returned_type(found), expected)
     for name, values in found.items():
         known = isinstance(name, str) and name.startswith(_TUNABLE)
         expected = f"the name of a setting that begins with {' or '.join(_TUNABLE)}"
@@ -134,32 +134,32 @@ def draw_task_layer(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor
     if isinstance(values, Tensor) and tuple(values.shape) == shape[:2] and count == 1:
         values = values[..., None]
     ok = isinstance(values, Tensor) and tuple(values.shape) == shape and values.is_floating_point()
-    check_returns(ok, f"layers: {spec.name}", _describe_type(values), f"floats of shape {shape}")
+    check_returns(ok, f"layers: {spec.name}", _describe_returned_type(values), f"floats of shape {shape}")
     bad = int((~values.isfinite()).sum())
     check_returns(not bad, f"layers: {spec.name}", f"{bad} NaN or infinite values", "finite numbers")
     return values.detach()
 
 
-def _describe_type(value: object) -> str:
+def _describe_returned_type(value: object) -> str:
     return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
 
 
-def _check_list(found: Any, function: str, kind: type[Kind]) -> list[Kind]:
+def _check_returned_list(found: Any, function: str, kind: type[Kind]) -> list[Kind]:
     expected = f"a list of neuprim.core.data.{kind.__name__}"
-    check_returns(isinstance(found, Sequence), function, _describe_type(found), expected)
+    check_returns(isinstance(found, Sequence), function, _describe_returned_type(found), expected)
     for entry in found:
-        check_returns(isinstance(entry, kind), function, f"{_describe_type(entry)} in the list", expected)
+        check_returns(isinstance(entry, kind), function, f"{_describe_returned_type(entry)} in the list", expected)
     return list(found)
 
 
-def _check_text_keys(found: Any, function: str) -> Mapping[str, Any]:
+def _check_returned_keys(found: Any, function: str) -> Mapping[str, Any]:
     ok = isinstance(found, Mapping) and all(isinstance(name, str) for name in found)
-    check_returns(ok, function, _describe_type(found), "a dictionary with texts as keys")
+    check_returns(ok, function, _describe_returned_type(found), "a dictionary with texts as keys")
     return found  # type: ignore[no-any-return]
 
 
-def _check_json(found: Any, function: str) -> dict[str, Any]:
-    for name, value in _check_text_keys(found, function).items():
+def _check_returned_json(found: Any, function: str) -> dict[str, Any]:
+    for name, value in _check_returned_keys(found, function).items():
         try:
             json.dumps(value, allow_nan=False)
         except (TypeError, ValueError) as error:

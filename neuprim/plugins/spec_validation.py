@@ -81,22 +81,22 @@ def _check_spec_member(member: Any, kind: type, where: str) -> None:
         raise _InvalidMember(f"{where}.{problem}") from None
 
 
-def _check_task_spec(spec: TaskSpec) -> None:
-    _check_spec_options(spec, "model.", "train.")
+def _check_plugin_task_spec(spec: TaskSpec) -> None:
+    _check_plugin_options(spec, "model.", "train.")
     for name, field in (spec.fields or {}).items():
         where, is_field = f"fields[{name!r}]", isinstance(field, type) and issubclass(field, Field)
         _require_member(is_field, f"{where} is {field!r}; expected a subclass of neuprim.core.model.fields.Field")
         abstract = ", ".join(sorted(getattr(field, "__abstractmethods__", ())))
         _require_member(not abstract, f"{where} lacks the methods {abstract}")
-    _check_channel_names(spec.channels)
+    _check_plugin_channel_names(spec.channels)
 
 
-def _check_channel_names(names: Any) -> None:
+def _check_plugin_channel_names(names: Any) -> None:
     wrong = channel_name_error(names)
     _require_member(wrong is None, f"channels{wrong}")
 
 
-def _check_condition_spec(spec: ConditionSpec) -> None:
+def _check_plugin_condition_spec(spec: ConditionSpec) -> None:
     ends = spec.range
     numbers = len(ends) == 2 and all(isinstance(end, int | float) for end in ends)
     _require_member(numbers and ends[0] < ends[1], f"range is {ends!r}; expected a lower and a higher number")
@@ -107,7 +107,7 @@ def _check_layer_spec(spec: LayerSpec) -> None:
     _require_member(short, f"name is {spec.name!r}; expected at most 31 letters, digits and _")
     taken = spec.name in {LIGHTS, *(common.name for common in COMMON)} or spec.name.startswith("light_")
     _require_member(not taken, f"name is {spec.name!r}, which is taken; expected another name")
-    _check_channel_names(spec.channels)
+    _check_plugin_channel_names(spec.channels)
 
 
 def _check_inspector(spec: Inspector) -> None:
@@ -135,7 +135,7 @@ def _check_exporter(spec: Exporter) -> None:
     _require_member(fits, f"default is {default!r}; expected a name that ends in {' or '.join(suffixes)}")
 
 
-def _check_spec_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
+def _check_plugin_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
     """Check ``options``, and ``uses``, which may name optional settings of these groups."""
     for name, entry in spec.options.items():
         known = isinstance(name, str) and name.isidentifier()
@@ -155,10 +155,10 @@ def _check_spec_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
 
 
 _CHECKS: dict[type, Any] = {
-    TaskSpec: _check_task_spec,
-    ConditionSpec: _check_condition_spec,
+    TaskSpec: _check_plugin_task_spec,
+    ConditionSpec: _check_plugin_condition_spec,
     LayerSpec: _check_layer_spec,
-    LossExtension: lambda spec: _check_spec_options(spec, "train."),
+    LossExtension: lambda spec: _check_plugin_options(spec, "train."),
     Exporter: _check_exporter,
     Inspector: _check_inspector,
 }

@@ -24,7 +24,7 @@ from neuprim.core.render.backends import best_render_backend_device, computing_d
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.density_truth import DensityGridSource
 from neuprim.plugins.attribution import attribute_errors
-from neuprim.plugins.provenance import warn_of_other_neuprim
+from neuprim.plugins.provenance import warn_of_other_provenance
 from neuprim.plugins.registry import PluginError
 
 COMPRESSED = "model.neuprim"
@@ -84,7 +84,7 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     if not named:
         config = replace(config, source=None)
     task = Job.of(config).task
-    warn_of_other_neuprim(config.made_by, config.source)
+    warn_of_other_provenance(config.made_by, config.source)
     model, header = load_model_checkpoint(model_file(run), task)
     config = replace(config, renderer=with_available_render_backend(config.renderer))
     stored = StoredRun(config, task, run, model, header, task)

@@ -17,7 +17,7 @@ import neuprim
 from neuprim.cli import main
 from neuprim.conformance import CHECKS
 from neuprim.core.errors import ConfigError
-from neuprim.plugins.new_task import write_task_package
+from neuprim.plugins.new_task import write_plugin_package
 from tests.systems import posix
 
 ROOT = Path(neuprim.__file__).parents[1]
@@ -117,7 +117,7 @@ def test_a_new_task_installs_trains_and_passes_its_tests(tmp_path: Path, capsys:
 def test_bad_names_write_nothing(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     with pytest.raises(ConfigError, match="lower-case letters, digits and _"):
-        write_task_package(name)
+        write_plugin_package(name)
     assert list(tmp_path.iterdir()) == []
 
 
@@ -141,14 +141,14 @@ def test_nothing_that_exists_is_touched(kind: str, tmp_path: Path) -> None:
     else:
         target.symlink_to(tmp_path / "nowhere")
     with pytest.raises(ConfigError, match="there: exists; expected a folder to make"):
-        write_task_package("wave", target)
+        write_plugin_package("wave", target)
     assert [p.name for p in tmp_path.iterdir()] == ["there"]
     assert kind != "folder" or (target / "precious").read_text() == "x"
 
 
 def test_the_default_folder_is_named_after_the_task(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    write_task_package("two_words")
+    write_plugin_package("two_words")
     assert (
         tmp_path / "neuprim-two-words" / "neuprim_two_words" / "conf" / "preset" / "two_words" / "quick.yaml"
     ).is_file()

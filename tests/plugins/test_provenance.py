@@ -18,7 +18,7 @@ from neuprim.core import checkpoint, notices
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.notices import NeuprimWarning
 from neuprim.plugins import provenance
-from neuprim.plugins.new_task import write_task_package
+from neuprim.plugins.new_task import write_plugin_package
 from neuprim.plugins.provenance import PluginVersion, Provenance
 from neuprim.runs.open import load_run
 from neuprim.runs.run import run
@@ -36,7 +36,7 @@ def glow(site: Path, distribution: str = "neuprim-glow", version: str = "0.1", p
     """A working task ``glow``."""
     draft = site.parent / "draft"
     if not draft.exists():
-        write_task_package("glow", draft)
+        write_plugin_package("glow", draft)
     files = {}
     for path in (draft / "neuprim_glow").rglob("*"):
         if path.is_file():

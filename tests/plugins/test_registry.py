@@ -24,7 +24,7 @@ from neuprim.plugins.registry import (
     TASKS,
     PluginError,
     PluginGroup,
-    find_scene,
+    find_registered_scene,
     load_task,
 )
 from neuprim.runs.measure import evaluate_run
@@ -226,14 +226,14 @@ def test_a_scene_with_the_name_of_a_tasks_own(site: Path) -> None:
     preset.write_text("model: {primitives: 7}\n")
     task = load_task("static")
     with pytest.warns(NeuprimWarning, match="one of task 'static' itself, which is used; scene=fake-extra:solids"):
-        assert find_scene(task, "solids").added_by is None
+        assert find_registered_scene(task, "solids").added_by is None
     assert "fake_extra" not in sys.modules
-    assert find_scene(task, "neuprim:solids").config_package == "neuprim.tasks.static.conf"
+    assert find_registered_scene(task, "neuprim:solids").config_package == "neuprim.tasks.static.conf"
     config = compose(["task=static", "scene=fake-extra:solids"], False)
     assert (config.scene_name, config.scene, config.model.primitives) == ("solids", {"wobble": 3.0}, 2800)
     for word in ("fake-extra:solid", "nobody:solids"):
         with pytest.raises(ConfigError, match=f"scene={word}: task 'static' has no such scene of"):
-            find_scene(task, word)
+            find_registered_scene(task, word)
 
 
 def test_a_task_of_a_taken_name_has_its_own_files(site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

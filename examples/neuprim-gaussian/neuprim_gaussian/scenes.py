@@ -13,9 +13,9 @@ __all__ = ["SCENES"]
 
 def _like_static(name: str, summary: str) -> SceneSpec:
     def load(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-        from neuprim.plugins.registry import find_scene, load_task
+        from neuprim.plugins.registry import find_registered_scene, load_task
 
-        return find_scene(load_task("neuprim:static"), name).spec.load(settings, context)
+        return find_registered_scene(load_task("neuprim:static"), name).spec.load(settings, context)
 
     return SceneSpec(name, summary, load)
 

@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.command_settings import ViewerSettings
     from neuprim.core.environment import EnvironmentFile
-    from neuprim.core.io.vdb import Grid, GridHeader
+    from neuprim.core.io.vdb import GridHeader, VdbGrid
 
 
 # ---------------------------------------------------------------- render
@@ -299,10 +299,10 @@ def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
     """Return files, frames in their order, and notes on the folder."""
     if not path.is_dir():
         return [path], []
-    from neuprim.core.io.vdb import vdb_sequence
+    from neuprim.core.io.vdb import list_vdb_files
 
     try:
-        frames = vdb_sequence(path)
+        frames = list_vdb_files(path)
     except DataError as error:
         files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
         if not files:
@@ -329,7 +329,7 @@ def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
     }
 
 
-def _describe_grid(header: GridHeader, grid: Grid | None) -> dict[str, Any]:
+def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
     """Grids that cannot be decoded have a ``reason`` and no numbers from voxels."""
     entry: dict[str, Any] = {
         "name": header.name,

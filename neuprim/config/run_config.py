@@ -11,7 +11,7 @@ from typing import Annotated, Any
 import yaml
 
 from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.io.plain import load_yaml
+from neuprim.core.io.plain import parse_yaml_file
 from neuprim.core.render import backends
 from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
@@ -194,7 +194,7 @@ def _read_config_yaml(file: Path) -> Mapping[str, Any]:
     try:
         if file.stat().st_size > _MAX_BYTES:
             raise CheckpointError(f"{file}: larger than {_MAX_BYTES} bytes; not a run's configuration")
-        data = load_yaml(file.read_text(encoding="utf-8"))
+        data = parse_yaml_file(file.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise CheckpointError(f"{file}: missing; expected a directory written by `neuprim run`") from error
     except yaml.YAMLError as error:

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
-from neuprim.core.io.exr import channel_name_error, default_channel_names
+from neuprim.core.io.exr import default_exr_channel_names, exr_channel_name_error
 from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.task import Display, TaskSpec
 
@@ -65,7 +65,7 @@ class Channels:
         """What pictures show, in words; empty for plain red, green and blue or grey."""
         if self.own is not None:
             return f"{self.name_list} through the display of task {self.task!r}"
-        if self.names == default_channel_names(self.count) and not self.hides_channels:
+        if self.names == default_exr_channel_names(self.count) and not self.hides_channels:
             return ""
         if self.count == 1:
             return f"{self.names[0]} as grey"
@@ -129,7 +129,7 @@ def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
     if (shape := tuple(dataset.background.shape)) != (dataset.channels,):
         expected = f"({dataset.channels},), a number per channel"
         raise DataError(f"{dataset.name}: the background has shape {shape}; expected {expected}")
-    names = tuple(task.channels) or default_channel_names(dataset.channels)
+    names = tuple(task.channels) or default_exr_channel_names(dataset.channels)
     return Channels(names, dataset.color_space, task.display, task.name)
 
 
@@ -145,8 +145,8 @@ def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec,
     """
     names = header.get("channels")
     if names is None:  # of a model that no run wrote
-        names = task.channels if len(task.channels) == count else default_channel_names(count)
-    elif not isinstance(names, list) or len(names) != count or channel_name_error(names):
+        names = task.channels if len(task.channels) == count else default_exr_channel_names(count)
+    elif not isinstance(names, list) or len(names) != count or exr_channel_name_error(names):
         raise CheckpointError(
             f"{where}: the model's header names the channels {str(names)[:100]}; expected {count} different names"
         )

@@ -20,7 +20,7 @@ from torch import Tensor
 from neuprim.core import compression
 from neuprim.core.errors import CheckpointError, cut_error_text, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.plain import finite_number, load_json
+from neuprim.core.io.plain import finite_json_number, load_json
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import dense_primitive_parameters, sparse_primitive_parameters
@@ -79,13 +79,13 @@ def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
             f"{path}: format version is {cut_error_text(repr(header.get('format')))}; this neuprim reads {FORMAT}"
         )
     for name in _NUMBERS:  # in any header; null: not known
-        number = 0.0 if header.get(name) is None else finite_number(header[name])
+        number = 0.0 if header.get(name) is None else finite_json_number(header[name])
         if number is None or number < 0:
             raise CheckpointError(
                 f"{path}: {name} is {cut_error_text(repr(header[name]))}; expected a number of at least 0"
             )
     background = header.get("background", [])
-    if not isinstance(background, list) or any(finite_number(value) is None for value in background):
+    if not isinstance(background, list) or any(finite_json_number(value) is None for value in background):
         raise CheckpointError(f"{path}: background is {cut_error_text(repr(background))}; expected finite numbers")
     return header
 

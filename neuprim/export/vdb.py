@@ -28,7 +28,7 @@ from torch import Tensor
 
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
-from neuprim.core.io.vdb import Grid, Tiles, read_grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, vdb_scale_transform, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.backends import computing_device
@@ -162,7 +162,7 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
     return model.component(placement.component)
 
 
-def _clamp_exported_grid(grid: Grid, extent: GridExtent, per_unit: float) -> tuple[Grid, _CutVoxels]:
+def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> tuple[VdbGrid, _CutVoxels]:
     """Clamp a grid to an extent: no value above its largest, none outside its box; and count what that changed.
 
     Args:
@@ -255,7 +255,7 @@ def _export_voxel_transform(
     if count is not None and size is not None:
         raise ConfigError("grid and voxel_size: expected one of them")
     corners = np.linalg.inv(scene_from_world)[:3, :3] @ (box[1] - box[0])
-    return scale_transform(size or float(np.abs(corners).max()) / (count or 128), origin.tolist())
+    return vdb_scale_transform(size or float(np.abs(corners).max()) / (count or 128), origin.tolist())
 
 
 # ---------------------------------------------------------------- sampling
@@ -271,7 +271,7 @@ class _VdbExportSampler(NamedTuple):
     factor: float
     threshold: float
 
-    def sample_grid(self, conditions: Conditions, transform: np.ndarray) -> Grid:
+    def sample_grid(self, conditions: Conditions, transform: np.ndarray) -> VdbGrid:
         """Sample one frame block by block, so that dense memory is that of one block.
 
         Args:
@@ -301,11 +301,11 @@ class _VdbExportSampler(NamedTuple):
             np.concatenate([np.zeros((0, 8, 8, 8), np.float32), *(g.values for g in parts)]),
             np.concatenate([np.zeros((0, 8, 8, 8), bool), *(g.masks for g in parts)]),
         )
-        return Grid(self.name, np.array(transform, np.float64), np.zeros((), np.float32), *leaves, Tiles.none())
+        return VdbGrid(self.name, np.array(transform, np.float64), np.zeros((), np.float32), *leaves, VdbTiles.none())
 
     def _sample_blocks(
         self, conditions: Conditions, scene_from_index: np.ndarray, first: np.ndarray, size: np.ndarray
-    ) -> Iterator[Grid]:
+    ) -> Iterator[VdbGrid]:
         """Yield sparse grids of blocks of bounded memory, each a multiple of 8 along the first two axes."""
         settings = self.job.run.settings
         where = computing_device(settings)
@@ -321,7 +321,7 @@ class _VdbExportSampler(NamedTuple):
                 sigma = density_grid(self.model, conditions, matrix, shape, settings.threads, where).numpy()
                 values = sigma * np.float32(self.factor)
                 values[values < self.threshold] = 0.0
-                yield Grid.from_dense(self.name, values, lower=corner.tolist())
+                yield VdbGrid.from_dense(self.name, values, lower=corner.tolist())
 
 
 def _measure_vdb_errors(

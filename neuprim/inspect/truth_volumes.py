@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import Grid, VdbFrame, read_grid, read_header, vdb_sequence, write_vdb
+from neuprim.core.io.vdb import VdbFrame, VdbGrid, list_vdb_files, read_grid, read_header, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.volumes.density_grid import voxels_in_box
 from neuprim.core.volumes.density_truth import DensityGridSource, DensityTruth, TruthFrame
@@ -43,7 +43,7 @@ def open_inspection_truth(
         return truth, "ground truth: the scene's own volumes"
     if not place.exists():
         raise DataError(f"--against {path}: no such file or folder; expected .vdb files, or scene for the scene's own")
-    frames = list(vdb_sequence(place).frames) if place.is_dir() else [VdbFrame(0, place)]
+    frames = list(list_vdb_files(place).frames) if place.is_dir() else [VdbFrame(0, place)]
     if _written_by_neuprim(frames[0].path):
         return InspectionGroundTruth(frames, world), f"ground truth: {path}, written by neuprim in scene units"
     scene = volume()
@@ -107,7 +107,7 @@ class InspectionGroundTruth(DensityTruth):
         self.bounds = torch.from_numpy(np.stack([np.min(lows, 0), np.max(highs, 0)])).double()
 
     @staticmethod
-    def _read_extinction(frame: VdbFrame) -> Grid:
+    def _read_extinction(frame: VdbFrame) -> VdbGrid:
         names = [g.name for g in read_header(frame.path).grids if g.refusal() is None]
         chosen = next((name for name in _USUAL if name in names), names[0] if len(names) == 1 else None)
         if chosen is None:
@@ -118,7 +118,7 @@ class InspectionGroundTruth(DensityTruth):
             raise DataError(f"{frame.path}: grid {chosen!r} has {grid.channels} channels; expected one")
         return grid
 
-    def _scene_from_index(self, grid: Grid) -> np.ndarray:
+    def _scene_from_index(self, grid: VdbGrid) -> np.ndarray:
         """Return the (4, 4) matrix from index to scene."""
         return np.asarray(self._world.scene_from_world.numpy() @ grid.transform)
 
@@ -151,6 +151,6 @@ def write_inspection_vdb(path: Path, frame: InspectionFrame, world: World) -> No
     scalars = {_CONDITION + name: float(value) for name, value in frame.conditions.items() if value.numel() == 1}
     meaning = {_MARK: "scene", "neuprim_value": "extinction, 1/scene unit; each primitive clamped at 0 from below"}
     transform = world.world_from_scene.numpy() @ frame.scene_from_index.numpy()
-    grid = Grid.from_dense(_GRID, frame.sigma, transform=transform, metadata={**meaning, **scalars})
+    grid = VdbGrid.from_dense(_GRID, frame.sigma, transform=transform, metadata={**meaning, **scalars})
     path.parent.mkdir(parents=True, exist_ok=True)
     write_vdb(path, [grid], compression="zip")

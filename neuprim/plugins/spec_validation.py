@@ -10,7 +10,7 @@ from typing import Any
 
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, Inspector, LossExtension
-from neuprim.core.io.exr import channel_name_error
+from neuprim.core.io.exr import exr_channel_name_error
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.render.layer_frame import COMMON, LIGHTS, LayerSpec
 from neuprim.core.task import SceneSpec, TaskSpec
@@ -92,7 +92,7 @@ def _check_plugin_task_spec(spec: TaskSpec) -> None:
 
 
 def _check_plugin_channel_names(names: Any) -> None:
-    wrong = channel_name_error(names)
+    wrong = exr_channel_name_error(names)
     _require_member(wrong is None, f"channels{wrong}")
 
 

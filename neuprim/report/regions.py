@@ -15,7 +15,7 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io import images
 from neuprim.core.io.files import read_json, write_json
-from neuprim.core.io.plain import finite_number
+from neuprim.core.io.plain import finite_json_number
 from neuprim.report.pictures import error_map
 
 REGIONS_FILE = "worst.json"  # beside the pictures in ``renders/``
@@ -115,7 +115,7 @@ def _parse_worst_region(pictures: Mapping[str, Path], entry: Any) -> RegionFile 
     """Return a region; None for what is no region of a picture in the folder."""
     if not isinstance(entry, Mapping) or not isinstance(entry.get("file"), str) or entry["file"] not in pictures:
         return None
-    value, numbers = finite_number(entry.get("psnr")), [entry.get(key) for key in ("x", "y", "side")]
+    value, numbers = finite_json_number(entry.get("psnr")), [entry.get(key) for key in ("x", "y", "side")]
     if value is None or not all(isinstance(n, int) for n in numbers):
         return None
     x, y, side = numbers

@@ -19,7 +19,7 @@ from typing import Any
 import yaml
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.plain import load_json, load_yaml
+from neuprim.core.io.plain import load_json, parse_yaml_file
 from neuprim.report.regions import RegionFile, read_regions
 
 
@@ -119,7 +119,7 @@ def read_reported_run(run_dir: Path) -> ReportedRun:
     if not any(f.is_file() for f in files):
         raise DataError(f"{run_dir}: not a run directory, it has none of config.yaml, metrics.json and metrics.jsonl")
     config_text = _read_reported_text(files[0])
-    config = _read_reported_mapping(files[0], "YAML", lambda text: load_yaml(text) or {})
+    config = _read_reported_mapping(files[0], "YAML", lambda text: parse_yaml_file(text) or {})
     metrics = _read_reported_mapping(files[1], "JSON", lambda text: load_json(text, infinite=True))
     log, unreadable = _parse_reported_log(_read_reported_text(files[2]) or "")
     renders = run_dir / "renders"

@@ -15,7 +15,7 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory
-from neuprim.core.io.plain import finite_number, load_json
+from neuprim.core.io.plain import finite_json_number, load_json
 from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit
@@ -166,7 +166,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         raise DataError(f"{path}: {error}") from error
     if not isinstance(data, dict) or any(
-        finite_number(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None
+        finite_json_number(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None
     ):
         raise DataError(f"{path}: expected an object with metrics")
     return data

@@ -13,7 +13,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.channels import Channels
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.images import webp_data_uri
+from neuprim.core.io.images import encode_webp_data_uri
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
@@ -33,7 +33,7 @@ def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int) -> 
         view = dataset.test.view(index)
         if isinstance(view.camera, Camera):
             image = channels.display(dataset.test.pixels(index).over(dataset.background)).clamp(0.0, 1.0)
-            truth = webp_data_uri(image, _TRUTH_PIXELS)
+            truth = encode_webp_data_uri(image, _TRUTH_PIXELS)
             views.append(PageView(view.name, view.camera, view.conditions, truth))
             contrasts.append(float(image.std()))
     if views:  # the first frame of a sequence may be empty
@@ -82,7 +82,7 @@ def scene_page(
     if scene.views:
         start = {condition.spec.name: condition.value for condition in scene.conditions}
         image = draw(model, scene.views[0].camera, scene.views[0].conditions or start)
-        still = webp_data_uri(channels.display(image).clamp(0.0, 1.0), _STILL_PIXELS)
+        still = encode_webp_data_uri(channels.display(image).clamp(0.0, 1.0), _STILL_PIXELS)
     scene = replace(scene, still=still, linear=channels.color_space == "linear", up=_read_webpage_axis(scene.up))
     return make_model_webpage(name, model, channels.rgb, settings, scene, level)
 

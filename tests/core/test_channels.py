@@ -15,7 +15,7 @@ from torch import Tensor
 from neuprim.core.channels import Channels, find_channels, read_stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.core.io import images
-from neuprim.core.io.exr import default_channel_names, exr_channels, write_exr
+from neuprim.core.io.exr import default_exr_channel_names, exr_channels, write_exr
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 
@@ -32,7 +32,7 @@ def image(channels: int, height: int = 4, width: int = 6) -> Tensor:
 @pytest.mark.parametrize(
     ("names", "shown", "indices"),
     [
-        (default_channel_names(5), "c0, c1, c2 of 5 channels as red, green, blue", (0, 1, 2)),
+        (default_exr_channel_names(5), "c0, c1, c2 of 5 channels as red, green, blue", (0, 1, 2)),
         (BANDS, "450nm, 550 nm, Ünïcode of 5 channels as red, green, blue", (0, 1, 2)),
         (("NIR", "B", "G", "R"), "R, G, B of 4 channels as red, green, blue", (3, 2, 1)),
         (("700nm", "550nm", "450nm"), "700nm, 550nm, 450nm as red, green, blue", (0, 1, 2)),
@@ -109,7 +109,8 @@ def test_a_model_keeps_its_names_and_old_ones_get_some(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("half", [True, False])
 @pytest.mark.parametrize(
-    "names", [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_channel_names(31)]
+    "names",
+    [BANDS, ("R", "G", "B"), ("Y",), ("NIR", "B", "G", "R"), ("z" * 31, "ü" * 15), default_exr_channel_names(31)],
 )
 def test_exr_gives_back_every_channel_by_its_name(tmp_path: Path, names: tuple[str, ...], half: bool) -> None:
     path, values = tmp_path / "a.exr", image(len(names))

@@ -24,7 +24,7 @@ from neuprim.core.conditions import read_conditions, split_conditions
 from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import NeuprimError
 from neuprim.core.io.images import write_png
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.task import SceneContext
 from neuprim.plugins.registry import EXPORTERS, TASKS
@@ -74,7 +74,7 @@ def with_run(static_run: Path) -> None:
 
 def with_volumes(static_run: Path) -> None:
     values = torch.rand(10, 10, 10).numpy()
-    grid = Grid.from_dense("density", values, lower=(0, 0, 0), transform=scale_transform(0.1))
+    grid = VdbGrid.from_dense("density", values, lower=(0, 0, 0), transform=vdb_scale_transform(0.1))
     Path("frames").mkdir()
     for path in ("smoke.vdb", "frames/smoke_001.vdb", "frames/smoke_002.vdb"):
         write_vdb(path, [grid])

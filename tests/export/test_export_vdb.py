@@ -11,7 +11,7 @@ import torch
 
 from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.vdb import Grid, read_grid
+from neuprim.core.io.vdb import VdbGrid, read_grid
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.export import vdb as exporter
@@ -22,7 +22,7 @@ from tests.plugins import marked
 from tests.pretend_card import CARD, pretended
 
 
-def centre_of(grid: Grid, near: tuple[float, float, float], radius: float) -> np.ndarray:
+def centre_of(grid: VdbGrid, near: tuple[float, float, float], radius: float) -> np.ndarray:
     """World position of the middle of what lies within ``radius`` of a place."""
     assert grid.bounds is not None
     dense, low = grid.to_dense(), np.array(grid.bounds[0])

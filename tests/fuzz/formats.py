@@ -220,11 +220,11 @@ def _read_images(folder: Path) -> None:
 
 
 def _vdb(folder: Path) -> None:
-    from neuprim.core.io.vdb import Grid, write_vdb
+    from neuprim.core.io.vdb import VdbGrid, write_vdb
 
     values = np.random.default_rng(0).random((12, 10, 9)).astype(np.float32)
     for compression in ("none", "zip", "blosc"):
-        grids = [Grid.from_dense("density", values), Grid.from_dense("heat", values[:3])]
+        grids = [VdbGrid.from_dense("density", values), VdbGrid.from_dense("heat", values[:3])]
         write_vdb(folder / f"{compression}.vdb", grids, compression=compression)
 
 
@@ -490,7 +490,7 @@ FORMATS: dict[str, Format] = {
     "png": Format(_images("png"), _read_images, {"a.png": m.png}),
     "jpeg": Format(_images("jpg"), _read_images, {"a.jpg": m.lies(0, 400)}),
     "webp": Format(_images("webp"), _read_images, {"a.webp": m.lies(0, 100)}),
-    "mask": Format(_images("png"), _reader(_IMAGES, "read_mask"), {"a.png": m.png}),
+    "mask": Format(_images("png"), _reader(_IMAGES, "read_mask_image"), {"a.png": m.png}),
     "exr": Format(_exr, _read_images, {"a.exr": m.lies(0, 420)}),
     "environment": Format(_exr, _reader("neuprim.core.environment", "read_environment"), {"a.exr": m.lies(0, 420)}),
     "vdb": Format(_vdb, _read_vdb, {f"{name}.vdb": m.lies(0, 1500) for name in ("none", "zip", "blosc")}),

@@ -12,7 +12,7 @@ import torch
 
 from neuprim.config import compose
 from neuprim.core import checkpoint
-from neuprim.core.io.vdb import Grid, write_vdb
+from neuprim.core.io.vdb import VdbGrid, write_vdb
 from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
@@ -80,7 +80,7 @@ def write_sequence(folder: Path, frames: tuple[int, ...] = (3, 4, 5)) -> Path:
         matrix[:3, 3] = WORLD_SHIFT
         write_vdb(
             folder / f"block_{number}.vdb",
-            [Grid.from_dense("density", values, lower=(-3, 4, 5), transform=matrix)],
+            [VdbGrid.from_dense("density", values, lower=(-3, 4, 5), transform=matrix)],
             compression="zip",
         )
     return folder

@@ -9,7 +9,7 @@ import torch
 
 from neuprim.config import compose
 from neuprim.core.checkpoint import save_model
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
@@ -39,7 +39,7 @@ def volumes(folder: Path) -> Path:
     for number in NUMBERS:
         radius = np.linalg.norm(index - np.array([8.0 + 4 * (number - 4), 12, 12], np.float32), axis=-1)
         value = np.clip(1 - radius / 6, 0, None)
-        grid = Grid.from_dense("density", value, transform=scale_transform(VOXEL, (10.0, 0.0, -3.0)))
+        grid = VdbGrid.from_dense("density", value, transform=vdb_scale_transform(VOXEL, (10.0, 0.0, -3.0)))
         write_vdb(folder / f"ball_{number}.vdb", [grid], compression="zip")
     return folder
 

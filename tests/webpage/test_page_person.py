@@ -12,7 +12,7 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.io.images import webp_data_uri
+from neuprim.core.io.images import encode_webp_data_uri
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
@@ -29,7 +29,7 @@ MODES = ("COLOUR", "ALPHA", "DEPTH", "SLICE", "ELLIPSOIDS")
 def still_page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A static model with two cameras, the second of which has its true image."""
     path = tmp_path_factory.mktemp("pages") / "static.html"
-    truth = webp_data_uri(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0)), 320)
+    truth = encode_webp_data_uri(torch.rand(48, 64, 3, generator=torch.Generator().manual_seed(0)), 320)
     views = [
         PageView("front", camera_at((0.3, -3.0, 1.0)), {}),
         PageView("side", camera_at((3.0, 0.2, 0.5)), {}, truth),
@@ -169,7 +169,7 @@ def test_a_picture_is_what_is_seen(still_page: Path, chromium: Any, tmp_path: Pa
 def test_time_moves_and_plays(chromium: Any, tmp_path: Path) -> None:
     model = random_model(TimeDensity(2, "window+motion", edge=2), TimeHarmonics(1), count=120)
     time = {"time": torch.tensor(0.2)}
-    views = [PageView("first", camera_at((0.3, -3.0, 1.0)), time, webp_data_uri(torch.rand(8, 8, 3), 320))]
+    views = [PageView("first", camera_at((0.3, -3.0, 1.0)), time, encode_webp_data_uri(torch.rand(8, 8, 3), 320))]
     page_of(model, tmp_path / "p.html", time, views=views)
     with open_tab(chromium, tmp_path / "p.html") as tab:
         before = middle(tab)

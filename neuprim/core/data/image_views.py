@@ -18,7 +18,7 @@ from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.distortion import Distortion, resample_image, undistortion_grid
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.images import ImageInfo, read_image, read_mask, srgb_to_linear
+from neuprim.core.io.images import ImageInfo, read_image, read_mask_image, srgb_to_linear
 from neuprim.core.model.fields import Conditions
 from neuprim.core.notices import warn_once
 
@@ -222,7 +222,7 @@ class ImageViews(ViewSet):
         image = read_image(frame.path, size)
         if image.shape[-1] != frame.info.channels or (image.dtype != torch.uint8) != frame.info.linear:
             raise DataError(f"{frame.path}: file changed while it was in use; expected {frame.info.channels} channels")
-        mask = None if frame.mask is None else read_mask(frame.mask.path, size) ^ frame.mask.inverted
+        mask = None if frame.mask is None else read_mask_image(frame.mask.path, size) ^ frame.mask.inverted
         if frame.info.linear and image.shape[-1] == 4:
             alpha = image[..., 3]
             if not bool(((alpha >= -1e-3) & (alpha <= 1.001)).all()):

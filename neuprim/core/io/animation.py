@@ -23,7 +23,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     repeated), RGB only. Raises DataError for frames, suffix or rate, and BackendUnavailable for MP4 without the package
     ``av``.
     """
-    _check_rate(path, len(frames), fps)
+    _check_animation_rate(path, len(frames), fps)
     shapes = sorted({tuple(f.shape) for f in frames})
     if len(shapes) != 1:
         raise DataError(f"{path}: frames have shapes {shapes}; expected one shape")
@@ -31,7 +31,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
         _write_mp4(path, frames, fps)
     else:
         images = [pillow_image(path, f) for f in frames]
-        _save_animation(path, images[0], images[1:], fps, quality)
+        _write_animation_file(path, images[0], images[1:], fps, quality)
 
 
 class FrameSpool:
@@ -55,21 +55,21 @@ class FrameSpool:
 
     def write(self, path: Path, fps: float) -> None:
         """Write the same file as :func:`write_animation` (WebP or GIF) and close the spool; raises as that."""
-        _check_rate(path, self.count, fps)
+        _check_animation_rate(path, self.count, fps)
         self._pages.finalize()
         self._file.seek(0)
         with Image.open(self._file, formats=["TIFF"]) as frames:
-            _save_animation(path, frames, (), fps)
+            _write_animation_file(path, frames, (), fps)
         self._file.close()
 
 
-def _check_rate(path: Path, count: int, fps: float) -> None:
+def _check_animation_rate(path: Path, count: int, fps: float) -> None:
     if not count or not 0.0 < fps < float("inf"):
         expected = "at least one frame and a positive rate"
         raise DataError(f"{path}: {count} frames at {fps} frames per second; expected {expected}")
 
 
-def _save_animation(
+def _write_animation_file(
     path: Path, first: Image.Image, others: Sequence[Image.Image], fps: float, quality: int = 80
 ) -> None:
     kind = {".webp": "WEBP", ".gif": "GIF"}.get(path.suffix.lower())

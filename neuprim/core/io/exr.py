@@ -29,7 +29,7 @@ _MAX_NAME_BYTES = 31  # that every reader of OpenEXR takes
 _MAGIC = b"\x76\x2f\x31\x01"
 
 
-def check_pixel_count(path: Path, width: int, height: int) -> None:
+def check_image_file_size(path: Path, width: int, height: int) -> None:
     """Raise DataError unless a header's size is positive and at most :data:`MAX_PIXELS`."""
     if width <= 0 or height <= 0:
         raise DataError(f"{path}: header claims {width}x{height} pixels; expected a positive size")
@@ -38,7 +38,7 @@ def check_pixel_count(path: Path, width: int, height: int) -> None:
 
 
 @contextmanager
-def refuse_out_of_memory(path: Path) -> Iterator[None]:
+def refuse_image_file_beyond_memory(path: Path) -> Iterator[None]:
     """Turn MemoryError into a DataError that names the image; damaged files also claim more than they hold."""
     try:
         yield
@@ -47,12 +47,12 @@ def refuse_out_of_memory(path: Path) -> Iterator[None]:
         raise DataError(f"{path}: {what}") from None
 
 
-def default_channel_names(count: int) -> tuple[str, ...]:
+def default_exr_channel_names(count: int) -> tuple[str, ...]:
     """R, G, B for three channels, Y for one, else c0, c1, ..."""
     return {1: ("Y",), 3: ("R", "G", "B")}.get(count, tuple(f"c{i}" for i in range(count)))
 
 
-def channel_name_error(names: Sequence[Any]) -> str | None:
+def exr_channel_name_error(names: Sequence[Any]) -> str | None:
     """``"PROBLEM; expected ..."`` for the first name that OpenEXR cannot hold or that is ambiguous, else None."""
     used: set[str] = set()
     for i, name in enumerate(names):
@@ -128,7 +128,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
         found = f"OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}"
         raise DataError(f"{path}: {found}; expected equal windows")
     width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
-    check_pixel_count(path, width, height)
+    check_image_file_size(path, width, height)
     if width * height * len(channels) > _MAX_VALUES:
         found = f"header claims {len(channels)} channels of {width}x{height} pixels"
         raise DataError(f"{path}: {found}; at most {_MAX_VALUES} values are accepted")
@@ -170,7 +170,7 @@ class ExrChannel:
 
 def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str] | None = None) -> None:
     """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``."""
-    error = None if names is None else channel_name_error(names)
+    error = None if names is None else exr_channel_name_error(names)
     if error:
         raise DataError(f"{path}: names{error}")
     counts = (3, 4) if names is None else (len(names),)

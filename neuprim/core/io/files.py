@@ -139,7 +139,10 @@ def remove_leftovers(folder: Path) -> None:
             with suppress(OSError):
                 if match is None:
                     continue
-                if _is_running(match["pid"] or match["staging"]) and time.time() - path.lstat().st_mtime < _DAY:
+                if (
+                    _is_file_writer_running(match["pid"] or match["staging"])
+                    and time.time() - path.lstat().st_mtime < _DAY
+                ):
                     continue
                 if path.is_dir() and not path.is_symlink():
                     shutil.rmtree(path, ignore_errors=True)
@@ -147,7 +150,7 @@ def remove_leftovers(folder: Path) -> None:
                     path.unlink()
 
 
-def _is_running(number: str | None) -> bool:
+def _is_file_writer_running(number: str | None) -> bool:
     """Whether another process of this machine has that number."""
     # Containers reuse numbers. A file with this process's own number is old: the lock's holder has not written yet.
     if number is None or int(number) == os.getpid():

@@ -20,7 +20,14 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.exr import MAX_PIXELS, check_pixel_count, is_exr, read_exr, read_exr_layout, refuse_out_of_memory
+from neuprim.core.io.exr import (
+    MAX_PIXELS,
+    check_image_file_size,
+    is_exr,
+    read_exr,
+    read_exr_layout,
+    refuse_image_file_beyond_memory,
+)
 from neuprim.core.io.files import checked_atomic_path
 
 # formats that are refused by name -> byte offset of their signature, and possible signatures
@@ -53,7 +60,7 @@ def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
     if is_exr(path, required=channels is not None):
         names, width, height = read_exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
-    with refuse_out_of_memory(path), _open_image(path) as image:
+    with refuse_image_file_beyond_memory(path), _open_image(path) as image:
         return ImageInfo(image.width, image.height, len(_lossless_mode(path, image)), False, _exif_orientation(image))
 
 
@@ -64,7 +71,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
         size: expected (width, height).
         channels: names of OpenEXR channels to read instead of R, G, B(, A), in this order, as (H, W, C).
     """
-    with refuse_out_of_memory(path):
+    with refuse_image_file_beyond_memory(path):
         if is_exr(path, required=channels is not None):
             names, width, height = read_exr_layout(path, channels)
             _check_image_size(path, width, height, size)
@@ -75,9 +82,9 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
             return torch.from_numpy(_decode_image(path, image, mode))
 
 
-def read_mask(path: Path, size: tuple[int, int] | None = None) -> Tensor:
+def read_mask_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
     """(H, W) bool from a PNG, JPEG or WebP: True where any colour channel is not zero; raises as read_image."""
-    with refuse_out_of_memory(path), _open_image(path) as image:
+    with refuse_image_file_beyond_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
         _check_image_size(path, image.width, image.height, size)
         return torch.from_numpy(_decode_image(path, image, "RGB").any(axis=-1))
@@ -109,7 +116,7 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
         found = f"not a readable PNG or JPEG image ({type(error).__name__}: {error})"
         raise DataError(f"{path}: {found}; expected {expected}") from None
     with image:
-        check_pixel_count(path, image.width, image.height)
+        check_image_file_size(path, image.width, image.height)
         yield image
 
 
@@ -191,7 +198,7 @@ def write_webp(path: Path, image: Tensor, quality: int = 90, lossless: bool = Fa
         picture.save(temporary, format="WEBP", quality=quality, lossless=lossless)
 
 
-def webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> str:
+def encode_webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> str:
     """Encode (H, W, 3) sRGB values 0..1 as a ``data:`` URI of a WebP, scaled down to at most ``max_width`` pixels."""
     picture = Image.fromarray(to_uint8(image).numpy())
     if picture.width > max_width:

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import DataError, cut_error_text
-from neuprim.core.io.plain import finite_number, load_json
+from neuprim.core.io.plain import finite_json_number, load_json
 
 _MISSING = object()
 
@@ -65,7 +65,7 @@ class JsonReader:
         self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf
     ) -> float:
         """A finite number strictly between ``low`` and ``high``."""
-        value = finite_number(self.values.get(key))
+        value = finite_json_number(self.values.get(key))
         if value is None or not low < value < high:
             raise self.fail(key, expected)
         return value
@@ -100,7 +100,7 @@ class JsonReader:
 
         def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
             if not shape:
-                number = finite_number(value)
+                number = finite_json_number(value)
                 if number is None:
                     raise DataError(f"{self.where}: {key}{place} is {_describe_json(value)}; expected a finite number")
                 return number

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 _MAX_DIGITS = 20  # of a whole number of 64 bits
 
 
-def finite_number(value: object) -> float | None:
+def finite_json_number(value: object) -> float | None:
     """A number of a file as a float; None for text, true, a list, NaN, 1e400 and the like."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
@@ -37,12 +37,12 @@ def finite_number(value: object) -> float | None:
 
 def load_json(text: str | bytes, infinite: bool = False) -> Any:
     """Parse JSON text; ``infinite`` accepts NaN and infinity. Raises ValueError or RecursionError."""
-    parse_float = float if infinite else _parse_float
-    parse_constant = float if infinite else _refuse_constant
-    return json.loads(text, parse_int=_parse_int, parse_float=parse_float, parse_constant=parse_constant)
+    parse_float = float if infinite else _parse_json_float
+    parse_constant = float if infinite else _refuse_json_constant
+    return json.loads(text, parse_int=_parse_json_int, parse_float=parse_float, parse_constant=parse_constant)
 
 
-def load_yaml(text: str) -> Any:
+def parse_yaml_file(text: str) -> Any:
     """Parse YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
     loader = _PlainYamlLoader(text)
     try:
@@ -51,20 +51,20 @@ def load_yaml(text: str) -> Any:
         loader.dispose()
 
 
-def _parse_int(text: str) -> int:
+def _parse_json_int(text: str) -> int:
     if len(text.lstrip("-")) > _MAX_DIGITS or not -(2**63) <= int(text) < 2**64:
         raise ValueError(f"{cut_error_text(text)} has more than 64 bits")
     return int(text)
 
 
-def _parse_float(text: str) -> float:
+def _parse_json_float(text: str) -> float:
     value = float(text)
     if math.isinf(value):
         raise ValueError(f"{cut_error_text(text)} is larger than any number here")
     return value
 
 
-def _refuse_constant(text: str) -> float:
+def _refuse_json_constant(text: str) -> float:
     raise ValueError(f"{text} is no finite number")
 
 

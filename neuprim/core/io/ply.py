@@ -133,7 +133,7 @@ def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHead
         elif words[0] == "element" and len(words) == 3:
             if any(element.name == words[1] for element in elements):
                 raise DataError(f"{path}: element {words[1][:40]} twice")
-            elements.append(_ElementHeader(words[1], _parse_count(words[1], words[2], path), []))
+            elements.append(_ElementHeader(words[1], _parse_ply_count(words[1], words[2], path), []))
         elif words[0] == "property" and elements:
             elements[-1].fields.append(_parse_property(words, path))
             if sum(len(element.fields) for element in elements) > _MAX_PROPERTIES:
@@ -154,7 +154,7 @@ def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHead
     return order, elements, tuple(comments)
 
 
-def _parse_count(name: str, text: str, path: Path) -> int:
+def _parse_ply_count(name: str, text: str, path: Path) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
         raise DataError(f"{path}: {text[:20]!r} for the number of {name[:20]}; expected a count")
     return int(text)
@@ -172,7 +172,7 @@ def _parse_property(words: list[str], path: Path) -> tuple[str, str, str]:
 _Values = tuple[np.ndarray, dict[str, PlyList]]
 
 
-def _describe_rows(element: _ElementHeader) -> str:
+def _describe_ply_rows(element: _ElementHeader) -> str:
     return {"vertex": "vertices", "face": "faces"}.get(element.name, f"rows of {element.name[:40]}")
 
 
@@ -182,7 +182,7 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
     if not count or not fields:
         return np.zeros(0, [(name, order + kind) for name, kind, length in fields if not length]), {}
     start = file.tell()
-    sizes = _first_sizes(file, fields, order)
+    sizes = _first_ply_list_lengths(file, fields, order)
     file.seek(start)
     if sizes is not None:
         layout: list[tuple] = []
@@ -203,12 +203,12 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
                 return rows, {name: PlyList(np.full(count, size), table[name].reshape(-1)) for name, size in lists}
             file.seek(start)
         elif not any(length for _, _, length in fields):
-            found = f"{count} {_describe_rows(element)} of {dtype.itemsize} bytes; only {left} bytes follow"
+            found = f"{count} {_describe_ply_rows(element)} of {dtype.itemsize} bytes; only {left} bytes follow"
             raise DataError(f"{path}: {found}; expected a complete file")
     return _read_row_by_row(file, path, element, order, left)
 
 
-def _first_sizes(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
+def _first_ply_list_lengths(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
     """Lengths of the first row's lists, 1 for scalars; None if they are implausible."""
     sizes = []
     for _, kind, length in fields:
@@ -241,7 +241,7 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
             place += size * width
             if place > len(data) or size < 0:
                 raise DataError(
-                    f"{path}: {element.count} {_describe_rows(element)} announced; the file ends in row {row}"
+                    f"{path}: {element.count} {_describe_ply_rows(element)} announced; the file ends in row {row}"
                 )
     file.seek(start + place)
     octets = np.frombuffer(data, np.uint8)
@@ -262,7 +262,7 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
 def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        found = f"{count} {_describe_rows(element)} of {len(fields)} numbers; only {left} bytes follow"
+        found = f"{count} {_describe_ply_rows(element)} of {len(fields)} numbers; only {left} bytes follow"
         raise DataError(f"{path}: {found}; expected a complete file")
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
@@ -277,20 +277,20 @@ def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) 
             table, lists = _read_ascii_lists(file, element)
     except (ValueError, IndexError) as error:
         reason = " ".join(str(error).split())[:120]
-        raise DataError(f"{path}: {_describe_rows(element)} are not numbers ({reason})") from error
+        raise DataError(f"{path}: {_describe_ply_rows(element)} are not numbers ({reason})") from error
     if table.shape != (count, len(scalars)):
-        found = f"{table.shape[0]} {_describe_rows(element)} of {table.shape[1]} numbers"
+        found = f"{table.shape[0]} {_describe_ply_rows(element)} of {table.shape[1]} numbers"
         raise DataError(f"{path}: {found}; expected {count} of {len(scalars)}")
     rows = np.zeros(count, [(name, "<" + kind) for name, kind in scalars])
     for i, (name, kind) in enumerate(scalars):
-        rows[name] = _cast_column(table[:, i], name, kind, path)
+        rows[name] = _cast_ply_column(table[:, i], name, kind, path)
     for name, kind, length in fields:
         if length:
-            lists[name] = PlyList(lists[name].sizes, _cast_column(lists[name].values, name, kind, path))
+            lists[name] = PlyList(lists[name].sizes, _cast_ply_column(lists[name].values, name, kind, path))
     return rows, lists
 
 
-def _cast_column(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
+def _cast_ply_column(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
     info = None if kind[0] == "f" else np.iinfo(kind)
     if info is not None and not ((values >= info.min) & (values <= info.max)).all():
         raise DataError(f"{path}: {name} has values outside its type; expected {info.min} to {info.max}")

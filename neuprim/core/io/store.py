@@ -50,13 +50,13 @@ def open_store(address: str, copies: Path) -> Store:
         system, root = fsspec.core.url_to_fs(address)
     except ImportError as error:
         extra = ": pip install 'neuprim[s3]'" if protocol in ("s3", "s3a") else ""
-        what = f"{protocol}:// needs a package that is not installed ({_one_line(error)}){extra}"
+        what = f"{protocol}:// needs a package that is not installed ({_store_error_line(error)}){extra}"
         raise BackendUnavailable(f"{address}: {what}") from None
     except ValueError as error:
         expected = "a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER"
-        raise ConfigError(f"{address}: {_one_line(error)}; expected {expected}") from None
+        raise ConfigError(f"{address}: {_store_error_line(error)}; expected {expected}") from None
     except Exception as error:
-        raise DataError(f"{address}: cannot be reached ({_one_line(error)})") from error
+        raise DataError(f"{address}: cannot be reached ({_store_error_line(error)})") from error
     digest = hashlib.sha256(address.rstrip("/").encode()).hexdigest()[:16]
     return Store(address.rstrip("/"), copies / digest, system, root.rstrip("/"))
 
@@ -206,7 +206,7 @@ class Store:
         except NeuprimError:
             raise
         except Exception as error:
-            raise DataError(f"{self.address}: cannot be {action} ({_one_line(error)})") from error
+            raise DataError(f"{self.address}: cannot be {action} ({_store_error_line(error)})") from error
 
 
 def _check_file_size(file: str, size: int, max_bytes: int) -> None:
@@ -214,5 +214,5 @@ def _check_file_size(file: str, size: int, max_bytes: int) -> None:
         raise DataError(f"{file}: {size:,} bytes; expected at most {max_bytes:,}")
 
 
-def _one_line(error: BaseException) -> str:
+def _store_error_line(error: BaseException) -> str:
     return " ".join(str(error).split()) or type(error).__name__

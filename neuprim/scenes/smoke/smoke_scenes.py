@@ -28,7 +28,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError, nearest
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.validation import Range
 from neuprim.scenes.image_set import Progress, write_cached_folder
 from neuprim.scenes.smoke.solver import GasForcing, GasProperties, GasSource, GasState, SmokeBox, advance_gas
@@ -396,11 +396,11 @@ def smoke_box(resolution: int) -> SmokeBox:
     return SmokeBox((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
 
 
-def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[Grid]:
+def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[VdbGrid]:
     """Convert a state to the grids of the scene, in half floats, with faint values set to the background."""
     half = box.cell * 0.5
     corner = (half - box.shape[0] * half, half - box.shape[1] * half, half)  # the centre of voxel 0
-    transform = scale_transform(box.cell, corner)
+    transform = vdb_scale_transform(box.cell, corner)
     fields = {"density": state.density, "temperature": state.temperature, "flames": state.fuel}
     grids = []
     for name in scene.grids:
@@ -412,7 +412,7 @@ def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[
         else:
             values = fields[name].numpy()
             values = np.where(values < THRESHOLD, np.float32(0), values)
-        grids.append(Grid.from_dense(name, values, transform=transform, half=True))
+        grids.append(VdbGrid.from_dense(name, values, transform=transform, half=True))
     return grids
 
 

@@ -127,7 +127,7 @@ def test_a_lack_of_memory_is_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
     monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", load)
     refuse(tmp_path / "a.png", "more memory than there is")
     with pytest.raises(DataError, match=r"a\.png.*more memory"):
-        images.read_mask(tmp_path / "a.png")
+        images.read_mask_image(tmp_path / "a.png")
 
 
 def test_what_8_bit_rgb_cannot_hold_is_refused(tmp_path: Path) -> None:
@@ -232,10 +232,10 @@ def test_masks_are_colours_that_are_not_zero(tmp_path: Path) -> None:
         (Image.fromarray(np.array([[True, False]])), [[True, False]]),
     ):
         image.save(tmp_path / "m.png")
-        assert images.read_mask(tmp_path / "m.png").tolist() == expected
+        assert images.read_mask_image(tmp_path / "m.png").tolist() == expected
     (tmp_path / "m.png").write_bytes(png(2, 2, 16, 0, (b"\0" + bytes(4)) * 2))
     with pytest.raises(DataError, match="16-bit"):
-        images.read_mask(tmp_path / "m.png")
+        images.read_mask_image(tmp_path / "m.png")
 
 
 def test_exr_of_one_named_layer(tmp_path: Path) -> None:

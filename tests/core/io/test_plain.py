@@ -11,7 +11,7 @@ import yaml
 from neuprim.core.checkpoint import read_header, write_tensors
 from neuprim.core.errors import CheckpointError, cut_error_text, one_line
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.io.plain import finite_number, load_json, load_yaml
+from neuprim.core.io.plain import finite_json_number, load_json, parse_yaml_file
 
 HUGE = ["1e400", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 100_000, "-" + "1" * 30, str(2**64)]
 
@@ -25,13 +25,13 @@ def test_numbers_beyond_the_limits_are_refused_in_a_short_line(number: str) -> N
 
 def test_numbers_within_them_are_as_they_were() -> None:
     assert load_json("[1, -2.5, 1e300, 18446744073709551615, true, null]") == [1, -2.5, 1e300, 2**64 - 1, True, None]
-    found = load_yaml("a: [1, 0x10, 1_000, 1.5e+3, 1:30, .inf, yes, 2**3]")
+    found = parse_yaml_file("a: [1, 0x10, 1_000, 1.5e+3, 1:30, .inf, yes, 2**3]")
     assert found["a"] == [1, 16, 1000, 1500.0, 90, float("inf"), True, "2**3"]
 
 
 @pytest.mark.parametrize("value", [True, "1", [1], None, float("nan"), float("inf"), 10**400])
 def test_what_is_no_finite_number(value: object) -> None:
-    assert finite_number(value) is None
+    assert finite_json_number(value) is None
 
 
 @pytest.mark.parametrize(
@@ -42,7 +42,7 @@ def test_what_is_no_finite_number(value: object) -> None:
 def test_yaml_with_references_huge_numbers_or_code_is_refused_at_once(text: str) -> None:
     begun = time.perf_counter()
     with pytest.raises((yaml.YAMLError, ValueError)):
-        load_yaml(text)
+        parse_yaml_file(text)
     assert time.perf_counter() - begun < 1.5
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.data import Dataset
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.task import SceneContext
 from neuprim.tasks.dynamic import vdb_recording_of
 from neuprim.tasks.dynamic.volume.capture import Capture
@@ -20,7 +20,7 @@ MIDDLE = (8, 15)  # along y and z, in voxels
 ORIGIN = (10.0, 0.0, -3.0)
 
 
-def blob(center: float, names: tuple[str, ...] = ("density", "flames"), fine: int = 1) -> list[Grid]:
+def blob(center: float, names: tuple[str, ...] = ("density", "flames"), fine: int = 1) -> list[VdbGrid]:
     """An ellipsoid of semi-axes 5, 3.5 and 6.5 voxels at x = ``center``, denser in the middle; no two axes are alike.
 
     With ``fine`` as many voxels share each edge.
@@ -28,12 +28,12 @@ def blob(center: float, names: tuple[str, ...] = ("density", "flames"), fine: in
     index = np.stack(np.meshgrid(*(np.arange(n * fine) / fine for n in (24, 18, 28)), indexing="ij"), -1)
     radius = np.linalg.norm((index - [center, *MIDDLE]) / [5.0, 3.5, 6.5], axis=-1)
     value = np.clip(1 - radius, 0, None).astype(np.float32)
-    transform = scale_transform(VOXEL / fine, ORIGIN)
-    return [Grid.from_dense(name, value * (0.2 if name == "flames" else 1.0), transform=transform) for name in names]
+    transform = vdb_scale_transform(VOXEL / fine, ORIGIN)
+    return [VdbGrid.from_dense(name, value * (0.2 if name == "flames" else 1.0), transform=transform) for name in names]
 
 
-def empty_frame() -> list[Grid]:
-    return [Grid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=scale_transform(VOXEL))]
+def empty_frame() -> list[VdbGrid]:
+    return [VdbGrid.from_dense("density", np.zeros((8, 8, 8), np.float32), transform=vdb_scale_transform(VOXEL))]
 
 
 def write_blobs(folder: Path, centers: dict[int, float], names: tuple[str, ...] = ("density", "flames")) -> Path:

@@ -11,7 +11,7 @@ import torch
 
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError
-from neuprim.core.io.vdb import Grid, read_grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, read_grid, vdb_scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.runs.export import export_run
@@ -33,12 +33,12 @@ def ball(centre: tuple[float, float, float], radius: float, peak: float, size: i
     return np.clip(peak * (1 - np.linalg.norm(index - centre, axis=-1) / radius), 0, None).astype(np.float32)
 
 
-def fire(frame: int) -> list[Grid]:
+def fire(frame: int) -> list[VdbGrid]:
     """Faint smoke, and flames of 1 that reach beyond it."""
-    transform = scale_transform(0.5, SHIFT)
+    transform = vdb_scale_transform(0.5, SHIFT)
     smoke, flame = ball((6 + frame, 8, 9), 5, PEAK), ball((6 + frame, 8, 5), 5, 1.0)
     named = (("density", smoke), ("flame", flame))
-    return [Grid.from_dense(name, values, transform=transform, half=True) for name, values in named]
+    return [VdbGrid.from_dense(name, values, transform=transform, half=True) for name, values in named]
 
 
 @pytest.fixture(scope="module")
@@ -63,7 +63,9 @@ def test_extinction_is_for_the_peak_of_the_sequence(peak: float, times: float, t
     values[8, 8, 8] = peak * 100  # one wrong voxel of thousands decides nothing
     values[2, 8, 8] = -peak
     (tmp_path / "files").mkdir()
-    write_vdb(tmp_path / "files" / "a_1.vdb", [Grid.from_dense("density", values, transform=scale_transform(0.5))])
+    write_vdb(
+        tmp_path / "files" / "a_1.vdb", [VdbGrid.from_dense("density", values, transform=vdb_scale_transform(0.5))]
+    )
     assert captured(tmp_path / "files", tmp_path).optics.extinction == 14 * times
     chosen = captured(tmp_path / "files", tmp_path, optics={"extinction": 3.0}).optics
     assert chosen.extinction == 3 and chosen.flame_extinction == 14
@@ -92,8 +94,8 @@ def test_the_parts_of_the_extinction_are_those_of_the_grids(files: Path, tmp_pat
 def test_flames_beyond_the_density_and_on_other_voxels_absorb(other: float, tmp_path: Path) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
-    smoke = Grid.from_dense("density", ball((8, 8, 8), 3, 1.0), transform=scale_transform(0.5))
-    flame = Grid.from_dense("flames", ball((20, 8, 8), 4, 1.0, 32), transform=scale_transform(other))
+    smoke = VdbGrid.from_dense("density", ball((8, 8, 8), 3, 1.0), transform=vdb_scale_transform(0.5))
+    flame = VdbGrid.from_dense("flames", ball((20, 8, 8), 4, 1.0, 32), transform=vdb_scale_transform(other))
     write_vdb(folder / "a_1.vdb", [smoke, flame])
     write_vdb(folder / "a_2.vdb", [flame])  # writers leave out a grid that is empty
     capture = captured(folder, tmp_path)
@@ -112,7 +114,7 @@ def test_flames_beyond_the_density_and_on_other_voxels_absorb(other: float, tmp_
 def test_a_flame_grid_without_a_flame_needs_no_component(tmp_path: Path) -> None:
     folder = tmp_path / "files"
     folder.mkdir()
-    write_vdb(folder / "a_1.vdb", [fire(0)[0], Grid.from_dense("flame", np.zeros((8, 8, 8), np.float32))])
+    write_vdb(folder / "a_1.vdb", [fire(0)[0], VdbGrid.from_dense("flame", np.zeros((8, 8, 8), np.float32))])
     assert captured(folder, tmp_path).components == ()
 
 

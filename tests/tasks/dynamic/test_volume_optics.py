@@ -12,7 +12,7 @@ import torch
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import read_grid, scale_transform, vdb_sequence, write_vdb
+from neuprim.core.io.vdb import list_vdb_files, read_grid, vdb_scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_capture_cameras
 from neuprim.tasks.dynamic.volume.optics import (
     EMBERGEN_FIRE,
@@ -129,7 +129,7 @@ def test_grids_of_other_resolutions_meet_in_the_world() -> None:
     for at in where:
         x, y, z = np.meshgrid(at, at, at, indexing="ij")
         fields.append(0.2 + 0.8 * np.exp(-8 * ((x - 0.4) ** 2 + (y - 0.5) ** 2 + (z - 0.6) ** 2)))
-    coarse, fine = (scale_transform(1 / n, [0.5 / n] * 3) for n in (24, 48))
+    coarse, fine = (vdb_scale_transform(1 / n, [0.5 / n] * 3) for n in (24, 48))
     density = grid_of("density", np.ones((24, 24, 24)), coarse)
     look = Optics(emission=1.0, flame_extinction=3.0)
     a = build_medium({"density": density, "flames": grid_of("flames", fields[0], coarse)}, look, SAME)
@@ -151,11 +151,13 @@ def test_normalisation(tmp_path: Path) -> None:
     for number, low in ((1, (0, 0, 0)), (2, (10, 4, 2)), (3, (0, 0, 0))):
         array = np.zeros((2, 2, 2)) if number == 3 else np.ones((2, 2, 2))
         grid = dataclasses.replace(
-            grid_of("density", array), transform=scale_transform((0.5, 1.0, 2.0), (7.0, 8.0, 9.0))
+            grid_of("density", array), transform=vdb_scale_transform((0.5, 1.0, 2.0), (7.0, 8.0, 9.0))
         )
         grid = dataclasses.replace(grid, origins=grid.origins + np.array(low, np.int32) * 8)
         write_vdb(tmp_path / f"f_{number}.vdb", [grid])
-    boxes = [b for f in vdb_sequence(tmp_path).frames if (b := read_grid(f.path, "density").world_bounds()) is not None]
+    boxes = [
+        b for f in list_vdb_files(tmp_path).frames if (b := read_grid(f.path, "density").world_bounds()) is not None
+    ]
     bounds = np.stack([np.min(boxes, 0)[0], np.max(boxes, 0)[1]])
     norm = CaptureNormalisation.from_bounds(bounds)
     scene = norm.to_scene(bounds)
@@ -171,7 +173,7 @@ def test_extinction_is_per_scene_unit() -> None:
     cloud = np.random.default_rng(0).random((8, 8, 8))
     images = []
     for size in (1.0, 100.0):
-        grid = grid_of("density", cloud, scale_transform(size / 8, (size, 0.0, -size)))
+        grid = grid_of("density", cloud, vdb_scale_transform(size / 8, (size, 0.0, -size)))
         bounds = grid.world_bounds()
         assert bounds is not None
         place = CaptureNormalisation.from_bounds(bounds).matrix()
@@ -184,7 +186,7 @@ def test_extinction_is_per_scene_unit() -> None:
 
 
 def test_a_real_fire_converges() -> None:
-    fire = vdb_sequence(real_folder("embergen_fire_a"))
+    fire = list_vdb_files(real_folder("embergen_fire_a"))
     position = [f.number for f in fire.frames].index(40)
     grids = {n: read_grid(fire.frames[position].path, n) for n in ("temperature", "flames")}
     boxes = [g.world_bounds() for g in grids.values() if g is not None]

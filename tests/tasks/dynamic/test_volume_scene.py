@@ -13,7 +13,7 @@ import torch
 
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.vdb import Grid, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
@@ -198,7 +198,9 @@ def test_optics_of_every_form() -> None:
 
 def test_the_box_is_that_of_the_grid_that_the_look_absorbs_by(hot: Path, tmp_path: Path) -> None:
     heat = blob(10.0, ("temperature",))[0]
-    far = Grid.from_dense("density", np.ones((8, 8, 8), np.float32), transform=scale_transform(VOXEL, (500.0, 0, 0)))
+    far = VdbGrid.from_dense(
+        "density", np.ones((8, 8, 8), np.float32), transform=vdb_scale_transform(VOXEL, (500.0, 0, 0))
+    )
     write_vdb(hot / "ball_1.vdb", [heat, far])
     write_vdb(hot / "ball_2.vdb", [heat])  # has what absorbs, whatever else it lacks
     data = dataset(hot, tmp_path, look="embergen_fire")
@@ -230,7 +232,7 @@ def test_grids_that_are_missing(names: tuple[str, ...], settings: dict[str, Any]
 def test_a_grid_by_another_name_and_one_of_vectors(hot: Path, tmp_path: Path) -> None:
     other = write_blobs(tmp_path / "other", {1: 11.0, 2: 12.0}, ("soup",))
     assert dataset(other, tmp_path, grids={"density": "soup"}).exposure > 0
-    vector = Grid.from_dense("density", np.ones((8, 8, 8, 3), np.float32), transform=scale_transform(VOXEL))
+    vector = VdbGrid.from_dense("density", np.ones((8, 8, 8, 3), np.float32), transform=vdb_scale_transform(VOXEL))
     write_vdb(hot / "ball_1.vdb", [vector])
     with pytest.raises(DataError, match=r"ball_1\.vdb: grid 'density' has 3 channels; expected 1"):
         dataset(hot, tmp_path)
@@ -250,8 +252,8 @@ def test_grids_far_from_the_worlds_origin_are_still_told_apart() -> None:
     ball = np.clip(1 - np.linalg.norm(index - 12, axis=-1) / 8, 0, None)
     media = []
     for offset in (0.0, 1e7):
-        coarse = Grid.from_dense("flames", ball[::2, ::2, ::2], transform=scale_transform(2e-3, (offset, 0, 0)))
-        fine = Grid.from_dense("density", ball, transform=scale_transform(1e-3, (offset, 0, 0)))
+        coarse = VdbGrid.from_dense("flames", ball[::2, ::2, ::2], transform=vdb_scale_transform(2e-3, (offset, 0, 0)))
+        fine = VdbGrid.from_dense("density", ball, transform=vdb_scale_transform(1e-3, (offset, 0, 0)))
         box = fine.world_bounds()
         assert box is not None
         grids = {"density": fine, "flames": coarse}

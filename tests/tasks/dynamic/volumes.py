@@ -10,7 +10,7 @@ import torch
 from scipy import ndimage
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.io.vdb import Grid
+from neuprim.core.io.vdb import VdbGrid
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 
@@ -98,6 +98,6 @@ def march_slowly(
     return image.reshape(view.height, view.width, -1, 4).mean(2)
 
 
-def grid_of(name: str, values: np.ndarray, transform: np.ndarray | None = None) -> Grid:
+def grid_of(name: str, values: np.ndarray, transform: np.ndarray | None = None) -> VdbGrid:
     """A fog volume of (X, Y, Z) or (X, Y, Z, 3) numbers."""
-    return Grid.from_dense(name, values, transform=transform)
+    return VdbGrid.from_dense(name, values, transform=transform)

@@ -4,9 +4,9 @@ Every failure is a DataError that names the file, what was found and what was ex
 be taken that its bytes do not pay for.
 """
 
-from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, Grid, Tiles, scale_transform
+from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, VdbGrid, VdbTiles, vdb_scale_transform
 from neuprim.core.io.vdb.header import FileHeader, GridHeader, read_header
-from neuprim.core.io.vdb.read import LEAF_LIMIT, VdbFrame, VdbSequence, read_grid, read_grids, vdb_sequence
+from neuprim.core.io.vdb.read import LEAF_LIMIT, VdbFrame, VdbSequence, list_vdb_files, read_grid, read_grids
 from neuprim.core.io.vdb.write import COMPRESSIONS, write_vdb
 
 __all__ = [
@@ -15,15 +15,15 @@ __all__ = [
     "LEAF_LIMIT",
     "Bounds",
     "FileHeader",
-    "Grid",
+    "VdbGrid",
     "GridHeader",
-    "Tiles",
+    "VdbTiles",
     "VdbFrame",
     "VdbSequence",
     "read_grid",
     "read_grids",
     "read_header",
-    "scale_transform",
-    "vdb_sequence",
+    "vdb_scale_transform",
+    "list_vdb_files",
     "write_vdb",
 ]

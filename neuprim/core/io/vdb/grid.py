@@ -14,14 +14,14 @@ from neuprim.core.errors import DataError
 
 TILE_SIZES = (8, 128, 4096)  # edges of a constant tile in voxels: in a lower node, in an upper node, in the root
 
-DENSE_LIMIT = 2 * 2**30  # most bytes that :meth:`Grid.to_dense` takes unless told otherwise: 2 GiB
+DENSE_LIMIT = 2 * 2**30  # most bytes that :meth:`VdbGrid.to_dense` takes unless told otherwise: 2 GiB
 
 Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
 """A box of voxels: lowest index, and the first index beyond the highest, per axis."""
 
 
 @dataclass(frozen=True, eq=False)
-class Tiles:
+class VdbTiles:
     """T cubes of one value each."""
 
     origins: np.ndarray  # (T, 3) int32, the lowest index of each
@@ -30,16 +30,18 @@ class Tiles:
     active: np.ndarray  # (T,) bool
 
     @staticmethod
-    def none(channels: int = 1) -> Tiles:
+    def none(channels: int = 1) -> VdbTiles:
         """No tiles."""
         shape = (0,) if channels == 1 else (0, channels)
-        return Tiles(np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros(shape, np.float32), np.zeros(0, bool))
+        return VdbTiles(
+            np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros(shape, np.float32), np.zeros(0, bool)
+        )
 
     def __len__(self) -> int:
         return len(self.sizes)
 
 
-def scale_transform(
+def vdb_scale_transform(
     voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
     """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``."""
@@ -50,7 +52,7 @@ def scale_transform(
 
 
 @dataclass(frozen=True, eq=False)
-class Grid:
+class VdbGrid:
     """A float or vec3s grid.
 
     A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have
@@ -63,7 +65,7 @@ class Grid:
     origins: np.ndarray  # (L, 3) int32, the lowest index of each leaf, multiples of 8, all different
     values: np.ndarray  # (L, 8, 8, 8) or (L, 8, 8, 8, 3) float32, indexed x, y, z
     masks: np.ndarray  # (L, 8, 8, 8) bool, which voxels are active
-    tiles: Tiles  # none of them overlaps a leaf
+    tiles: VdbTiles  # none of them overlaps a leaf
     kind: str = "fog volume"  # or "staggered", "unknown" or, if asked for, "level set"
     half: bool = False  # store as 16-bit floats when written
     metadata: Mapping[str, Any] = field(default_factory=dict)
@@ -78,13 +80,13 @@ class Grid:
         background: float = 0.0,
         half: bool = False,
         metadata: Mapping[str, Any] | None = None,
-    ) -> Grid:
+    ) -> VdbGrid:
         """A fog volume of the voxels that differ from the background; DataError for another shape or range.
 
         Args:
             array: (X, Y, Z) or (X, Y, Z, 3), any real type; kept as float32.
             lower: index of ``array[0, 0, 0]``.
-            transform: (4, 4) index to world, as of :func:`scale_transform`; None: voxels of edge 1.
+            transform: (4, 4) index to world, as of :func:`vdb_scale_transform`; None: voxels of edge 1.
         """
         array = np.asarray(array, np.float32)
         if array.ndim not in (3, 4) or array.shape[3:] not in ((), (3,)):
@@ -98,19 +100,19 @@ class Grid:
         padded = np.full((*(counts * 8), *channels), background, np.float32)
         inside = tuple(slice(a, a + n) for a, n in zip(low - base, array.shape[:3], strict=True))
         padded[inside] = array
-        blocks = _blocks(padded)
+        blocks = _vdb_leaf_blocks(padded)
         active = blocks != np.float32(background)
         active = active.any(-1) if channels else active
         kept = np.argwhere(active.any((3, 4, 5)))
         chosen = tuple(kept.T)
-        return Grid(
+        return VdbGrid(
             name,
             np.eye(4) if transform is None else np.array(transform, np.float64),
             np.full(channels, background, np.float32),
             (kept * 8 + base).astype(np.int32),
             blocks[chosen],
             active[chosen],
-            Tiles.none(3 if channels else 1),
+            VdbTiles.none(3 if channels else 1),
             half=half,
             metadata=dict(metadata or {}),
         )
@@ -217,7 +219,7 @@ class Grid:
         first, last = np.array(base, np.int64), np.array(top, np.int64)
         self._fill_tiles(padded, first, last)
         inside = ((self.origins >= first) & (self.origins < last)).all(1)
-        _blocks(padded)[tuple(((self.origins[inside] - first) // 8).T)] = self.values[inside]
+        _vdb_leaf_blocks(padded)[tuple(((self.origins[inside] - first) // 8).T)] = self.values[inside]
         cut = tuple(slice(l - b, h - b) for l, h, b in zip(low, high, base, strict=True))
         dense = np.ascontiguousarray(padded[cut])
         if non_finite is not None:
@@ -230,13 +232,13 @@ class Grid:
         meets = ((origins < last) & (origins + tiles.sizes[:, None] > first)).all(1)
         small = meets & (tiles.sizes == 8)  # often many, and each of them one whole block
         repeated = tiles.values[small].reshape(-1, 1, 1, 1, *tiles.values.shape[1:])
-        _blocks(padded)[tuple(((origins[small] - first) // 8).T)] = repeated
+        _vdb_leaf_blocks(padded)[tuple(((origins[small] - first) // 8).T)] = repeated
         for i in np.flatnonzero(meets & ~small):
             begin, stop = np.maximum(origins[i] - first, 0), np.minimum(origins[i] + tiles.sizes[i], last) - first
             padded[begin[0] : stop[0], begin[1] : stop[1], begin[2] : stop[2]] = tiles.values[i]
 
 
-def _blocks(padded: np.ndarray) -> np.ndarray:
+def _vdb_leaf_blocks(padded: np.ndarray) -> np.ndarray:
     """(X/8, Y/8, Z/8, 8, 8, 8, …) view of an (X, Y, Z, …) array whose edges are multiples of 8."""
     x, y, z = (n // 8 for n in padded.shape[:3])
     split = padded.reshape(x, 8, y, 8, z, 8, *padded.shape[3:])

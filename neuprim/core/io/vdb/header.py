@@ -75,7 +75,7 @@ def open_cursor(path: Path) -> Iterator[VdbCursor]:
         yield VdbCursor(path, data)
 
 
-def compression_label(flags: int) -> str:
+def vdb_compression_label(flags: int) -> str:
     """The words OpenVDB itself uses, for example ``blosc + active values``."""
     codec = "blosc" if flags & BLOSC else "zip" if flags & ZIP else ""
     return " + ".join(word for word in (codec, "active values" if flags & MASK else "") if word) or "none"
@@ -92,10 +92,10 @@ def blosc_module() -> Any:
     return blosc
 
 
-def decompressor(flags: int) -> Callable[[bytes, int], bytes]:
+def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
     """Return the function (chunk, size) -> bytes that undoes a grid's compression, or raises ValueError."""
     if not flags & BLOSC:
-        return _unzip
+        return _unzip_vdb_chunk
     blosc = blosc_module()
     decompress, sizes = blosc.decompress, _BLOSC_HEADER.unpack_from
 
@@ -120,7 +120,7 @@ def decompressor(flags: int) -> Callable[[bytes, int], bytes]:
     return unblosc
 
 
-def _unzip(chunk: bytes, size: int) -> bytes:
+def _unzip_vdb_chunk(chunk: bytes, size: int) -> bytes:
     try:
         values = zlib.decompressobj().decompress(chunk, size + 1)
     except zlib.error as error:
@@ -176,7 +176,7 @@ class GridHeader:
 
     @property
     def compression(self) -> str:
-        return compression_label(self.flags)
+        return vdb_compression_label(self.flags)
 
     @property
     def voxel_size(self) -> tuple[float, float, float] | None:
@@ -253,13 +253,13 @@ def parse_header(cursor: VdbCursor) -> FileHeader:
     return FileHeader(cursor.path, version, (major, minor), metadata, tuple(grids))
 
 
-def _unique_name(text: str) -> str:
+def _unique_vdb_grid_name(text: str) -> str:
     name, _, number = text.partition("\x1e")  # OpenVDB's mark between a name and its number
     return f"{name}[{number}]" if number else name
 
 
 def _parse_grid(cursor: VdbCursor, what: str) -> GridHeader:
-    name = _unique_name(cursor.text(f"name of {what}"))
+    name = _unique_vdb_grid_name(cursor.text(f"name of {what}"))
     what = f"grid {name!r}"
     kind, parent = cursor.text(f"type of {what}"), cursor.text(f"parent of {what}")
     start, block, end = cursor.unpack("3q", f"offsets of {what}")
@@ -274,8 +274,8 @@ def _parse_grid(cursor: VdbCursor, what: str) -> GridHeader:
         expected = "a sum of 1 (zip), 2 (active values) and 4 (blosc)"
         raise inner.fail(f"{what} has compression bits {flags:#x}; expected {expected}")
     metadata = _parse_metadata(inner, f"metadata of {what}")
-    mapping, transform = _parse_transform(inner, what)
-    tree, half, parent = kind.removesuffix(_HALF), kind.endswith(_HALF), _unique_name(parent)
+    mapping, transform = _parse_vdb_transform(inner, what)
+    tree, half, parent = kind.removesuffix(_HALF), kind.endswith(_HALF), _unique_vdb_grid_name(parent)
     return GridHeader(name, tree, half, flags, metadata, mapping, transform, parent, inner.at, block, end)
 
 
@@ -300,7 +300,7 @@ def _parse_metadata(cursor: VdbCursor, what: str) -> dict[str, Any]:
     return found
 
 
-def _parse_transform(cursor: VdbCursor, what: str) -> tuple[str, np.ndarray | None]:
+def _parse_vdb_transform(cursor: VdbCursor, what: str) -> tuple[str, np.ndarray | None]:
     mapping = cursor.text(f"transform of {what}")
     if mapping not in _DOUBLES:
         return mapping, None

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb.grid import TILE_SIZES, Grid, Tiles
+from neuprim.core.io.vdb.grid import TILE_SIZES, VdbGrid, VdbTiles
 from neuprim.core.io.vdb.header import (
     BLOSC,
     MASK,
@@ -25,23 +25,23 @@ from neuprim.core.io.vdb.header import (
     FileHeader,
     GridHeader,
     VdbCursor,
-    decompressor,
     open_cursor,
     parse_header,
+    vdb_decompressor,
 )
 
 LEAF_LIMIT = 4 * 2**30
 """Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
 
 
-def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> Grid:
+def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> VdbGrid:
     """Read one grid of a file; the others stay undecoded. Arguments and errors as of :func:`read_grids`."""
     return next(read_grids(path, (name,), max_bytes=max_bytes, level_sets=level_sets))
 
 
 def read_grids(
     path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False
-) -> Iterator[Grid]:
+) -> Iterator[VdbGrid]:
     """Read several grids of a file, one at a time.
 
     Args:
@@ -59,7 +59,7 @@ def read_grids(
             yield _decode_grid(cursor, file, file.grid(name), max_bytes, level_sets)
 
 
-def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_bytes: int, level_sets: bool) -> Grid:
+def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_bytes: int, level_sets: bool) -> VdbGrid:
     what = f"grid {header.name!r}"
     refusal = header.undecodable() if level_sets else header.refusal()
     if refusal or header.transform is None:
@@ -72,7 +72,7 @@ def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_by
             raise cursor.fail(f"{what} {found}, which has none of its own or one of another type")
     tree = _TreeReader(cursor, source, what, max_bytes)
     arrays = (tree.background, tree.origins, tree.values, tree.masks, tree.tiles)
-    return Grid(header.name, header.transform, *arrays, header.kind, header.half, dict(header.metadata))
+    return VdbGrid(header.name, header.transform, *arrays, header.kind, header.half, dict(header.metadata))
 
 
 # ---------------------------------------------------------------- trees
@@ -101,7 +101,7 @@ UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
-    """Decodes the tree of ``source``, called ``what``, into the arrays of a Grid of at most ``max_bytes``."""
+    """Decodes the tree of ``source``, called ``what``, into the arrays of a VdbGrid of at most ``max_bytes``."""
 
     def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
@@ -112,7 +112,7 @@ class _TreeReader:
         self._stored_size = self._stored.itemsize * source.channels
         self._full_size = 4 * source.channels
         self._packed = bool(source.flags & (ZIP | BLOSC))
-        self._unpack = decompressor(source.flags)
+        self._unpack = vdb_decompressor(source.flags)
         self._leaf_origins: list[np.ndarray] = []
         self._tiles: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
         self._limit = max_bytes
@@ -172,7 +172,7 @@ class _TreeReader:
     def _node(self, origin: np.ndarray, slots: NodeSlots) -> np.ndarray:
         """Reads an internal node, keeps its tiles, and returns which slots, in order, are children."""
         cursor, what = self._cursor, f"a node of {self._what}"
-        children, active = (_unpack_mask(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
+        children, active = (_unpack_vdb_mask(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
         values = self._values(active, slots.count, what)
         if values is not None:
             kept = np.flatnonzero(~children)
@@ -189,13 +189,13 @@ class _TreeReader:
                 raise self._cursor.fail(f"{self._what} has {found}")
             self._tiles.append((origins[kept], size, values[kept], active[kept]))
 
-    def _collect_tiles(self, channels: int) -> Tiles:
+    def _collect_tiles(self, channels: int) -> VdbTiles:
         if not self._tiles:
-            return Tiles.none(channels)
+            return VdbTiles.none(channels)
         origins, sizes, values, active = zip(*self._tiles, strict=True)
         repeated = np.repeat(np.array(sizes, np.int32), [len(a) for a in active])
         places, numbers = np.concatenate(origins).astype(np.int32), np.concatenate(values).astype(np.float32)
-        return Tiles(places, repeated, numbers, np.concatenate(active))
+        return VdbTiles(places, repeated, numbers, np.concatenate(active))
 
     def _values(self, active: np.ndarray, count: int, what: str) -> np.ndarray | None:
         """(count,) or (count, 3) float32; None where all of them are the background and not active."""
@@ -211,7 +211,7 @@ class _TreeReader:
         values = np.empty((count, *self._shape), np.float32)
         values[:] = low
         if chosen is not None:
-            values[_unpack_mask(chosen)] = high
+            values[_unpack_vdb_mask(chosen)] = high
         values[active] = found
         return values
 
@@ -257,13 +257,13 @@ class _TreeReader:
     def _leaves(self, first: int, last: int) -> None:
         """Decode leaves ``first`` to ``last`` - 1: one loop over their headers, then whole arrays."""
         masks, special, whole, payloads = self._leaf_bytes(first, last)
-        active = _unpack_mask(masks).reshape(-1, _LEAF)
+        active = _unpack_vdb_mask(masks).reshape(-1, _LEAF)
         values = self.values[first:last]
         values[:] = self.background
         for i, low, high, chosen in special:
             values[i] = low
             if chosen is not None:
-                values[i, _unpack_mask(chosen)] = high
+                values[i, _unpack_vdb_mask(chosen)] = high
         stored = active
         if whole:
             stored = active.copy()
@@ -322,7 +322,7 @@ class _TreeReader:
         return b"".join(masks), special, whole, b"".join(payloads)
 
 
-def _unpack_mask(raw: bytes) -> np.ndarray:
+def _unpack_vdb_mask(raw: bytes) -> np.ndarray:
     return np.unpackbits(np.frombuffer(raw, np.uint8), bitorder="little").view(bool)
 
 
@@ -346,7 +346,7 @@ class VdbSequence:
         return len(self.frames)
 
 
-def vdb_sequence(folder: Path, prefix: str | None = None) -> VdbSequence:
+def list_vdb_files(folder: Path, prefix: str | None = None) -> VdbSequence:
     """The .vdb files of a folder by the last number in each name, after ``prefix`` where it holds several sequences.
 
     Raises DataError for no file, a name without a number, several prefixes, or one number twice.

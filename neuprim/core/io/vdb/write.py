@@ -13,8 +13,8 @@ import numpy as np
 
 from neuprim.core.errors import DataError, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.vdb.grid import TILE_SIZES, Grid
-from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, compression_label
+from neuprim.core.io.vdb.grid import TILE_SIZES, VdbGrid
+from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, vdb_compression_label
 from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, NodeSlots
 
 COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
@@ -27,7 +27,7 @@ _STALE = ("file_mem_bytes", "file_delayed_load")
 
 
 def write_vdb(
-    path: Path, grids: Sequence[Grid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None
+    path: Path, grids: Sequence[VdbGrid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None
 ) -> None:
     """Write grids to a file, whole or not at all.
 
@@ -53,7 +53,11 @@ def write_vdb(
             where = f"{path}: grid {grid.name!r}"
             writer = _TreeWriter(grid, flags, where)
             kind = ("Tree_vec3s_5_4_3" if grid.channels == 3 else "Tree_float_5_4_3") + "_HalfFloat" * grid.half
-            own = struct.pack("<I", flags) + _grid_metadata(grid, flags, where) + _pack_transform(grid.transform, where)
+            own = (
+                struct.pack("<I", flags)
+                + _grid_metadata(grid, flags, where)
+                + _pack_vdb_transform(grid.transform, where)
+            )
             tree = own + writer.topology
             file.write(_pack_text(grid.name) + _pack_text(kind) + _pack_text(""))
             start = file.tell() + 24
@@ -101,19 +105,19 @@ def _pack_metadatum(value: Any) -> tuple[str, bytes]:
     return "", b""
 
 
-def _grid_metadata(grid: Grid, flags: int, where: str) -> bytes:
+def _grid_metadata(grid: VdbGrid, flags: int, where: str) -> bytes:
     # values of foreign types are bytes, which cannot be written
     kept = {k: v for k, v in grid.metadata.items() if k not in _STALE and _pack_metadatum(v)[0]}
     box: tuple[tuple[int, ...], tuple[int, ...]] = _EMPTY_BOX
     if grid.bounds:  # OpenVDB's boxes include their upper corner
         box = grid.bounds[0], tuple(v - 1 for v in grid.bounds[1])
     kept |= {"class": grid.kind, "name": grid.name, "file_bbox_min": box[0], "file_bbox_max": box[1]}
-    kept |= {"file_voxel_count": grid.active_voxels, "file_compression": compression_label(flags)}
+    kept |= {"file_voxel_count": grid.active_voxels, "file_compression": vdb_compression_label(flags)}
     kept |= {"is_saved_as_half_float": bool(grid.half)}
     return _pack_metadata(dict(sorted(kept.items())), where)
 
 
-def _pack_transform(matrix: np.ndarray, where: str) -> bytes:
+def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
     """The simplest of OpenVDB's maps that is this transform."""
     matrix = np.asarray(matrix, np.float64)
     sound = matrix.shape == (4, 4) and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
@@ -135,7 +139,7 @@ def _pack_transform(matrix: np.ndarray, where: str) -> bytes:
 class _TreeWriter:
     """Turns a grid into ``topology`` and ``buffers``, the two parts of its tree."""
 
-    def __init__(self, grid: Grid, flags: int, where: str) -> None:
+    def __init__(self, grid: VdbGrid, flags: int, where: str) -> None:
         self._grid, self._where = grid, where
         self._pack = _value_packer(flags, (2 if grid.half else 4) * grid.channels)
         self._flags = flags
@@ -187,13 +191,13 @@ class _TreeWriter:
         here = tiles[self._grid.tiles.sizes[tiles] == UPPER.edge]
         below = tiles[self._grid.tiles.sizes[tiles] < UPPER.edge]
         nodes = _group_by_block(UPPER.edge, self._origins[leaves], self._tile_origins[below])
-        nodes.sort(key=lambda node: _slot_numbers(np.array([node[0]]), origin, UPPER)[0])
+        nodes.sort(key=lambda node: _vdb_slot_numbers(np.array([node[0]]), origin, UPPER)[0])
         self._node(
-            parts, _slot_numbers(np.array([n[0] for n in nodes]).reshape(-1, 3), origin, UPPER), origin, here, UPPER
+            parts, _vdb_slot_numbers(np.array([n[0] for n in nodes]).reshape(-1, 3), origin, UPPER), origin, here, UPPER
         )
         for corner, (inner, small) in nodes:
             mine = leaves[inner]
-            slots = _slot_numbers(self._origins[mine], corner, LOWER)
+            slots = _vdb_slot_numbers(self._origins[mine], corner, LOWER)
             mine = mine[np.argsort(slots)]
             self._node(parts, slots, corner, below[small], LOWER)
             for leaf in mine:
@@ -215,7 +219,7 @@ class _TreeWriter:
         values = np.empty((slots.count, *grid.background.shape), np.float32)
         values[:] = grid.background
         has_child[children] = True
-        at = _slot_numbers(self._tile_origins[tiles], origin, slots)
+        at = _vdb_slot_numbers(self._tile_origins[tiles], origin, slots)
         active[at] = grid.tiles.active[tiles]
         values[at] = grid.tiles.values[tiles]
         parts += [np.packbits(has_child, bitorder="little").tobytes(), np.packbits(active, bitorder="little").tobytes()]
@@ -251,7 +255,7 @@ def _group_by_block(
     return found
 
 
-def _slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: NodeSlots) -> np.ndarray:
+def _vdb_slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: NodeSlots) -> np.ndarray:
     """The slot numbers, in a node at ``origin``, of the children at ``corners`` (n, 3)."""
     edge = round(slots.count ** (1 / 3))
     x, y, z = ((corners - np.array(origin)) // slots.edge).astype(np.int64).T

@@ -12,7 +12,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.vdb import VdbFrame, vdb_sequence
+from neuprim.core.io.vdb import VdbFrame, list_vdb_files
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import voxels_in_box
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS, DensityGridSource, TruthFrame, measure_density_errors
@@ -53,7 +53,7 @@ class CaptureDensity(DensityGridSource):
         if path is None:
             files = list(capture.frames)
         elif path.is_dir():
-            files = [frame for frame in vdb_sequence(path).frames if first <= frame.number <= last]
+            files = [frame for frame in list_vdb_files(path).frames if first <= frame.number <= last]
             if not files:
                 raise DataError(f"{path}: no frame from {first} to {last}, which are the scene's")
         else:

@@ -14,7 +14,7 @@ from scipy import ndimage
 
 from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError, DataError, nearest
-from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, Grid
+from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, VdbGrid
 from neuprim.core.validation import Accepts, Range, Unbounded, field_types, validate_fields, validate_setting_names
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance
 
@@ -211,7 +211,7 @@ _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between
 
 
 def build_medium(
-    grids: Mapping[str, Grid], optics: Optics, scene_from_world: np.ndarray, where: torch.device = device.HOST
+    grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray, where: torch.device = device.HOST
 ) -> Medium:
     """Build the medium of one frame on the voxels of its extinction grid.
 
@@ -230,7 +230,9 @@ def build_medium(
     flames = grids.get(optics.flame_grid) if optics.emission > 0.0 or optics.flame_extinction > 0.0 else None
     base = next((grids[name] for name in optics.extinction_grids if name in grids), None)
     if base is None and flames is not None and optics.flame_extinction > 0.0:  # flames absorb by themselves
-        base = Grid.from_dense(optics.extinction_grids[0], np.zeros((0, 0, 0), np.float32), transform=flames.transform)
+        base = VdbGrid.from_dense(
+            optics.extinction_grids[0], np.zeros((0, 0, 0), np.float32), transform=flames.transform
+        )
     if base is None:
         wanted = " or ".join(repr(n) for n in optics.extinction_grids)
         raise DataError(f"no grid {wanted} to take the extinction from{nearest(optics.extinction_grids[0], grids)}")
@@ -259,7 +261,7 @@ def build_medium(
     return Medium.padded(values, scene_from_index, sigma_s if optics.mixes(grids) else None)
 
 
-def _transform_medium_bounds(grid: Grid, transform: np.ndarray) -> Bounds | None:
+def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
     """Bounds, under another index-to-world map, of the voxels whose centres lie in the box of a grid's active ones."""
     if grid.bounds is None or _same_voxels(grid.transform, transform):
         return grid.bounds
@@ -289,7 +291,7 @@ def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
     return same_axes and np.allclose(shift, [0, 0, 0, 1], rtol=0, atol=1e-6)
 
 
-def _sample_medium_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
+def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
     """The grid at the voxel centres of ``box`` under ``transform``; 0 where it is not finite, or a scalar negative."""
     if grid.channels != channels:
         raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
@@ -312,7 +314,7 @@ def _sample_medium_grid(grid: Grid, transform: np.ndarray, box: Bounds, channels
 
 
 def _scattering_albedo(
-    grids: Mapping[str, Grid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
+    grids: Mapping[str, VdbGrid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
 ) -> np.ndarray:
     """An array that broadcasts to (X, Y, Z, 3)."""
     albedo = np.array(optics.albedo, np.float32)

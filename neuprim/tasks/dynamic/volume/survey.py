@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from neuprim.core.errors import DataError, nearest
-from neuprim.core.io.vdb import Grid, VdbFrame, read_grids, read_header
+from neuprim.core.io.vdb import VdbFrame, VdbGrid, read_grids, read_header
 from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.tasks.dynamic.volume.optics import Optics
 
@@ -54,7 +54,7 @@ class GridReader:
             f"choose another scene.look, or name the grid: scene.grids.{wanted[0]}=NAME"
         )
 
-    def read(self, path: Path) -> dict[str, Grid]:
+    def read(self, path: Path) -> dict[str, VdbGrid]:
         """Read the grids of one file by meaning; grids that the file lacks are left out (exporters drop empty ones)."""
         in_file = {grid.name for grid in read_header(path).grids}
         wanted = {meaning: name for meaning, name in self.names.items() if name in in_file}

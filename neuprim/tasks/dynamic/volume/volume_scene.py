@@ -21,7 +21,7 @@ import torch
 from neuprim.core.data import Dataset, DataSource
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.store import Store, open_store
-from neuprim.core.io.vdb import VdbFrame, vdb_sequence
+from neuprim.core.io.vdb import VdbFrame, list_vdb_files
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunk, Chunks, SceneContext
@@ -231,7 +231,7 @@ def _prepare_vdb_scene(
         run = (options.simulation, options.timesteps, options.resolution, context.seed)
         folder = simulate_smoke(*run, context.cache_dir, context.progress)
         name = f"{options.simulation} (simulated)"
-    files = vdb_sequence(folder).frames
+    files = list_vdb_files(folder).frames
     chosen = set(choose_volume_frames(options.frames, [f.number for f in files], str(folder)))
     frames = [f for f in files if f.number in chosen]
     reader = find_volume_grids(frames, {str(meaning): name for meaning, name in options.grids.items()})

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuprim.core.io.vdb import read_grid, read_grids, read_header, scale_transform
+from neuprim.core.io.vdb import read_grid, read_grids, read_header, vdb_scale_transform
 from tests.core.io.vdb.vdb_bytes import LEAF_CORNER, bits, file_head, grid_bytes, one_grid, one_leaf, refused, text
 
 RNG = np.random.default_rng(11)
@@ -132,11 +132,11 @@ def test_versions(tmp_path: Path, version: int) -> None:
 
 MATRIX = np.array([[0.0, -2.0, 0.0, 5.0], [1.0, 0.0, 0.3, 6.0], [0.0, 0.0, 3.0, 7.0], [0.0, 0.0, 0.0, 1.0]])
 MAPS: dict[str, tuple[list[float], np.ndarray]] = {
-    "UniformScaleMap": ([0.5] * 15, scale_transform(0.5)),
-    "ScaleMap": ([1, 2, 3] + [9] * 12, scale_transform((1, 2, 3))),
-    "UniformScaleTranslateMap": ([5, 6, 7, 2, 2, 2] + [9] * 12, scale_transform(2, (5, 6, 7))),
-    "ScaleTranslateMap": ([5, 6, 7, 1, 2, 3] + [9] * 12, scale_transform((1, 2, 3), (5, 6, 7))),
-    "TranslationMap": ([5, 6, 7], scale_transform(1, (5, 6, 7))),
+    "UniformScaleMap": ([0.5] * 15, vdb_scale_transform(0.5)),
+    "ScaleMap": ([1, 2, 3] + [9] * 12, vdb_scale_transform((1, 2, 3))),
+    "UniformScaleTranslateMap": ([5, 6, 7, 2, 2, 2] + [9] * 12, vdb_scale_transform(2, (5, 6, 7))),
+    "ScaleTranslateMap": ([5, 6, 7, 1, 2, 3] + [9] * 12, vdb_scale_transform((1, 2, 3), (5, 6, 7))),
+    "TranslationMap": ([5, 6, 7], vdb_scale_transform(1, (5, 6, 7))),
     "AffineMap": (MATRIX.T.ravel().tolist(), MATRIX),
 }
 

@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuprim.core.io.vdb import Grid, read_grid, read_header, vdb_sequence, write_vdb
+from neuprim.core.io.vdb import VdbGrid, list_vdb_files, read_grid, read_header, write_vdb
 from tests.core.io.vdb.vdb_bytes import real_folder, same
 
 FOLDERS = {"embergen_fire_a": 2, "mantaflow_smoke": 21, "vdb_samples": 1}
 """Folder -> how many grids of its first file are decodable."""
 
 
-def agrees(grid: Grid) -> None:
+def agrees(grid: VdbGrid) -> None:
     """With what OpenVDB counted when it wrote the file."""
     assert grid.active_voxels == grid.metadata["file_voxel_count"]
     if grid.bounds is not None:
@@ -63,7 +63,7 @@ def test_copies_are_equal(tmp_path: Path, compression: str) -> None:
 
 def test_the_fire(tmp_path: Path) -> None:
     """Frame 0 is empty with an inverted box, numbers are not padded, and there is no grid called density."""
-    fire = vdb_sequence(real_folder("embergen_fire_a"))
+    fire = list_vdb_files(real_folder("embergen_fire_a"))
     assert [f.number for f in fire.frames] == list(range(41)) and fire.gaps == ()
     first, second = (read_grid(frame.path, "flames") for frame in fire.frames[:2])
     assert first.bounds is None and first.metadata["file_bbox_min"] > first.metadata["file_bbox_max"]

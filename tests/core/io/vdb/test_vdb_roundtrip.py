@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from neuprim.core.io.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, read_header, vdb_scale_transform, write_vdb
 from tests.core.io.vdb.vdb_bytes import random_grid, refused, same
 
 
@@ -35,7 +35,7 @@ def test_random_grids(tmp_path: Path, compression: str, half: bool, channels: in
 def test_dense_arrays_anywhere(tmp_path: Path, lower: tuple[int, int, int]) -> None:
     rng = np.random.default_rng(2)
     array = rng.random((21, 9, 30), np.float32) * (rng.random((21, 9, 30)) < 0.1)
-    grid = Grid.from_dense("density", array, lower=lower)
+    grid = VdbGrid.from_dense("density", array, lower=lower)
     write_vdb(tmp_path / "a.vdb", [grid])
     found = read_grid(tmp_path / "a.vdb", "density")
     box = (lower, (lower[0] + 21, lower[1] + 9, lower[2] + 30))
@@ -47,7 +47,7 @@ def test_dense_arrays_anywhere(tmp_path: Path, lower: tuple[int, int, int]) -> N
 
 
 def test_empty(tmp_path: Path) -> None:
-    write_vdb(tmp_path / "a.vdb", [Grid.from_dense("density", np.zeros((5, 5, 5)))])
+    write_vdb(tmp_path / "a.vdb", [VdbGrid.from_dense("density", np.zeros((5, 5, 5)))])
     grid = read_grid(tmp_path / "a.vdb", "density")
     assert grid.bounds is None and grid.world_bounds() is None and grid.range is None
     assert grid.active_voxels == grid.dense_bytes == 0 and grid.to_dense().shape == (0, 0, 0)
@@ -85,7 +85,7 @@ def test_dense_says_how_much_it_would_take() -> None:
 def test_non_finite_values_are_kept_counted_and_replaced_on_request(tmp_path: Path) -> None:
     array = np.ones((8, 8, 8), np.float32)
     array[0, 0, :3] = np.nan, np.inf, -np.inf
-    write_vdb(tmp_path / "a.vdb", [Grid.from_dense("density", array)])
+    write_vdb(tmp_path / "a.vdb", [VdbGrid.from_dense("density", array)])
     grid = read_grid(tmp_path / "a.vdb", "density")
     assert grid.non_finite == 3 and grid.range == (1.0, 1.0) and grid.active_voxels == 512
     np.testing.assert_array_equal(grid.to_dense(), array)
@@ -94,10 +94,10 @@ def test_non_finite_values_are_kept_counted_and_replaced_on_request(tmp_path: Pa
 
 
 TRANSFORMS = {
-    "UniformScaleMap": scale_transform(0.25),
-    "UniformScaleTranslateMap": scale_transform(0.25, (1, 2, 3)),
-    "ScaleMap": scale_transform((0.25, 0.5, 2.0)),
-    "ScaleTranslateMap": scale_transform((0.25, -0.5, 2.0), (0, 0, -9)),
+    "UniformScaleMap": vdb_scale_transform(0.25),
+    "UniformScaleTranslateMap": vdb_scale_transform(0.25, (1, 2, 3)),
+    "ScaleMap": vdb_scale_transform((0.25, 0.5, 2.0)),
+    "ScaleTranslateMap": vdb_scale_transform((0.25, -0.5, 2.0), (0, 0, -9)),
     "AffineMap": np.array([[0.0, -2.0, 0.0, 5.0], [1.0, 0.0, 0.3, 6.0], [0.0, 0.0, 3.0, 7.0], [0.0, 0.0, 0.0, 1.0]]),
 }
 
@@ -105,7 +105,7 @@ TRANSFORMS = {
 @pytest.mark.parametrize("name", TRANSFORMS)
 def test_transforms(tmp_path: Path, name: str) -> None:
     matrix = TRANSFORMS[name]
-    write_vdb(tmp_path / "a.vdb", [Grid.from_dense("density", np.ones((2, 3, 4)), transform=matrix)])
+    write_vdb(tmp_path / "a.vdb", [VdbGrid.from_dense("density", np.ones((2, 3, 4)), transform=matrix)])
     (entry,) = read_header(tmp_path / "a.vdb").grids
     assert entry.map == name
     grid = read_grid(tmp_path / "a.vdb", "density")
@@ -116,15 +116,17 @@ def test_transforms(tmp_path: Path, name: str) -> None:
 
 
 def test_writer_refuses(tmp_path: Path) -> None:
-    path, good = tmp_path / "a.vdb", Grid.from_dense("density", np.ones((8, 8, 8)))
+    path, good = tmp_path / "a.vdb", VdbGrid.from_dense("density", np.ones((8, 8, 8)))
     write_vdb(path, [good])
     before = path.read_bytes()
 
-    def grid(**changes: object) -> Grid:
+    def grid(**changes: object) -> VdbGrid:
         return replace(good, **changes)  # type: ignore[arg-type]
 
-    def tile(origin: tuple[int, int, int], size: int) -> Tiles:
-        return Tiles(np.array([origin], np.int32), np.array([size], np.int32), np.ones(1, np.float32), np.ones(1, bool))
+    def tile(origin: tuple[int, int, int], size: int) -> VdbTiles:
+        return VdbTiles(
+            np.array([origin], np.int32), np.array([size], np.int32), np.ones(1, np.float32), np.ones(1, bool)
+        )
 
     refused(lambda: write_vdb(path, [good, good]), "a.vdb", "different names")
     refused(lambda: write_vdb(path, [good], compression="lz4"), "a.vdb", "'lz4'", "blosc")
@@ -137,6 +139,6 @@ def test_writer_refuses(tmp_path: Path) -> None:
     refused(lambda: write_vdb(path, [grid(transform=np.zeros((4, 4)))]), "density", "invertible")
     large = grid(half=True, values=np.full((1, 8, 8, 8), 7e4, np.float32))
     refused(lambda: write_vdb(path, [large]), "density", "half", "65504")
-    refused(lambda: Grid.from_dense("density", np.ones((2, 2))), "density", "(2, 2)")
-    refused(lambda: Grid.from_dense("density", np.ones((9, 9, 9)), lower=(2**31 - 9, 0, 0)), "density", "31 bits")
+    refused(lambda: VdbGrid.from_dense("density", np.ones((2, 2))), "density", "(2, 2)")
+    refused(lambda: VdbGrid.from_dense("density", np.ones((9, 9, 9)), lower=(2**31 - 9, 0, 0)), "density", "31 bits")
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

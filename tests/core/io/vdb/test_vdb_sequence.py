@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from neuprim.cli import main
-from neuprim.core.io.vdb import Grid, scale_transform, vdb_sequence, write_vdb
+from neuprim.core.io.vdb import VdbGrid, list_vdb_files, vdb_scale_transform, write_vdb
 from tests.core.io.vdb.vdb_bytes import one_grid, one_leaf, refused
 
 
 def frame(path: Path, size: int, voxel: float = 1.0, name: str = "density", value: float = 1.0) -> Path:
-    write_vdb(path, [Grid.from_dense(name, np.full((size,) * 3, value), transform=scale_transform(voxel))])
+    write_vdb(path, [VdbGrid.from_dense(name, np.full((size,) * 3, value), transform=vdb_scale_transform(voxel))])
     return path
 
 
@@ -22,25 +22,25 @@ def test_sorted_by_number_with_gaps(tmp_path: Path) -> None:
     for number in (10, 9, 0, 1, 14):
         frame(tmp_path / f"fire_a2_{number}.vdb", 1)
     (tmp_path / "notes_3.txt").write_text("no frame")
-    found = vdb_sequence(tmp_path)
+    found = list_vdb_files(tmp_path)
     assert [f.number for f in found.frames] == [0, 1, 9, 10, 14] and len(found) == 5
     assert found.gaps == ((2, 8), (11, 13))
 
 
 def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
-    refused(lambda: vdb_sequence(tmp_path / "gone"), "gone", "no such folder")
-    refused(lambda: vdb_sequence(tmp_path / ("x" * 300)), "cannot be read", "expected a folder")
-    refused(lambda: vdb_sequence(tmp_path), "no .vdb file")
+    refused(lambda: list_vdb_files(tmp_path / "gone"), "gone", "no such folder")
+    refused(lambda: list_vdb_files(tmp_path / ("x" * 300)), "cannot be read", "expected a folder")
+    refused(lambda: list_vdb_files(tmp_path), "no .vdb file")
     frame(tmp_path / "a_1.vdb", 1)
     frame(tmp_path / "b_1.vdb", 1)
-    refused(lambda: vdb_sequence(tmp_path), "'a_', 'b_'", "prefix")
-    refused(lambda: vdb_sequence(tmp_path / "a_1.vdb"), "a_1.vdb", "is a file")
-    assert vdb_sequence(tmp_path, "b_").frames[0].path.name == "b_1.vdb"
-    refused(lambda: vdb_sequence(tmp_path, "c_"), "c_NUMBER.vdb")
+    refused(lambda: list_vdb_files(tmp_path), "'a_', 'b_'", "prefix")
+    refused(lambda: list_vdb_files(tmp_path / "a_1.vdb"), "a_1.vdb", "is a file")
+    assert list_vdb_files(tmp_path, "b_").frames[0].path.name == "b_1.vdb"
+    refused(lambda: list_vdb_files(tmp_path, "c_"), "c_NUMBER.vdb")
     frame(tmp_path / "b_01.vdb", 1)
-    refused(lambda: vdb_sequence(tmp_path, "b_"), "frame 1", "b_01.vdb")
+    refused(lambda: list_vdb_files(tmp_path, "b_"), "frame 1", "b_01.vdb")
     frame(tmp_path / "smoke.vdb", 1)
-    refused(lambda: vdb_sequence(tmp_path), "smoke.vdb", "no frame number")
+    refused(lambda: list_vdb_files(tmp_path), "smoke.vdb", "no frame number")
 
 
 # ---------------------------------------------------------------- neuprim vdb info

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from neuprim.core.errors import NeuprimError
-from neuprim.core.io.vdb import Grid, Tiles, read_grid, read_header, scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, read_header, vdb_scale_transform, write_vdb
 
 LEAF_CORNER = (8, 0, 16)
 
@@ -79,7 +79,7 @@ def one_grid(path: Path, tree: bytes, buffers: bytes, version: int = 224, **opti
 
 def random_grid(
     rng: np.random.Generator, *, half: bool = False, channels: int = 1, tiles: bool = True, name: str = "density"
-) -> Grid:
+) -> VdbGrid:
     """Scattered leaves on both sides of the origin, partly active, and tiles of all three sizes, one of each
     inactive."""
     corners = np.unique(rng.integers(-40, 40, (30, 3)), axis=0) * 8
@@ -88,26 +88,26 @@ def random_grid(
     values = rng.normal(size=shape).astype(np.float32)
     values = values.astype(np.float16).astype(np.float32) if half else values
     values[~masks] = 0.0
-    flat = Tiles.none(channels)
+    flat = VdbTiles.none(channels)
     if tiles:
         origins = [(4096, 0, 0), (-8192, 4096, 0), (1024, 1024, 1024), (1152, 1024, 1024), (2048, 0, 8), (2048, 0, 16)]
         sizes = [4096, 4096, 128, 128, 8, 8]
         numbers = np.array([1.5, -0.25, 3.0, 0.5, 2.0, -1.0], np.float32)
         numbers = np.stack([numbers, -numbers, 2 * numbers], 1) if channels == 3 else numbers
         active = np.array([True, False] * 3)
-        flat = Tiles(np.array(origins, np.int32), np.array(sizes, np.int32), numbers, active)
+        flat = VdbTiles(np.array(origins, np.int32), np.array(sizes, np.int32), numbers, active)
     background = np.zeros((3,) if channels == 3 else (), np.float32)
-    transform = scale_transform(0.5, (1.0, 2.0, 3.0))
+    transform = vdb_scale_transform(0.5, (1.0, 2.0, 3.0))
     arrays = (background, corners.astype(np.int32), values, masks, flat)
-    return Grid(name, transform, *arrays, half=half, metadata={"creator": "test"})
+    return VdbGrid(name, transform, *arrays, half=half, metadata={"creator": "test"})
 
 
-def sorted_tiles(tiles: Tiles) -> list[tuple[Any, ...]]:
+def sorted_tiles(tiles: VdbTiles) -> list[tuple[Any, ...]]:
     rows = zip(tiles.origins.tolist(), tiles.sizes.tolist(), tiles.values.tolist(), tiles.active.tolist(), strict=True)
     return sorted((tuple(o), s, str(v), a) for o, s, v, a in rows)
 
 
-def same(a: Grid, b: Grid) -> None:
+def same(a: VdbGrid, b: VdbGrid) -> None:
     """Equal in every voxel, whatever the order of leaves and tiles."""
     np.testing.assert_array_equal(a.transform, b.transform)
     np.testing.assert_array_equal(a.background, b.background)

@@ -15,7 +15,7 @@ from neuprim.core.data import Dataset, Pixels, View, ViewSet, camera_extent
 from neuprim.core.data.initial import initial_points
 from neuprim.core.data.posed_images import find_data_folder
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.core.io.images import read_image, read_mask
+from neuprim.core.io.images import read_image, read_mask_image
 from neuprim_spectral.bands import BANDS
 
 
@@ -32,7 +32,7 @@ class FileViews(ViewSet):
     def pixels(self, index):
         view, path, mask = self.frames[index]
         size = (view.camera.width, view.camera.height)
-        return Pixels(_read(path, size), None, read_mask(mask, size) if mask else None)
+        return Pixels(_read(path, size), None, read_mask_image(mask, size) if mask else None)
 
 
 def files(path, test_every):

@@ -33,25 +33,25 @@ T = TypeVar("T")
 V = TypeVar("V")
 
 
-def hash_settings(settings: Any, version: int) -> str:
+def hash_scene_settings(settings: Any, version: int) -> str:
     """A short hash of every field of a settings dataclass and the generator's version."""
     text = json.dumps({"version": version, **asdict(settings)}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-def unit_direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
+def scene_direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
     """(3,) unit vector at this cosine of the angle from the zenith, ``azimuth`` radians from x towards y."""
     across = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     return np.array([across * math.cos(azimuth), across * math.sin(azimuth), cosine])
 
 
-def camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
+def scene_camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
     """(4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) that looks at the origin, z up."""
     view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
 
 
-def ray_bands(
+def scene_ray_bands(
     pose: NDArray[np.float64], field_of_view: float, size: int, samples: int
 ) -> Iterator[NDArray[np.float64]]:
     """Yield (N, 3) unit directions in the scene, rows of pixels from the top, ``samples`` rays per pixel side.
@@ -68,8 +68,8 @@ def ray_bands(
         yield local @ pose[:3, :3].T
 
 
-def average_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArray[np.float32]:
-    """(rows, size, C) means over the rays of each pixel, of the (N, C) values of one of :func:`ray_bands`."""
+def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArray[np.float32]:
+    """(rows, size, C) means over the rays of each pixel, of the (N, C) values of one of :func:`scene_ray_bands`."""
     channels = values.shape[1]
     rows = len(values) // (size * samples * samples)
     across = values.reshape(rows, samples, size, samples * channels).mean(axis=1)
@@ -86,13 +86,13 @@ def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: C
         pool.shutdown(cancel_futures=True)  # on an interrupt, wait for the running ones only
 
 
-def drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
+def scene_drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
     """What progress shows while images are drawn."""
     slow = "" if scene.engine == "embree" else " (without embreex, which would be faster)"
     return f"{name}: drawing {width}x{height} images{slow}"
 
 
-def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
+def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
     """Have ``write`` fill the folder ``final``, which appears when complete, unless all ``files`` exist."""
     names = tuple(files)
     try:
@@ -103,7 +103,7 @@ def write_cached_folder(final: Path, files: Iterable[str], write: Callable[[Path
 
 
 @dataclass(frozen=True)
-class ImageSet(Generic[V]):
+class SceneImageSet(Generic[V]):
     """The images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view."""
 
     name: str
@@ -124,7 +124,7 @@ class ImageSet(Generic[V]):
         names += [f"{split}/{file}" for split, views in self.splits.items() for v in views for file in self.files(v)]
         folder = Path(cache_dir) / f"{self.name}-{self.key}"
         what = f"scene {self.name}: cannot write the generated images"
-        return write_cached_folder(folder, names, lambda folder: self._write_images(folder, progress), what)
+        return write_scene_folder(folder, names, lambda folder: self._write_images(folder, progress), what)
 
     def _write_images(self, folder: Path, progress: Progress) -> None:
         progress(f"{self.name}: building the scene", 0.0)
@@ -139,5 +139,5 @@ class ImageSet(Generic[V]):
             self.draw(scene, view, [place / file for file in self.files(view)])
 
         jobs = [(folder / split, view) for split, views in self.splits.items() for view in views]
-        text = drawing_text(self.name, scene, self.size, self.size)
+        text = scene_drawing_text(self.name, scene, self.size, self.size)
         draw_in_parallel(draw, jobs, lambda fraction: progress(text, fraction))

@@ -29,18 +29,18 @@ from neuprim.core.io.exr import write_exr
 from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.scenes.image_set import (
-    ImageSet,
     ImageSize,
     Progress,
+    SceneImageSet,
     Supersampling,
-    average_rays,
-    camera_pose,
-    hash_settings,
-    ray_bands,
-    unit_direction,
+    average_scene_rays,
+    hash_scene_settings,
+    scene_camera_pose,
+    scene_direction,
+    scene_ray_bands,
 )
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.shading import dot, reflectance_lobes
+from neuprim.scenes.shading import reflectance_lobes, shading_dot
 from neuprim.scenes.shapes import FLOOR, Solid, build_solids, lathe, ring, uniform_colour
 
 GENERATOR_VERSION = 1
@@ -82,7 +82,7 @@ class LitSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        return hash_settings(self, GENERATOR_VERSION)
+        return hash_scene_settings(self, GENERATOR_VERSION)
 
 
 class LitView(NamedTuple):
@@ -108,7 +108,7 @@ def generate_lit_solids(
     """Write the data set unless it is complete; return its folder ``cache_dir/lit_solids-KEY``."""
 
     def draw(scene: Scene, view: LitView, paths: Sequence[Path]) -> None:
-        pose, quality = camera_pose(view.camera), (settings.size, settings.supersampling)
+        pose, quality = scene_camera_pose(view.camera), (settings.size, settings.supersampling)
         taken = draw_lit_solids(scene, pose, view.light, *quality)
         Image.fromarray(taken.classes).save(paths[2])
         images = [taken.rgba, taken.unshadowed]
@@ -117,7 +117,7 @@ def generate_lit_solids(
         for path, image in zip([*paths[:2], *paths[3:]], images, strict=True):
             write_exr(path, torch.from_numpy(image), half=True)
 
-    return ImageSet(
+    return SceneImageSet(
         name="lit_solids",
         key=settings.key(),
         size=settings.size,
@@ -125,12 +125,12 @@ def generate_lit_solids(
         lens={"camera_angle_x": FIELD_OF_VIEW, "camera_near": DISTANCE[0] - 1.5, "camera_far": DISTANCE[1] + 1.5},
         build=lambda: Scene(build_lit_solids()),
         frame=_lit_frame_entry,
-        files=_lit_image_files,
+        files=_lit_solids_image_files,
         draw=draw,
     ).generate(cache_dir, progress)
 
 
-def _lit_image_files(view: LitView) -> list[str]:
+def _lit_solids_image_files(view: LitView) -> list[str]:
     nearest = [] if view.near_light is None else [f"{view.name}_nearest.exr"]
     return [f"{view.name}.exr", f"{view.name}_unshadowed.exr", f"{view.name}_classes.png", *nearest]
 
@@ -139,7 +139,7 @@ def _lit_frame_entry(split: str, view: LitView) -> dict[str, Any]:
     return {
         "file_path": f"./{split}/{view.name}",
         "file_ext": ".exr",
-        "transform_matrix": camera_pose(view.camera).tolist(),
+        "transform_matrix": scene_camera_pose(view.camera).tolist(),
         "pl_pos": view.light.tolist(),
         "pl_intensity": [INTENSITY] * 3,
     }
@@ -173,9 +173,9 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
             near = max(lights[:NEAR_LIGHTS], key=lambda known: float(known @ light / np.linalg.norm(known)))
             test.append(LitView(f"{name}_{i:0{digits}d}", camera, light, near))
     middle = sum(DISTANCE) / 2
-    eye = middle * unit_direction(math.cos(math.radians(58.0)), -1.1)
+    eye = middle * scene_direction(math.cos(math.radians(58.0)), -1.1)
     turns = [2 * math.pi * i / CIRCLE_FRAMES for i in range(CIRCLE_FRAMES)]
-    around = [middle * unit_direction(math.cos(math.radians(45.0)), turn) for turn in turns]
+    around = [middle * scene_direction(math.cos(math.radians(45.0)), turn) for turn in turns]
     circle = [LitView(f"light_{i:02d}", eye, light) for i, light in enumerate(around)]
     return {"train": train, "test": test, "circle": circle}
 
@@ -183,15 +183,15 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
     """Positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
-    return [_position_on_cap(n[:3], _CAMERA_POLAR) for n in numbers], [
-        _position_on_cap(n[3:], _LIGHT_POLAR) for n in numbers
+    return [_position_above_lit_solids(n[:3], _CAMERA_POLAR) for n in numbers], [
+        _position_above_lit_solids(n[3:], _LIGHT_POLAR) for n in numbers
     ]
 
 
-def _position_on_cap(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
+def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
     """Map three numbers 0..1 to a point in a direction uniform on the cap of half-angle ``polar`` about the zenith."""
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
-    return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * unit_direction(cosine, 2 * math.pi * numbers[1])
+    return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * scene_direction(cosine, 2 * math.pi * numbers[1])
 
 
 # ---------------------------------------------------------------- drawing
@@ -215,11 +215,11 @@ def draw_lit_solids(
 ) -> LitImage:
     """Draw the view at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
     parts = []
-    for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
+    for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         seen = shade_point_light(scene, pose[:3, 3], directions, light, INTENSITY)
         kinds = seen.classes[:, None] == np.arange(len(PIXEL_CLASSES), dtype=np.uint8)
         values = np.concatenate([seen.rgb, seen.unshadowed, kinds], axis=1, dtype=np.float32)
-        parts.append(average_rays(values, size, supersampling))
+        parts.append(average_scene_rays(values, size, supersampling))
     mean = np.concatenate(parts)
     shares = mean[..., 6:]
     alpha = shares[..., 1:].sum(axis=-1, keepdims=True)
@@ -250,10 +250,10 @@ def shade_point_light(
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)
     way = np.asarray(light, dtype=np.float32) - hits.position
-    square = dot(way, way)
+    square = shading_dot(way, way)
     to_light = (way / np.sqrt(square)[:, None]).astype(np.float32, copy=False)
     cosine, highlight = reflectance_lobes(hits, -d[hits.hit], to_light)
-    facing = (cosine > 0) & (dot(hits.face, to_light) > 0)
+    facing = (cosine > 0) & (shading_dot(hits.face, to_light) > 0)
     irradiance = np.where(facing, cosine * np.float32(intensity / np.pi) / square, np.float32(0))
     unshadowed = (hits.albedo + highlight[:, None]) * irradiance[:, None]
     starts = hits.lifted()[facing]  # what faces away needs no ray

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from neuprim.core.errors import BackendUnavailable
-from neuprim.scenes.shapes import Solid, corner_normals
+from neuprim.scenes.shapes import Solid, solid_corner_normals
 
 Engine = Literal["auto", "embree", "numba"]
 
@@ -56,7 +56,7 @@ class Scene:
         start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
         vertices = np.concatenate([mesh.vertices.view(np.ndarray) for mesh in meshes]).astype(np.float32)
         faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start, strict=False)]
-        normals = [corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]
+        normals = [solid_corner_normals(s.mesh) if s.normals is None else s.normals for s in self.solids]
         self._face_normals = np.concatenate([mesh.face_normals.view(np.ndarray) for mesh in meshes]).astype(np.float32)
         self._corner_normals = np.concatenate(normals).astype(np.float32)
         self._owner = np.repeat(np.arange(len(meshes)), [len(mesh.faces) for mesh in meshes])
@@ -66,7 +66,7 @@ class Scene:
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
         """The first surface that each ray meets; (N, 3) scene units, directions of any length."""
-        o, d = _broadcast_rays(origins, directions)
+        o, d = _broadcast_raycast_rays(origins, directions)
         triangle, u, v, distance = self._first_hits(o, d)
         hit = triangle >= 0
         rows = np.flatnonzero(hit)
@@ -89,11 +89,13 @@ class Scene:
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of points off a surface."""
-        o, d = _broadcast_rays(points, directions)
+        o, d = _broadcast_raycast_rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
 
 
-def _broadcast_rays(origins: ArrayLike, directions: ArrayLike) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _broadcast_raycast_rays(
+    origins: ArrayLike, directions: ArrayLike
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     d = np.ascontiguousarray(directions, dtype=np.float32)
     return np.ascontiguousarray(np.broadcast_to(np.asarray(origins, dtype=np.float32), d.shape)), d
 
@@ -179,7 +181,7 @@ def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDAr
 
 
 @numba.njit(nogil=True, error_model="numpy")
-def _enter_box(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
+def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
     """Distance at which a ray enters the box of a node, or infinity."""
     near, far = 0.0, limit
     for axis in range(3):
@@ -221,7 +223,7 @@ def _trace_rays(corners, low, high, links, origins, directions, limits, any_hit)
             # A huge number instead of infinity: 0 times infinity would be NaN for an origin in the plane of a box.
             inverse[axis] = 1 / d[axis] if abs(d[axis]) > 1e-30 else 1e30
         best = limits[ray]
-        stack[0], entry[0], top = 0, _enter_box(low, high, 0, o, inverse, best), 1
+        stack[0], entry[0], top = 0, _raycast_box_entry(low, high, 0, o, inverse, best), 1
         while top > 0:
             top -= 1
             if entry[top] >= best:
@@ -229,8 +231,8 @@ def _trace_rays(corners, low, high, links, origins, directions, limits, any_hit)
             node = stack[top]
             if links[node, 1] == 0:
                 a = links[node, 0]
-                near_a = _enter_box(low, high, a, o, inverse, best)
-                near_b = _enter_box(low, high, a + 1, o, inverse, best)
+                near_a = _raycast_box_entry(low, high, a, o, inverse, best)
+                near_b = _raycast_box_entry(low, high, a + 1, o, inverse, best)
                 nearer = a if near_a <= near_b else a + 1
                 near, far = min(near_a, near_b), max(near_a, near_b)
                 if far < best:  # below the nearer one

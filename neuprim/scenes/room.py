@@ -29,15 +29,21 @@ from neuprim.scenes.image_set import (
     ImageSize,
     Progress,
     Supersampling,
-    average_rays,
+    average_scene_rays,
     draw_in_parallel,
-    drawing_text,
-    hash_settings,
-    write_cached_folder,
+    hash_scene_settings,
+    scene_drawing_text,
+    write_scene_folder,
 )
 from neuprim.scenes.raycast import Engine, Hits, Scene
 from neuprim.scenes.room_interior import ABOVE, BELOW, BULB, LAMP, LAMP_POWER, Furnishing, Texture, furnish_room
-from neuprim.scenes.shading import add_surroundings, dot, encode_srgb, reflect_light, visible_light
+from neuprim.scenes.shading import (
+    add_scene_surroundings,
+    encode_scene_srgb,
+    reflect_light,
+    scene_light_visibility,
+    shading_dot,
+)
 from neuprim.scenes.shapes import Solid, build_solids, uniform_colour
 
 GENERATOR_VERSION = 1
@@ -72,19 +78,19 @@ class RoomSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        return hash_settings(self, GENERATOR_VERSION)
+        return hash_scene_settings(self, GENERATOR_VERSION)
 
 
 def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
     """Write the data set unless it is complete; return its folder ``cache_dir/room-KEY``."""
     poses = room_camera_poses(settings.train_views, settings.test_views)
-    gains = exposure_gains(settings.train_views, settings.exposure).tolist()
+    gains = room_exposure_gains(settings.train_views, settings.exposure).tolist()
     shots = [(f"train_{i:04d}.png", pose, gains[i]) for i, pose in enumerate(poses["train"])]
     shots += [(f"test_{i:04d}.png", pose, 1.0) for i, pose in enumerate(poses["test"])]
     files = ["transforms.json", "points.ply", "exposures.json", *(f"images/{name}" for name, _, _ in shots)]
     folder = Path(cache_dir) / f"room-{settings.key()}"
     what = "scene room: cannot write the generated images"
-    return write_cached_folder(folder, files, lambda folder: _write_room(folder, settings, shots, progress), what)
+    return write_scene_folder(folder, files, lambda folder: _write_room(folder, settings, shots, progress), what)
 
 
 def build_room(settings: RoomSettings) -> Room:
@@ -92,7 +98,7 @@ def build_room(settings: RoomSettings) -> Room:
     return Room(build_solids(), furnish_room(), 1 / (room_lens(settings).focal * settings.supersampling))
 
 
-def exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
+def room_exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
     """(count,) factors of training images, whose binary logarithms are even between minus and plus ``stops``."""
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
 
@@ -107,7 +113,7 @@ def _write_room(folder: Path, settings: RoomSettings, shots: list[_Shot], progre
         name, pose, gain = shot
         Image.fromarray(photograph_room(room, lens, pose, settings.supersampling, gain)).save(images / name)
 
-    text = drawing_text("room", room, lens.width, lens.height)
+    text = scene_drawing_text("room", room, lens.width, lens.height)
     draw_in_parallel(draw, shots, lambda fraction: progress(text, fraction))
 
     def luma(index: int) -> NDArray[np.float32]:
@@ -116,7 +122,7 @@ def _write_room(folder: Path, settings: RoomSettings, shots: list[_Shot], progre
         return bright / np.float32(255)
 
     poses = [pose for _, pose, _ in shots[: settings.train_views]]
-    points = reconstruct_points(room, lens, poses, luma, settings.points)
+    points = reconstruct_room_points(room, lens, poses, luma, settings.points)
     rows = np.empty(
         len(points.position), [*((n, "<f4") for n in "xyz"), *((n, "u1") for n in ("red", "green", "blue"))]
     )
@@ -124,10 +130,10 @@ def _write_room(folder: Path, settings: RoomSettings, shots: list[_Shot], progre
         rows[axis], rows[channel] = points.position[:, i], points.rgb[:, i]
     write_ply(folder / "points.ply", rows)
     write_json(folder / "exposures.json", {f"images/{name}": gain for name, _, gain in shots})
-    write_json(folder / "transforms.json", _transforms_document(lens, shots))
+    write_json(folder / "transforms.json", _room_transforms_document(lens, shots))
 
 
-def _transforms_document(lens: Lens, shots: list[_Shot]) -> dict[str, Any]:
+def _room_transforms_document(lens: RoomLens, shots: list[_Shot]) -> dict[str, Any]:
     camera, names = lens.camera, [f"images/{name}" for name, _, _ in shots]
     return {
         "camera_model": "OPENCV",
@@ -149,7 +155,7 @@ def _transforms_document(lens: Lens, shots: list[_Shot]) -> dict[str, Any]:
 
 
 @dataclass(frozen=True)
-class Lens:
+class RoomLens:
     """Intrinsics of images ``width`` pixels wide; all-zero ``distortion`` is a pinhole."""
 
     width: int
@@ -203,24 +209,24 @@ class Lens:
             yield self.rays(pose, np.stack([x, y], axis=-1).reshape(-1, 2))
 
 
-def room_lens(settings: RoomSettings) -> Lens:
+def room_lens(settings: RoomSettings) -> RoomLens:
     """The lens that the images are taken with."""
-    return Lens(settings.size, LENS if settings.distortion else RadialDistortion())
+    return RoomLens(settings.size, LENS if settings.distortion else RadialDistortion())
 
 
 def photograph_room(
-    room: Room, lens: Lens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
+    room: Room, lens: RoomLens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
 ) -> NDArray[np.uint8]:
     """(H, W, 3) sRGB, of linear light that is averaged over the rays of each pixel and multiplied by ``gain``."""
-    bands = (lamplight_radiance(room, pose[:3, 3], d) for d in lens.ray_bands(pose, supersampling))
-    mean = np.concatenate([average_rays(band, lens.width, supersampling) for band in bands])
-    return np.round(encode_srgb(mean * np.float32(gain)) * 255).astype(np.uint8)
+    bands = (room_lamplight_radiance(room, pose[:3, 3], d) for d in lens.ray_bands(pose, supersampling))
+    mean = np.concatenate([average_scene_rays(band, lens.width, supersampling) for band in bands])
+    return np.round(encode_scene_srgb(mean * np.float32(gain)) * 255).astype(np.uint8)
 
 
 # ---------------------------------------------------------------- the walk
 
 
-def walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
+def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
     """Where on the walk, 0 to 1, photographs are taken: test ones evenly, training ones between them."""
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
@@ -232,7 +238,7 @@ def walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
 def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
     """Camera-to-world matrices (4, 4), OpenGL axes, of both splits; the test ones depend on their own number alone."""
     poses = {}
-    for split, times in walk_positions(train, test).items():
+    for split, times in room_walk_positions(train, test).items():
         shake = 2 * np.random.default_rng(_WALKS_SEEDS[split]).random((len(times), 7)) - 1
         poses[split] = [_walk_pose(float(t), s) for t, s in zip(times, shake, strict=True)]
     return poses
@@ -268,8 +274,12 @@ class ReconstructedPoints(NamedTuple):
     camera: NDArray[np.intp]  # (N,) index of the training camera that found them
 
 
-def reconstruct_points(
-    room: Room, lens: Lens, poses: Sequence[NDArray[np.float64]], luma: Callable[[int], NDArray[np.float32]], count: int
+def reconstruct_room_points(
+    room: Room,
+    lens: RoomLens,
+    poses: Sequence[NDArray[np.float64]],
+    luma: Callable[[int], NDArray[np.float32]],
+    count: int,
 ) -> ReconstructedPoints:
     """Return ``count`` points, each seen by the training camera that found it and at least one other.
 
@@ -277,7 +287,7 @@ def reconstruct_points(
     ConfigError
     if the cameras have too little in view together.
     """
-    chances = [_pixel_detail_chances(luma(i)) for i in range(len(poses))]
+    chances = [_room_pixel_detail_chances(luma(i)) for i in range(len(poses))]
     directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)
     each = -(-count // len(poses))
     for attempt in range(_ROUNDS):
@@ -287,7 +297,7 @@ def reconstruct_points(
             index = np.searchsorted(chances[camera], numbers[:, 0], side="right").clip(max=len(chances[camera]) - 1)
             pixels = np.stack([index % lens.width + numbers[:, 1], index // lens.width + numbers[:, 2]], axis=1)
             rays = lens.rays(pose, pixels)
-            rays = rays[_seen_by_another(room, lens, poses, camera, rays)]
+            rays = rays[_room_seen_by_another(room, lens, poses, camera, rays)]
             directions = np.concatenate([directions, rays])
             finders = np.concatenate([finders, np.full(len(rays), camera)])
         if len(directions) >= count:
@@ -302,7 +312,7 @@ def reconstruct_points(
     directions, finders = directions[chosen], finders[chosen]
     origins = np.stack([p[:3, 3] for p in poses])[finders]
     hits = room.intersect(origins, directions)
-    colours = encode_srgb(lamplight_radiance(room, origins, directions))
+    colours = encode_scene_srgb(room_lamplight_radiance(room, origins, directions))
     surface, depth = hits.position.astype(np.float64), hits.distance.astype(np.float64)[:, None]
     position = surface + depth * NOISE / np.sqrt(3) * random.standard_normal(surface.shape)
     wrong = np.zeros((count, 1), dtype=np.bool_)
@@ -311,7 +321,7 @@ def reconstruct_points(
     return ReconstructedPoints(surface, position, np.round(colours * 255).astype(np.uint8), finders)
 
 
-def _pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
+def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
     """(H * W,) running sum, up to 1, of the chance of every pixel: as much as brightness changes there."""
     down, across = np.gradient(luma.astype(np.float64))
     detail = np.hypot(down, across)
@@ -319,8 +329,8 @@ def _pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
     return total / total[-1]
 
 
-def _seen_by_another(
-    room: Room, lens: Lens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
+def _room_seen_by_another(
+    room: Room, lens: RoomLens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
     """(M,) whether what ``camera`` sees in these directions (M, 3) is visible to another camera, in its picture."""
     hits = room.intersect(poses[camera][:3, 3], directions)
@@ -365,7 +375,7 @@ class Room(Scene):
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         # A pixel covers an ellipse of the surface; its area decides, so grazing views blur across rather than flicker
         # along.
-        root: NDArray[np.float32] = np.sqrt(np.maximum(np.abs(dot(hits.face, towards)), _GRAZING))
+        root: NDArray[np.float32] = np.sqrt(np.maximum(np.abs(shading_dot(hits.face, towards)), _GRAZING))
         width = hits.distance * self._spacing / root
         albedo = hits.albedo.copy()
         for index in np.unique(hits.solid):
@@ -375,18 +385,18 @@ class Room(Scene):
         return replace(hits, albedo=albedo)
 
 
-def lamplight_radiance(room: Room, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
+def room_lamplight_radiance(room: Room, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
     """(N, 3) linear RGB that N rays (``origins`` (N, 3) or (3,), unit ``directions``) see."""
     d = np.asarray(directions, dtype=np.float32)
     hits = room.intersect(origins, d)
     to_eye = -d[hits.hit]
     to_lamp = np.array(LAMP, dtype=np.float32) - hits.position
-    away = np.sqrt(dot(to_lamp, to_lamp))
+    away = np.sqrt(shading_dot(to_lamp, to_lamp))
     to_lamp /= away[:, None]
     beside_bulb = np.maximum(away - np.float32(1.2 * BULB), 0)  # the bulb itself is no obstacle
-    lit = visible_light(room, hits, to_lamp, beside_bulb)
+    lit = scene_light_visibility(room, hits, to_lamp, beside_bulb)
     rgb = reflect_light(hits, to_eye, to_lamp) * (np.array(LAMP_POWER, dtype=np.float32) * (lit / away**2)[:, None])
-    add_surroundings(rgb, hits, to_eye, ABOVE, BELOW)
+    add_scene_surroundings(rgb, hits, to_eye, ABOVE, BELOW)
     glow = room.glow[hits.solid][:, None]
     image = np.zeros(d.shape, dtype=np.float32)
     image[hits.hit] = np.where(glow > 0, glow * hits.albedo, rgb)

@@ -14,8 +14,8 @@ from neuprim.scenes.shapes import (
     ball,
     chamfered_box,
     lathe,
-    merge_meshes,
-    parse_srgb,
+    merge_solid_meshes,
+    parse_solid_srgb,
     rod,
 )
 
@@ -95,7 +95,7 @@ def _lattice_noise(points: Array, seed: int) -> Array:
 
 def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) -> Texture:
     """One colour, unevenly painted."""
-    colour = parse_srgb(code)
+    colour = parse_solid_srgb(code)
     return lambda p, w: np.clip(colour * (1 + np.float32(strength) * lattice_noise(p, w, cell, seed))[:, None], 0, 1)
 
 
@@ -103,7 +103,7 @@ def planks(
     dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2
 ) -> Texture:
     """Boards along one axis beside each other along another, each of its own tone, with a grain and narrow gaps."""
-    one, other = parse_srgb(dark), parse_srgb(light)
+    one, other = parse_solid_srgb(dark), parse_solid_srgb(light)
 
     def texture(p: Array, w: Array) -> Array:
         row = np.floor(p[:, across] / width)
@@ -121,7 +121,7 @@ def planks(
 
 def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22, mortar: float = 0.03) -> Texture:
     """A wall of bricks, each of its own red, rough, every other row moved by half a brick."""
-    dark, light, grout = parse_srgb("#7d3527"), parse_srgb("#cf7d5a"), parse_srgb("#c9c0b2")
+    dark, light, grout = parse_solid_srgb("#7d3527"), parse_solid_srgb("#cf7d5a"), parse_solid_srgb("#c9c0b2")
 
     def texture(p: Array, w: Array) -> Array:
         row = np.floor(p[:, v] / height)
@@ -138,7 +138,7 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
 
 def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> Texture:
     """Squares of two colours with fine joints, worn unevenly."""
-    first, second = parse_srgb(one), parse_srgb(other)
+    first, second = parse_solid_srgb(one), parse_solid_srgb(other)
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
@@ -153,7 +153,7 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
 def wallpaper(u: int, v: int, seed: int) -> Texture:
     """Broad and narrow stripes with a row of dots in every broad one."""
-    ground, broad, narrow, dot = map(parse_srgb, ("#e9dcc0", "#9db8a2", "#4f7a6b", "#b5533c"))
+    ground, broad, narrow, dot = map(parse_solid_srgb, ("#e9dcc0", "#9db8a2", "#4f7a6b", "#b5533c"))
 
     def texture(p: Array, w: Array) -> Array:
         x, y = p[:, u], p[:, v]
@@ -173,7 +173,7 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
 def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
     """Rough plaster in clouds of ochre; below the height ``panel`` a wainscot of upright boards."""
-    light, dark, board, seam, edge = map(parse_srgb, ("#e6c98c", "#b0764a", "#5d6f86", "#2f3a4a", "#efe9dc"))
+    light, dark, board, seam, edge = map(parse_solid_srgb, ("#e6c98c", "#b0764a", "#5d6f86", "#2f3a4a", "#efe9dc"))
     narrow = np.array([1, 0.2], np.float32)
 
     def texture(p: Array, w: Array) -> Array:
@@ -190,7 +190,7 @@ def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
 
 def painting(u: int, v: int, seed: int) -> Texture:
     """A picture: three colours flow into each other, with contours where one gives way to the next."""
-    ground, *colours = map(parse_srgb, ("#12355b", "#e4572e", "#f3a712", "#76b041"))
+    ground, *colours = map(parse_solid_srgb, ("#12355b", "#e4572e", "#f3a712", "#76b041"))
 
     def texture(p: Array, w: Array) -> Array:
         flat = p[:, [u, v]]
@@ -207,7 +207,7 @@ def painting(u: int, v: int, seed: int) -> Texture:
 def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5) -> Texture:
     """Spines side by side: each of its own colour, with a band, and a dark line to the next."""
     codes = ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")
-    colours = np.stack([parse_srgb(code) for code in codes])
+    colours = np.stack([parse_solid_srgb(code) for code in codes])
 
     def texture(p: Array, w: Array) -> Array:
         index = np.stack([np.floor(p[:, u] / thickness), np.floor(p[:, v] / shelf)], axis=1).astype(np.int64)
@@ -217,14 +217,14 @@ def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5
         height = (p[:, v] / shelf) % 1
         band = (np.abs(height - 0.35 - 0.3 * cell_random(index, seed + 1)) < 0.06) * (1 - far)
         gap = stripes(p[:, u] + 0.008, thickness, 0.016 / thickness, w)
-        return mix_colours(colour, parse_srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
+        return mix_colours(colour, parse_solid_srgb("#f1e4b8"), 0.8 * band) * (1 - 0.8 * gap)[:, None]
 
     return texture
 
 
 def marble(seed: int) -> Texture:
     """Dark veins through something light, in all three dimensions."""
-    light, vein = parse_srgb("#e4e0d8"), parse_srgb("#5a6470")
+    light, vein = parse_solid_srgb("#e4e0d8"), parse_solid_srgb("#5a6470")
 
     def texture(p: Array, w: Array) -> Array:
         flow = lattice_noise(p, w, 0.9, seed, octaves=5, fall=0.6)
@@ -236,7 +236,7 @@ def marble(seed: int) -> Texture:
 
 def rug(radius: float, seed: int) -> Texture:
     """Rings about the z axis, some of them cut into wedges, woven from coarse yarn."""
-    red, navy, cream = parse_srgb("#a63a3a"), parse_srgb("#1f2f4f"), parse_srgb("#e8dcc2")
+    red, navy, cream = parse_solid_srgb("#a63a3a"), parse_solid_srgb("#1f2f4f"), parse_solid_srgb("#e8dcc2")
 
     def texture(p: Array, w: Array) -> Array:
         r: Array = np.hypot(p[:, 0], p[:, 1])
@@ -255,7 +255,7 @@ def rug(radius: float, seed: int) -> Texture:
 
 def sky(seed: int, low: float, high: float) -> Texture:
     """Clouds before a blue that pales from the height ``high`` down to ``low``; what is behind a window."""
-    zenith, horizon, cloud = parse_srgb("#4f8fd6"), parse_srgb("#cfe3f2"), parse_srgb("#ffffff")
+    zenith, horizon, cloud = parse_solid_srgb("#4f8fd6"), parse_solid_srgb("#cfe3f2"), parse_solid_srgb("#ffffff")
 
     def texture(p: Array, w: Array) -> Array:
         blue = mix_colours(horizon, zenith, (p[:, 2] - low) / (high - low))
@@ -292,7 +292,7 @@ def furnish_room() -> list[Furnishing]:
     return [*inside, *_wallpaper_side_furnishings(), *_tile_side_furnishings()]
 
 
-def _corner_box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
+def _room_corner_box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
     """A box with these opposite corners."""
     return chamfered_box(np.subtract(high, low), np.add(low, high) / 2, chamfer)
 
@@ -304,8 +304,8 @@ def _wall_slab(low: Corner, high: Corner) -> trimesh.Trimesh:
     return mesh
 
 
-def _corner_boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -> trimesh.Trimesh:
-    return merge_meshes([_corner_box(low, high, chamfer) for low, high in corners])
+def _room_corner_boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -> trimesh.Trimesh:
+    return merge_solid_meshes([_room_corner_box(low, high, chamfer) for low, high in corners])
 
 
 def _picture_frame(
@@ -321,20 +321,20 @@ def _picture_frame(
     for sign in (-1, 1):
         bars.append(chamfered_box(upright, middle + sign * side * (half + width / 2), 0.015))
         bars.append(chamfered_box(level, middle + np.array([0, 0, sign * (high - low + width) / 2]), 0.015))
-    return merge_meshes(bars)
+    return merge_solid_meshes(bars)
 
 
 def _wall_furnishings() -> list[Furnishing]:
     (x0, y0, z0), (x1, y1, z1) = LOW, HIGH
     t = 0.3
     below, above = (x0 - t, y0 - t), (x1 + t, y1 + t)
-    skirting = _corner_boxes(
+    skirting = _room_corner_boxes(
         ((x0, y0, z0), (x1, y0 + 0.05, z0 + 0.16)),
         ((x0, y1 - 0.05, z0), (x1, y1, z0 + 0.16)),
         ((x0, y0, z0), (x0 + 0.05, y1, z0 + 0.16)),
         ((x1 - 0.05, y0, z0), (x1, y1, z0 + 0.16)),
     )
-    beams = _corner_boxes(*(((x0, y - 0.14, z1 - 0.22), (x1, y + 0.14, z1)) for y in (-4.2, -0.6, 3.0)))
+    beams = _room_corner_boxes(*(((x0, y - 0.14, z1 - 0.22), (x1, y + 0.14, z1)) for y in (-4.2, -0.6, 3.0)))
     brick = _wall_slab((x1, y0 - t, z0 - t), (x1 + t, y1 + t, z1 + t))
     papered = _wall_slab((x0 - t, y0 - t, z0 - t), (x0, y1 + t, z1 + t))
     plastered = _wall_slab((x0 - t, y1, z0 - t), (x1 + t, y1 + t, z1 + t))
@@ -378,12 +378,12 @@ def _lamp_furnishings() -> list[Furnishing]:
 def _brick_side_furnishings() -> list[Furnishing]:
     """The wall at x = 6: a window with four panes, and crates below."""
     x, low, high = HIGH[0], 0.2, 2.4
-    pane = _corner_box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
-    upright = _corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01)
-    level = _corner_box((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01)
-    window = merge_meshes([_picture_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), upright, level])
-    sill = _corner_box((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14))
-    crates = _corner_boxes(
+    pane = _room_corner_box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
+    upright = _room_corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01)
+    level = _room_corner_box((x - 0.1, -1.4, 1.25), (x, 1.4, 1.35), 0.01)
+    window = merge_solid_meshes([_picture_frame(x, 0, low, high, 1.4, 1, 0.14, 0.2), upright, level])
+    sill = _room_corner_box((x - 0.3, -1.65, low - 0.24), (x, 1.65, low - 0.14))
+    crates = _room_corner_boxes(
         ((5.0, 3.6, -1.6), (5.9, 4.9, -0.7)),
         ((5.1, 3.8, -0.7), (5.8, 4.7, 0.0)),
         ((5.2, -4.4, -1.6), (5.9, -3.2, -0.9)),
@@ -407,12 +407,12 @@ def _plaster_side_furnishings() -> list[Furnishing]:
         ((left, y0 + 0.12, z + step * i + 0.05), (right - gap, y1, z + step * i + height))
         for i, (gap, height) in enumerate([(0.0, 0.5), (0.5, 0.46), (0.0, 0.52), (1.1, 0.44), (0.2, 0.5)])
     ]
-    picture = _corner_box((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005)
+    picture = _room_corner_box((1.2, 5.93, 0.5), (4.0, 6.0, 2.5), 0.005)
     frame = _picture_frame(2.6, 6.0, 0.5, 2.5, 1.4, 0, 0.14, 0.24)
     shelf = planks("#4d3524", "#7d5a3c", 0, 1, 111, width=0.4)
     return [
-        Furnishing("shelf", _corner_boxes(*boards, chamfer=0.005), shelf),
-        Furnishing("books", _corner_boxes(*rows, chamfer=0.005), books(0, 2, 113, shelf=step)),
+        Furnishing("shelf", _room_corner_boxes(*boards, chamfer=0.005), shelf),
+        Furnishing("books", _room_corner_boxes(*rows, chamfer=0.005), books(0, 2, 113, shelf=step)),
         Furnishing("picture", picture, painting(0, 2, 115)),
         Furnishing("frame", frame, speckled("#b8892f", 117, 0.2, 0.2), 0.6),
     ]
@@ -422,18 +422,18 @@ def _wallpaper_side_furnishings() -> list[Furnishing]:
     """The wall at x = -6: a long bench, two pictures above it, and a pillar in the corner."""
     column = [(0.0, 0.62), (0.2, 0.62), (0.3, 0.45), (4.7, 0.42), (4.8, 0.6), (5.0, 0.6)]
     bench = [
-        _corner_box((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05),
-        _corner_box((-5.95, -2.6, -1.1), (-5.75, 1.4, -0.3), 0.05),
+        _room_corner_box((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05),
+        _room_corner_box((-5.95, -2.6, -1.1), (-5.75, 1.4, -0.3), 0.05),
     ]
-    bench += [_corner_box((-5.9, y, -1.6), (-5.2, y + 0.25, -1.35)) for y in (-2.5, 1.05)]
+    bench += [_room_corner_box((-5.9, y, -1.6), (-5.2, y + 0.25, -1.35)) for y in (-2.5, 1.05)]
     small, tall = (
-        _corner_box((-6.0, -2.4, 0.3), (-5.94, -0.8, 1.5), 0.005),
-        _corner_box((-6.0, 0.3, 0.1), (-5.94, 1.4, 2.0), 0.005),
+        _room_corner_box((-6.0, -2.4, 0.3), (-5.94, -0.8, 1.5), 0.005),
+        _room_corner_box((-6.0, 0.3, 0.1), (-5.94, 1.4, 2.0), 0.005),
     )
     small_frame = _picture_frame(-6.0, -1.6, 0.3, 1.5, 0.8, 1, 0.1, 0.2)
     tall_frame = _picture_frame(-6.0, 0.85, 0.1, 2.0, 0.55, 1, 0.1, 0.2)
     return [
-        Furnishing("bench", merge_meshes(bench), chequered("#b5533c", "#d98f4e", 1, 2, 0.2, 121)),
+        Furnishing("bench", merge_solid_meshes(bench), chequered("#b5533c", "#d98f4e", 1, 2, 0.2, 121)),
         Furnishing("small picture", small, painting(1, 2, 123)),
         Furnishing("small frame", small_frame, speckled("#26221e", 125, 0.1), 0.4),
         Furnishing("tall picture", tall, painting(1, 2, 127)),
@@ -445,11 +445,11 @@ def _wallpaper_side_furnishings() -> list[Furnishing]:
 def _tile_side_furnishings() -> list[Furnishing]:
     """The wall at y = -6: a cupboard, a door and a big pot."""
     places = [(x, z) for x in (-4.3, -3.55, -2.8) for z in (-1.4, -0.3)]
-    panels = _corner_boxes(*(((x, -5.27, z), (x + 0.62, -5.22, z + 0.95)) for x, z in places))
+    panels = _room_corner_boxes(*(((x, -5.27, z), (x + 0.62, -5.22, z + 0.95)) for x, z in places))
     places = [(x, z) for x in (1.45, 2.2) for z in (-1.4, 0.1)]
     fields = (((x, -5.93, z), (x + 0.55, -5.88, z + 1.1)) for x, z in places)
-    door = _corner_boxes(((1.3, -6.0, -1.6), (2.9, -5.92, 1.5)), *fields)
-    cupboard = _corner_box((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03)
+    door = _room_corner_boxes(((1.3, -6.0, -1.6), (2.9, -5.92, 1.5)), *fields)
+    cupboard = _room_corner_box((-4.5, -6.0, -1.6), (-2.0, -5.25, 0.8), 0.03)
     pot = [(0.0, 0.3), (0.2, 0.42), (0.5, 0.48), (0.75, 0.4), (0.85, 0.45), (0.9, 0.45)]
     glaze = bricks(0, 2, 145, width=0.2, height=0.15, mortar=0.02)
     door_frame = _picture_frame(2.1, -6.0, -1.8, 1.5, 0.8, 0, 0.12, 0.24)

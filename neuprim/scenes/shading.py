@@ -30,7 +30,7 @@ class Daylight:
 DAYLIGHT = Daylight()
 
 
-def dot(a: Array, b: Array) -> Array:
+def shading_dot(a: Array, b: Array) -> Array:
     """(M,) products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
     return np.einsum("nc,nc->n", a, np.broadcast_to(b, a.shape))  # several times faster than a sum over three
 
@@ -38,11 +38,13 @@ def dot(a: Array, b: Array) -> Array:
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
     """(M,) cosine to the light, at least 0, and pi times the highlight's reflectance; directions are unit vectors."""
     eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
-    cosine = np.maximum(dot(hits.normal, light), 0)
+    cosine = np.maximum(shading_dot(hits.normal, light), 0)
     half: Array = eye + light
-    half /= np.sqrt(np.maximum(dot(half, half), np.float32(1e-12)))[:, None]
+    half /= np.sqrt(np.maximum(shading_dot(half, half), np.float32(1e-12)))[:, None]
     exponent = 6 + 110 * hits.gloss**2
-    highlight = hits.specular * hits.gloss * (exponent + 8) / 8 * np.maximum(dot(hits.normal, half), 0) ** exponent
+    highlight = (
+        hits.specular * hits.gloss * (exponent + 8) / 8 * np.maximum(shading_dot(hits.normal, half), 0) ** exponent
+    )
     return cosine, highlight.astype(np.float32, copy=False)
 
 
@@ -52,7 +54,7 @@ def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
     return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
 
 
-def daylight_radiance(
+def scene_daylight_radiance(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT
 ) -> tuple[Array, NDArray[np.bool_]]:
     """(N, 3) linear RGB that N rays see, zero where nothing is hit, and (N,) bool of hits."""
@@ -61,9 +63,9 @@ def daylight_radiance(
     to_eye = -d[hits.hit]
     to_sun = np.array(light.direction, dtype=np.float32)
     to_sun /= np.linalg.norm(to_sun)
-    lit = visible_light(scene, hits, np.broadcast_to(to_sun, hits.position.shape), np.inf)
+    lit = scene_light_visibility(scene, hits, np.broadcast_to(to_sun, hits.position.shape), np.inf)
     rgb = reflect_light(hits, to_eye, to_sun) * (np.array(light.sun, dtype=np.float32) * lit[:, None])
-    add_surroundings(rgb, hits, to_eye, light.sky, light.ground)
+    add_scene_surroundings(rgb, hits, to_eye, light.sky, light.ground)
     if hits.emission is not None:
         rgb += hits.emission
     image = np.zeros(d.shape, dtype=np.float32)
@@ -71,14 +73,14 @@ def daylight_radiance(
     return image, hits.hit
 
 
-def visible_light(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> NDArray[np.bool_]:
+def scene_light_visibility(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> NDArray[np.bool_]:
     """(M,) whether light from ``to_light`` (M, 3), ``away`` lengths of it far, reaches the surfaces."""
-    lit: NDArray[np.bool_] = dot(hits.face, to_light) > 0  # what faces away is in its own shadow: no ray needed
+    lit: NDArray[np.bool_] = shading_dot(hits.face, to_light) > 0  # what faces away is in its own shadow: no ray needed
     lit[lit] = ~scene.occluded(hits.lifted()[lit], to_light[lit], np.broadcast_to(away, len(lit))[lit])
     return lit
 
 
-def add_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
+def add_scene_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
     """Add to ``rgb`` (M, 3) the reflection of soft light from all around: ``sky`` above, ``ground`` below."""
 
     def surroundings(height: Array) -> Array:
@@ -87,13 +89,13 @@ def add_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground:
 
     rgb += hits.albedo * surroundings(hits.normal[:, 2])
     # Polished things mirror the surroundings faintly, more so at grazing angles (Schlick).
-    facing = np.clip(dot(hits.normal, to_eye), 0, 1)
+    facing = np.clip(shading_dot(hits.normal, to_eye), 0, 1)
     mirrored = 2 * facing * hits.normal[:, 2] - to_eye[:, 2]
     strength = hits.gloss * (0.06 + 0.5 * (1 - facing) ** 5)
     rgb += strength[:, None] * surroundings(mirrored)
 
 
-def encode_srgb(linear: Array) -> Array:
+def encode_scene_srgb(linear: Array) -> Array:
     """Display values 0..1 of linear ones, clipped (IEC 61966-2-1)."""
     x = np.clip(linear, 0, 1)
     curve = 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055

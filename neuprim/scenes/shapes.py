@@ -119,14 +119,14 @@ def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sec
     return trimesh.Trimesh(vertices, np.concatenate([lower, upper, bottom, top]), process=True, validate=True)
 
 
-def merge_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
+def merge_solid_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
     """All of them as one mesh, each with vertices of its own even where they touch, so that each stays closed."""
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start[:-1], strict=True)]
     return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), process=False)
 
 
-def corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
+def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
     """(F, 3, 3) unit normals at corners: the angle-weighted mean of the vertex's faces that turn by little."""
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
@@ -155,11 +155,11 @@ class Solid:
     albedo: Albedo  # diffuse reflectance as a function of position
     gloss: float  # 0 (matt) to 1 (polished); see :mod:`neuprim.scenes.shading`
     specular: float = 0.12  # strength of the highlight of a polished solid
-    # (F, 3, 3) unit normals at the faces' corners; None: :func:`corner_normals`
+    # (F, 3, 3) unit normals at the faces' corners; None: :func:`solid_corner_normals`
     normals: NDArray[np.float64] | None = None
 
 
-def parse_srgb(code: str) -> NDArray[np.float32]:
+def parse_solid_srgb(code: str) -> NDArray[np.float32]:
     """(3,) linear RGB of a display colour "#rrggbb" (IEC 61966-2-1)."""
     value = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
@@ -167,13 +167,13 @@ def parse_srgb(code: str) -> NDArray[np.float32]:
 
 def uniform_colour(code: str) -> Albedo:
     """One colour everywhere."""
-    colour = parse_srgb(code)
+    colour = parse_solid_srgb(code)
     return lambda position: np.broadcast_to(colour, position.shape)
 
 
 def _two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], NDArray[np.bool_]]) -> Albedo:
     """``other`` where ``is_other`` (positions (M, 3) -> (M,) bool) holds, else ``code``."""
-    first, second = parse_srgb(code), parse_srgb(other)
+    first, second = parse_solid_srgb(code), parse_solid_srgb(other)
     return lambda position: np.where(is_other(position)[:, None], second, first)
 
 
@@ -205,7 +205,7 @@ def _place_solid(solid: Solid, pose: NDArray[np.float64]) -> Solid:
 
 def _plate_solid() -> Solid:
     half, thickness, rim, cell = 0.84, 0.08, 0.78, 0.195
-    ivory, slate, edge = parse_srgb("#f2ead8"), parse_srgb("#33415c"), parse_srgb("#1f9e89")
+    ivory, slate, edge = parse_solid_srgb("#f2ead8"), parse_solid_srgb("#33415c"), parse_solid_srgb("#1f9e89")
 
     def albedo(position: NDArray[np.float32]) -> NDArray[np.float32]:
         odd = np.floor(position[:, :2] / cell).sum(1) % 2 == 1
@@ -251,7 +251,7 @@ def _drill_solids() -> list[Solid]:
         Solid("guard", guard, uniform_colour("#d7263d"), 0.6),
         Solid("trigger", trigger, uniform_colour("#d7263d"), 0.6),
         Solid("battery", chamfered_box([0.46, 0.28, 0.15], [-0.23, 0, FLOOR + 0.075], 0.03), battery_paint, 0.5),
-        Solid("slats", merge_meshes(slats), uniform_colour("#22223b"), 0.2),
+        Solid("slats", merge_solid_meshes(slats), uniform_colour("#22223b"), 0.2),
     ]
 
 
@@ -262,8 +262,8 @@ def _wire_cube_solids() -> list[Solid]:
     turn = trimesh.transformations.rotation_matrix(np.radians(20.0), [0, 0, 1])[:3, :3]
     corner = {sign: centre + turn @ (np.array(sign) * side / 2) for sign in product((-1, 1), repeat=3)}
     edges = [(a, b) for a in corner for b in corner if a < b and sum(x != y for x, y in zip(a, b, strict=True)) == 1]
-    rods = merge_meshes([rod(corner[a], corner[b], thick) for a, b in edges])
-    knots = merge_meshes([ball(point, 2 * thick, fine=False) for point in corner.values()])
+    rods = merge_solid_meshes([rod(corner[a], corner[b], thick) for a, b in edges])
+    knots = merge_solid_meshes([ball(point, 2 * thick, fine=False) for point in corner.values()])
     return [
         Solid("wire cube", rods, uniform_colour("#0fa34a"), 0.5),
         Solid("knots", knots, uniform_colour("#0b5d2c"), 0.5),

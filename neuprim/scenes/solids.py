@@ -20,22 +20,22 @@ from PIL import Image
 
 from neuprim.core.validation import Range, validate_fields
 from neuprim.scenes.image_set import (
-    ImageSet,
     ImageSize,
     Progress,
+    SceneImageSet,
     Supersampling,
-    average_rays,
-    camera_pose,
-    hash_settings,
-    ray_bands,
-    unit_direction,
+    average_scene_rays,
+    hash_scene_settings,
+    scene_camera_pose,
+    scene_direction,
+    scene_ray_bands,
 )
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.shading import daylight_radiance, encode_srgb
+from neuprim.scenes.shading import encode_scene_srgb, scene_daylight_radiance
 from neuprim.scenes.shapes import build_solids
 
 Radiance = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
-"""(scene, origins, directions) -> what :func:`~neuprim.scenes.shading.daylight_radiance` returns."""
+"""(scene, origins, directions) -> what :func:`~neuprim.scenes.shading.scene_daylight_radiance` returns."""
 
 GENERATOR_VERSION = 1  # part of the cache's key: raise it with every change to shapes, light, cameras or file layout
 
@@ -57,7 +57,7 @@ class SolidsSettings:
         validate_fields(self, "scene")
 
     def key(self) -> str:
-        return hash_settings(self, GENERATOR_VERSION)
+        return hash_scene_settings(self, GENERATOR_VERSION)
 
 
 class _SolidsView(NamedTuple):
@@ -78,9 +78,9 @@ def describe_solids_images(
     key: str,
     settings: SolidsSettings,
     build: Callable[[], Scene],
-    seen: Radiance = daylight_radiance,
+    seen: Radiance = scene_daylight_radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
-) -> ImageSet[_SolidsView]:
+) -> SceneImageSet[_SolidsView]:
     """Describe images of the scene that ``build`` makes, taken by the cameras of the solids."""
 
     def views(split: str, count: int) -> list[_SolidsView]:
@@ -89,7 +89,7 @@ def describe_solids_images(
     def draw(scene: Scene, view: _SolidsView, paths: Sequence[Path]) -> None:
         Image.fromarray(draw_solids(scene, view.pose, settings.size, settings.supersampling, seen)).save(paths[0])
 
-    return ImageSet(
+    return SceneImageSet(
         name=name,
         key=key,
         size=settings.size,
@@ -111,19 +111,21 @@ def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
     """
     low, high, phase, turn = (-0.16, 0.98, 0.0, _GOLDEN_ANGLE) if split == "train" else (0.05, 0.9, 1.0, -_GOLDEN_ANGLE)
     cosines = [low + (high - low) * (i + 0.5) / count for i in range(count)]
-    return [camera_pose(_DISTANCE * unit_direction(cosine, phase + i * turn)) for i, cosine in enumerate(cosines)]
+    return [
+        scene_camera_pose(_DISTANCE * scene_direction(cosine, phase + i * turn)) for i, cosine in enumerate(cosines)
+    ]
 
 
 def draw_solids(
-    scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = daylight_radiance
+    scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = scene_daylight_radiance
 ) -> NDArray[np.uint8]:
     """(size, size, 4) RGBA, sRGB with straight alpha. Rays are averaged premultiplied and linear, then encoded."""
     bands = []
-    for directions in ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
+    for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         rgb, hit = seen(scene, pose[:3, 3], directions)
         rgba = np.concatenate([rgb, hit[:, None].astype(np.float32)], axis=1)
-        bands.append(average_rays(rgba, size, supersampling))
+        bands.append(average_scene_rays(rgba, size, supersampling))
     mean = np.concatenate(bands)
     alpha = mean[..., 3:]
     straight = (mean[..., :3] / np.maximum(alpha, np.float32(1e-6))).astype(np.float32, copy=False)
-    return np.round(np.concatenate([encode_srgb(straight), alpha], axis=-1) * 255).astype(np.uint8)
+    return np.round(np.concatenate([encode_scene_srgb(straight), alpha], axis=-1) * 255).astype(np.uint8)

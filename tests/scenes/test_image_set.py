@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 
-from neuprim.scenes.image_set import ImageSet, draw_in_parallel
+from neuprim.scenes.image_set import SceneImageSet, draw_in_parallel
 from neuprim.scenes.lit import LitSettings
 from neuprim.scenes.room import RoomSettings
 from neuprim.scenes.solids import SolidsSettings
@@ -24,7 +24,7 @@ def quiet(text: str, fraction: float) -> None:
     pass
 
 
-def numbers(engine: str = "embree", **changes: Any) -> ImageSet[int]:
+def numbers(engine: str = "embree", **changes: Any) -> SceneImageSet[int]:
     """A "scene" whose images are the squares of their numbers."""
 
     def draw(scene: Any, view: int, paths: Sequence[Path]) -> None:
@@ -42,7 +42,7 @@ def numbers(engine: str = "embree", **changes: Any) -> ImageSet[int]:
         "files": lambda view: [f"{view}.txt", f"{view}_again.txt"],
         "draw": draw,
     }
-    return ImageSet(**{**given, **changes})  # type: ignore[arg-type]
+    return SceneImageSet(**{**given, **changes})  # type: ignore[arg-type]
 
 
 def contents(folder: Path) -> dict[str, str]:

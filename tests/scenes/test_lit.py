@@ -14,7 +14,7 @@ from neuprim.core.data.image_views import ImageViews
 from neuprim.core.task import SceneContext
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.scenes import lit as generator
-from neuprim.scenes.image_set import camera_pose
+from neuprim.scenes.image_set import scene_camera_pose
 from neuprim.scenes.lit import (
     FIELD_OF_VIEW,
     INTENSITY,
@@ -28,7 +28,7 @@ from neuprim.scenes.lit import (
     shade_point_light,
 )
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.shapes import Solid, ball, chamfered_box, parse_srgb, uniform_colour
+from neuprim.scenes.shapes import Solid, ball, chamfered_box, parse_solid_srgb, uniform_colour
 from neuprim.tasks import relight
 from neuprim.tasks.relight.datasets import load_lit_solids_for_relighting as load
 from neuprim.tasks.relight.datasets import load_olat, read_lit_pixel_classes
@@ -57,7 +57,9 @@ def test_lambert_under_a_point_light() -> None:
     seen = down(Scene([FLOOR]), points, (0.3, -0.2, 2.0))
     for (x, y), rgb in zip(points, seen.rgb, strict=True):
         square = (x - 0.3) ** 2 + (y + 0.2) ** 2 + 4.0
-        np.testing.assert_allclose(rgb, parse_srgb(GREY) / np.pi * (2.0 / np.sqrt(square)) * 2.0 / square, rtol=1e-4)
+        np.testing.assert_allclose(
+            rgb, parse_solid_srgb(GREY) / np.pi * (2.0 / np.sqrt(square)) * 2.0 / square, rtol=1e-4
+        )
     assert names(seen) == ["lit"] * 3
     np.testing.assert_array_equal(seen.rgb, seen.unshadowed)
 
@@ -85,7 +87,7 @@ def test_what_faces_away_is_in_attached_shadow() -> None:
 def test_the_highlight_lies_where_the_normal_is_the_half_vector() -> None:
     sphere = Scene([Solid("ball", ball([0, 0, 0], 1.0), uniform_colour("#101010"), 0.6, specular=1.5)])
     eye, light = np.array([4.2, 0.0, 1.0]), np.array([1.5, 3.0, 3.0])
-    pose, plane = camera_pose(eye), np.tan(FIELD_OF_VIEW / 2)
+    pose, plane = scene_camera_pose(eye), np.tan(FIELD_OF_VIEW / 2)
     image = draw_lit_solids(sphere, pose, light, 128, 1)
     row, column = np.unravel_index(image.rgba[..., 1].argmax(), (128, 128))
     ray = pose[:3, :3] @ [((column + 0.5) / 64 - 1) * plane, (1 - (row + 0.5) / 64) * plane, -1.0]
@@ -97,7 +99,7 @@ def test_the_highlight_lies_where_the_normal_is_the_half_vector() -> None:
 
 
 def test_a_pixel_has_the_class_of_most_of_its_rays() -> None:
-    scene, pose, light = Scene([FLOOR, BLOCK]), camera_pose(np.array([2.0, -3.0, 2.5])), np.array([1.0, 1.0, 4.0])
+    scene, pose, light = Scene([FLOOR, BLOCK]), scene_camera_pose(np.array([2.0, -3.0, 2.5])), np.array([1.0, 1.0, 4.0])
     coarse, fine = draw_lit_solids(scene, pose, light, 16, 4), draw_lit_solids(scene, pose, light, 64, 1)
     alpha = fine.rgba[..., 3].reshape(16, 4, 16, 4).sum((1, 3))
     np.testing.assert_array_equal(coarse.rgba[..., 3] * 16, alpha)

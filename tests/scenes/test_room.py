@@ -18,17 +18,17 @@ from neuprim.core.io.ply import read_ply
 from neuprim.core.task import SceneContext
 from neuprim.scenes.room import (
     LENS,
-    Lens,
     Room,
+    RoomLens,
     RoomSettings,
     build_room,
-    exposure_gains,
-    lamplight_radiance,
     photograph_room,
-    reconstruct_points,
+    reconstruct_room_points,
     room_camera_poses,
+    room_exposure_gains,
+    room_lamplight_radiance,
     room_lens,
-    walk_positions,
+    room_walk_positions,
 )
 from neuprim.scenes.room_interior import (
     ABOVE,
@@ -41,7 +41,7 @@ from neuprim.scenes.room_interior import (
     lattice_noise,
     speckled,
 )
-from neuprim.scenes.shapes import ball, build_solids, chamfered_box, parse_srgb
+from neuprim.scenes.shapes import ball, build_solids, chamfered_box, parse_solid_srgb
 from neuprim.tasks.static.datasets import load_room_dataset
 
 SMALL = {"size": 40, "train_views": 6, "test_views": 3, "supersampling": 1, "points": 300}
@@ -130,8 +130,8 @@ def test_the_lamp_falls_with_distance_and_casts_shadows() -> None:
     blocker = Furnishing("blocker", ball([x + 0.5, y, z / 2], 0.2), grey)
     spots = np.array([[x, y], [x - 2, y], [x + 1.0, y]])  # below, aside, and behind the ball
     origins = np.column_stack([spots, np.full(3, 0.2)])
-    rgb = lamplight_radiance(Room([], [floor, blocker], 1e-3), origins, np.tile([[0.0, 0, -1]], (3, 1)))
-    albedo, above, power = parse_srgb("#808080"), np.array(ABOVE), np.array(LAMP_POWER)
+    rgb = room_lamplight_radiance(Room([], [floor, blocker], 1e-3), origins, np.tile([[0.0, 0, -1]], (3, 1)))
+    albedo, above, power = parse_solid_srgb("#808080"), np.array(ABOVE), np.array(LAMP_POWER)
     np.testing.assert_allclose(rgb[0], albedo * (above + power / z**2 / np.pi), rtol=1e-4)
     np.testing.assert_allclose(rgb[1], albedo * (above + power * z / np.hypot(2, z) ** 3 / np.pi), rtol=1e-4)
     np.testing.assert_allclose(rgb[2], albedo * above, rtol=1e-4)
@@ -140,7 +140,7 @@ def test_the_lamp_falls_with_distance_and_casts_shadows() -> None:
 # ---------------------------------------------------------------- cameras and the lens
 
 
-def pixels(lens: Lens, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
+def pixels(lens: RoomLens, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
     """(N, 2) photographed pixels of (N, 3) points, all of them before the camera."""
     local = (points - pose[:3, 3]) @ pose[:3, :3]
     assert (local[:, 2] < 0).all()
@@ -150,7 +150,7 @@ def pixels(lens: Lens, pose: np.ndarray, points: np.ndarray) -> np.ndarray:
 @pytest.mark.parametrize(("train", "test"), [(80, 20), (2, 1), (5, 7)])
 def test_cameras_are_in_the_room_and_see_the_whole_subject(train: int, test: int) -> None:
     corners = np.concatenate([s.mesh.vertices for s in build_solids()])
-    lens, poses = Lens(200), room_camera_poses(train, test)
+    lens, poses = RoomLens(200), room_camera_poses(train, test)
     assert {split: len(found) for split, found in poses.items()} == {"train": train, "test": test}
     for pose in (*poses["train"], *poses["test"]):
         eye = pose[:3, 3]
@@ -163,7 +163,7 @@ def test_cameras_are_in_the_room_and_see_the_whole_subject(train: int, test: int
 
 def test_test_cameras_lie_between_training_ones_and_are_the_same_for_any_number_of_them() -> None:
     for train in (80, 20, 7):
-        found = walk_positions(train, 20)
+        found = room_walk_positions(train, 20)
         both = np.sort(np.concatenate([found["train"], found["test"]]))
         assert len(both) == train + 20 and np.diff(both).min() > 0.3 / (train + 20)
         np.testing.assert_array_equal(room_camera_poses(train, 20)["test"], room_camera_poses(80, 20)["test"])
@@ -177,7 +177,7 @@ def test_the_loaders_undistorted_image_is_what_a_pinhole_sees(tmp_path: Path) ->
     loaded = load_room_dataset(asdict(settings), SceneContext(seed=0, cache_dir=tmp_path))
     camera, found = loaded.test.view(0).camera, loaded.test.pixels(0)
     lens, pose = room_lens(settings), room_camera_poses(2, 1)["test"][0]
-    pinhole = photograph_room(build_room(settings), Lens(128, RadialDistortion()), pose, 2)
+    pinhole = photograph_room(build_room(settings), RoomLens(128, RadialDistortion()), pose, 2)
     assert found.mask is None or found.mask.all()  # a barrel lens shows all that the pinhole would
     bent = np.asarray(Image.open(next(tmp_path.glob("room-*")) / "images" / "test_0000.png"))
     agreement = psnr(found.rgb.numpy() * 255, pinhole)
@@ -214,10 +214,10 @@ def test_exposures_are_within_bounds_and_in_training_images_only(room: Room, fol
         poses = room_camera_poses(6, 3)[split]
         for i in range(count):
             name = f"images/{split}_{i:04d}.png"
-            image = photograph_room(room, Lens(40), poses[i], 1, written[name])
+            image = photograph_room(room, RoomLens(40), poses[i], 1, written[name])
             np.testing.assert_array_equal(np.asarray(Image.open(folder / name)), image)
             assert (written[name] == 1.0) == (split == "test") and abs(np.log2(written[name])) <= 0.15
-    many = np.log2(exposure_gains(2000, 0.3))
+    many = np.log2(room_exposure_gains(2000, 0.3))
     assert many.min() < -0.29 and many.max() > 0.29
     assert abs(many.mean()) < 0.02 and abs(many.std() - 0.3 / np.sqrt(3)) < 0.01
 
@@ -228,7 +228,7 @@ def test_points_lie_on_surfaces_that_two_cameras_see(room: Room, folder: Path) -
         return image @ np.array([0.2126, 0.7152, 0.0722]) / 255
 
     poses = room_camera_poses(6, 3)["train"]
-    found = reconstruct_points(room, Lens(40), poses, luma, 3000)
+    found = reconstruct_room_points(room, RoomLens(40), poses, luma, 3000)
     assert len(found.surface) == 3000 and set(found.camera) == set(range(6))
     seen_by, own = np.zeros(3000, dtype=int), np.zeros(3000, dtype=bool)
     for index, pose in enumerate(poses):
@@ -238,7 +238,7 @@ def test_points_lie_on_surfaces_that_two_cameras_see(room: Room, folder: Path) -
         local = ray @ pose[:3, :3]
         before = local[:, 2] < 0
         flat = np.stack([local[:, 0], -local[:, 1]], axis=1) / -np.where(before, local[:, 2], -1.0)[:, None]
-        x, y = Lens(40).pixels(flat).T
+        x, y = RoomLens(40).pixels(flat).T
         inside = before & (x >= 0) & (x <= 40) & (y >= 0) & (y <= 30)
         seen = inside & (np.abs(first.distance - away) < 2e-3 * away)
         seen_by += seen

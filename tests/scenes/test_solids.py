@@ -16,8 +16,8 @@ from neuprim.core.cameras import Camera
 from neuprim.core.task import SceneContext
 from neuprim.scenes import solids as generator
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.shading import DAYLIGHT, daylight_radiance
-from neuprim.scenes.shapes import Solid, ball, build_solids, chamfered_box, parse_srgb, uniform_colour
+from neuprim.scenes.shading import DAYLIGHT, scene_daylight_radiance
+from neuprim.scenes.shapes import Solid, ball, build_solids, chamfered_box, parse_solid_srgb, uniform_colour
 from neuprim.scenes.solids import SolidsSettings, generate_solids
 from neuprim.tasks.static.datasets import load_solids_dataset
 
@@ -69,7 +69,7 @@ def test_rays_meet_a_ball_where_the_equation_says() -> None:
     np.testing.assert_allclose(hits.position, [[x, 0.1, 0.2]], atol=2e-3)
     np.testing.assert_allclose(hits.distance, [(3 - x) / 2], atol=2e-3)
     np.testing.assert_allclose(hits.normal, (hits.position - [[0.1, 0, 0]]) / 0.5, atol=5e-3)
-    np.testing.assert_allclose(hits.albedo, [parse_srgb("#ff8000")])
+    np.testing.assert_allclose(hits.albedo, [parse_solid_srgb("#ff8000")])
     assert hits.gloss.tolist() == [np.float32(0.7)] and hits.solid.tolist() == [0]
 
 
@@ -97,9 +97,9 @@ def test_shadow_takes_the_sun_away() -> None:
     sun = np.array(DAYLIGHT.direction) / np.linalg.norm(DAYLIGHT.direction)
     blocker = Solid("blocker", ball(sun * 0.8, 0.2), uniform_colour("#ffffff"), 0.0)
     origins, down = np.array([[0.0, 0, 0.3], [-0.8, 0.8, 0.3]]), np.tile([[0.0, 0, -1]], (2, 1))
-    rgb, hit = daylight_radiance(Scene([floor, blocker]), origins, down)
+    rgb, hit = scene_daylight_radiance(Scene([floor, blocker]), origins, down)
     assert hit.all()
-    grey, sky = parse_srgb("#808080"), np.array(DAYLIGHT.sky)
+    grey, sky = parse_solid_srgb("#808080"), np.array(DAYLIGHT.sky)
     np.testing.assert_allclose(rgb[0], grey * sky, rtol=1e-5)
     np.testing.assert_allclose(rgb[1], grey * (sky + np.array(DAYLIGHT.sun) * sun[2] / np.pi), rtol=1e-5)
 

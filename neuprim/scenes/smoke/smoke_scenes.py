@@ -30,7 +30,7 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.validation import Range
-from neuprim.scenes.image_set import Progress, write_cached_folder
+from neuprim.scenes.image_set import Progress, write_scene_folder
 from neuprim.scenes.smoke.solver import GasForcing, GasProperties, GasSource, GasState, SmokeBox, advance_gas
 
 SOLVER_VERSION = 1
@@ -71,7 +71,7 @@ class TurbulenceNoise:
         key = math.floor(phase)
         angle = (phase - key) * math.pi / 2
         lattice = math.cos(angle) * self._lattice(channel, key) + math.sin(angle) * self._lattice(channel, key + 1)
-        x, y, z = (_lattice_weights(axis.reshape(-1) * cells) for axis in axes)
+        x, y, z = (_smoke_lattice_weights(axis.reshape(-1) * cells) for axis in axes)
         planes = torch.matmul(y, torch.matmul(lattice, z.T)).reshape(_PERIOD, -1)
         return torch.matmul(x, planes).reshape(len(x), len(y), len(z))
 
@@ -86,7 +86,7 @@ class TurbulenceNoise:
         return torch.stack([self.fractal(c, axes, cells, tempo, time, octaves) for c in channels])
 
 
-def _lattice_weights(places: Tensor) -> Tensor:
+def _smoke_lattice_weights(places: Tensor) -> Tensor:
     """(n, _PERIOD) what each lattice node counts at each place; cubic fade, so that slopes are continuous."""
     lower = places.floor()
     part = places - lower
@@ -143,7 +143,7 @@ class SmokeScene:
         return "color" in self.grids
 
 
-def _soft_edge(distance: Tensor, width: float) -> Tensor:
+def _soft_smoke_source_edge(distance: Tensor, width: float) -> Tensor:
     """1 well inside (negative distance), 0 outside, smooth over ``width``."""
     t = (0.5 - distance / width).clamp(0, 1)
     return t * t * (3 - 2 * t)
@@ -158,7 +158,13 @@ def _force_smoke_fire(stage: SmokeStage, time: float) -> GasForcing:
     noise = stage.noise
     radius = torch.sqrt(x * x + y * y) - 0.05 * noise.fractal(1, axes, 5.0, 3.0, time)
     flicker = torch.sigmoid(3.0 * noise.fractal(2, axes, 8.0, 6.0, time, octaves=2) + 0.6)
-    rate = 50.0 * min(1.0, 0.2 + time / 0.25) * _soft_edge(radius - 0.11, 0.06) * _soft_edge(z - 0.05, 0.05) * flicker
+    rate = (
+        50.0
+        * min(1.0, 0.2 + time / 0.25)
+        * _soft_smoke_source_edge(radius - 0.11, 0.06)
+        * _soft_smoke_source_edge(z - 0.05, 0.05)
+        * flicker
+    )
     push = noise.vector(3, axes, 7.0, 7.0, time) * 0.5
     push[2] += 0.8
     fire = GasSource(where, rate, density=0.0, temperature=0.7, fuel=1.0, velocity=push)
@@ -194,7 +200,7 @@ def _force_colorful_smoke(stage: SmokeStage, time: float) -> GasForcing:
         x, y, z = axes
         lumps = stage.noise.fractal(10 * k, axes, 12.0, 4.0, time, octaves=2)
         distance = torch.sqrt((x - cx) ** 2 + (y - cy) ** 2 + (z - cz) ** 2) - 0.012 * lumps
-        rate = 60.0 * _soft_edge(distance - 0.045, 0.035) * min(1.0, 0.2 + strength)
+        rate = 60.0 * _soft_smoke_source_edge(distance - 0.045, 0.035) * min(1.0, 0.2 + strength)
         push = 0.25 * stage.noise.vector(10 * k + 3, axes, 11.0, 6.0, time, octaves=1)
         speed = 0.5 + 0.75 * strength
         inward, around = 0.45, 0.35 if k % 2 else -0.2
@@ -228,7 +234,7 @@ def _force_ground_explosion(stage: SmokeStage, time: float) -> GasForcing:
         x, y, z = axes
         distance = torch.sqrt(x * x + y * y + (z - 0.03) ** 2) + 1e-6
         lumps = noise.fractal(1, axes, 9.0, 5.0, time)
-        inside = _soft_edge(distance - 0.1 - 0.02 * lumps, 0.05) * blast
+        inside = _soft_smoke_source_edge(distance - 0.1 - 0.02 * lumps, 0.05) * blast
         push = torch.stack([x.expand_as(distance), y.expand_as(distance), (z * 1.2).expand_as(distance)]) / distance
         push = 1.0 * push * (1 + 0.3 * lumps) + 0.3 * noise.vector(2, axes, 10.0, 8.0, time)
         push[2] += 0.7
@@ -242,7 +248,7 @@ def _force_ground_explosion(stage: SmokeStage, time: float) -> GasForcing:
         x, y, z = axes
         distance = torch.sqrt(x * x + y * y) + 1e-6
         lumps = noise.fractal(5, axes, 11.0, 3.0, time)
-        ring = _soft_edge((distance - front).abs() - 0.035 - 0.02 * lumps, 0.05) * _soft_edge(
+        ring = _soft_smoke_source_edge((distance - front).abs() - 0.035 - 0.02 * lumps, 0.05) * _soft_smoke_source_edge(
             z - 0.03 - 0.015 * lumps, 0.03
         )
         speed = 1.1 * math.exp(-time / 0.3)
@@ -305,7 +311,7 @@ def _force_dust_tornado(stage: SmokeStage, time: float) -> GasForcing:
     fx, fy = _whirl_axis(axes[2], time)
     ground = torch.sqrt((axes[0] - fx) ** 2 + (axes[1] - fy) ** 2)
     lumps = noise.fractal(1, axes, 13.0, 7.0, time)
-    ring = _soft_edge((ground - 0.085).abs() - 0.04 - 0.035 * lumps, 0.05) * _soft_edge(
+    ring = _soft_smoke_source_edge((ground - 0.085).abs() - 0.04 - 0.035 * lumps, 0.05) * _soft_smoke_source_edge(
         axes[2] - 0.03 - 0.025 * lumps, 0.04
     )
     dust = GasSource(where, 22.0 * ring, density=(0.4 + 0.6 * lumps).clamp(0.0, 1.2), temperature=0.05)
@@ -366,13 +372,13 @@ def simulate_smoke(
         stage, state = SmokeStage(box, seed), GasState.clear_air(box, scene.coloured)
         metadata = {"creator": "neuprim simulation", "comment": f"simulated by neuprim: {name}, seed {seed}"}
         for frame, file in enumerate(files, start=1):
-            with _one_torch_thread():
+            with _solve_smoke_on_one_thread():
                 state = advance_gas(state, scene.solver, box, scene.forcing(stage, state.time), scene.frame_time)
             write_vdb(folder / file, make_smoke_grids(state, scene, box), metadata=metadata)
             progress(text, frame / count)
 
     final = Path(cache_dir) / f"sim-{name}-{simulation_key(scene, count, resolution, seed)}"
-    return write_cached_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
+    return write_scene_folder(final, files, write, f"scene {name}: cannot write the simulated frames")
 
 
 def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -> str:
@@ -417,7 +423,7 @@ def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[
 
 
 @contextmanager
-def _one_torch_thread() -> Iterator[None]:
+def _solve_smoke_on_one_thread() -> Iterator[None]:
     """Run torch on one thread: the solver divides its work itself, and results must not depend on threads."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)

@@ -70,10 +70,10 @@ class SmokeBox:
     def solve_pressure(self, right: Tensor) -> Tensor:
         """(X, Y, Z) float64: the pressure whose Laplacian is ``right``."""
         (x, y, z), inverse = self._modes
-        return _apply_along_axes(_apply_along_axes(right.double(), x.T, y.T, z.T) * inverse, x, y, z)
+        return _apply_smoke_solver_modes(_apply_smoke_solver_modes(right.double(), x.T, y.T, z.T) * inverse, x, y, z)
 
 
-def _apply_along_axes(field: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
+def _apply_smoke_solver_modes(field: Tensor, x: Tensor, y: Tensor, z: Tensor) -> Tensor:
     field = torch.matmul(y, torch.matmul(field, z.T))
     return torch.matmul(x, field.reshape(field.shape[0], -1)).reshape(field.shape)
 
@@ -110,13 +110,13 @@ def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Face
     return parts[0], parts[1], parts[2]
 
 
-def _to_centres(velocity: Faces) -> Tensor:
+def _smoke_solver_flow_at_centres(velocity: Faces) -> Tensor:
     """(3, X, Y, Z) velocity at the cells' centres, the mean of opposite faces."""
     u, v, w = velocity
     return torch.stack([u[1:] + u[:-1], v[:, 1:] + v[:, :-1], w[:, :, 1:] + w[:, :, :-1]]).mul_(0.5)
 
 
-def _to_faces(centred: Tensor) -> Faces:
+def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
     """Faces between two cells get the mean of both, those at the ends the cell's own."""
     parts = []
     for axis, field in enumerate(centred):
@@ -234,14 +234,14 @@ def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing
 
 def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
     """The gas ``time`` seconds later; its velocity is free of divergence, to rounding."""
-    before = _to_centres(state.velocity)
+    before = _smoke_solver_flow_at_centres(state.velocity)
     wind = before
     making = forcing.expansion
     if settings.expansion:
         burnt = state.fuel.clamp_max(settings.burn * time) * (settings.expansion / time)
         making = burnt if making is None else burnt + making
     if making is not None:
-        wind = before + _to_centres(expansion_flow(making, box))
+        wind = before + _smoke_solver_flow_at_centres(expansion_flow(making, box))
     scalars = torch.stack([state.density, state.temperature, state.fuel])
     fields = [before, scalars] if state.colour is None else [before, scalars, state.colour]
     # The velocity stays blurred: sharp, it gathers motion of the finest scale, which shows as streaks along the axes.
@@ -268,7 +268,12 @@ def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: G
     # smoothing removes what the centres cannot see: motion that alternates from face to face.
     u, v, w = (
         old + more + settings.smoothing * (mean - old)
-        for old, more, mean in zip(state.velocity, _to_faces(after - before), _to_faces(before), strict=True)
+        for old, more, mean in zip(
+            state.velocity,
+            _smoke_solver_flow_at_faces(after - before),
+            _smoke_solver_flow_at_faces(before),
+            strict=True,
+        )
     )
     return replace(state, velocity=project_velocity((u, v, w), box))
 
@@ -344,7 +349,7 @@ _SLAB = 1 << 15  # cells worked on at once: their stencils stay in a CPU's cache
 _INVISIBLE = 1e-4  # most of a box holds no more, and need not be corrected
 
 
-class _Stencil(NamedTuple):
+class _SmokeSolverStencil(NamedTuple):
     """Rows of a table (X * Y * Z, C) around N points. ``embedding_bag`` sums them several times faster than
     ``grid_sample`` in three dimensions, with the same result for any number of threads."""
 
@@ -356,7 +361,7 @@ class _Stencil(NamedTuple):
         return embedding_bag(self.rows, table, per_sample_weights=self.weights, mode="sum")
 
 
-def _trilinear_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _Stencil:
+def _smoke_solver_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _SmokeSolverStencil:
     """Of points given as three tensors (N,) in cells, the first centre at 0; clamped to the outermost centres."""
     lower, parts = [], []
     for along, count in zip(points, shape, strict=True):
@@ -373,7 +378,9 @@ def _trilinear_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _St
     for pair, edge in enumerate(edges):
         upper = torch.mul(edge, z, out=weights[:, 2 * pair + 1])
         torch.sub(edge, upper, out=weights[:, 2 * pair])
-    return _Stencil(base[:, None] + torch.tensor(_stencil_offsets(shape), dtype=torch.int32), weights)
+    return _SmokeSolverStencil(
+        base[:, None] + torch.tensor(_smoke_solver_stencil_offsets(shape), dtype=torch.int32), weights
+    )
 
 
 def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
@@ -391,17 +398,17 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
     shape = (fields.shape[1], fields.shape[2], fields.shape[3])
     table, winds = (x.reshape(len(x), -1).T.contiguous() for x in (fields, velocity))
     sharp = table[:, blurred:].contiguous()
-    scale, cells = time / cell, _cell_indices(shape)
+    scale, cells = time / cell, _smoke_solver_cell_indices(shape)
     carried, behind = torch.empty_like(table), torch.empty_like(winds)
     place = torch.empty(len(table), dtype=torch.int32)
 
     def carry(rows: slice) -> None:
         here = [axis[rows] for axis in cells]
         wind = winds[rows]
-        behind[rows] = _trilinear_stencil([p - (0.5 * scale) * wind[:, k] for k, p in enumerate(here)], shape).read(
+        behind[rows] = _smoke_solver_stencil([p - (0.5 * scale) * wind[:, k] for k, p in enumerate(here)], shape).read(
             winds
         )
-        back = _trilinear_stencil([p - scale * behind[rows, k] for k, p in enumerate(here)], shape)
+        back = _smoke_solver_stencil([p - scale * behind[rows, k] for k, p in enumerate(here)], shape)
         carried[rows] = back.read(table)
         place[rows] = back.rows[:, 0]
 
@@ -412,11 +419,11 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
         # The wind half a step ahead is not sampled but extrapolated: as much more than here as the one behind is less.
         step = scale * (2 * winds.index_select(0, at) - behind.index_select(0, at))
         ahead = [axis.index_select(0, at) + step[:, k] for k, axis in enumerate(cells)]
-        gone = sharp.index_select(0, at) - _trilinear_stencil(ahead, shape).read(blurry)
+        gone = sharp.index_select(0, at) - _smoke_solver_stencil(ahead, shape).read(blurry)
         better = blurry.index_select(0, at) + 0.5 * gone
         lowest_corner = place.index_select(0, at)
         low = high = sharp.index_select(0, lowest_corner)
-        for offset in _stencil_offsets(shape)[1:]:
+        for offset in _smoke_solver_stencil_offsets(shape)[1:]:
             values = sharp.index_select(0, lowest_corner + offset)
             low, high = torch.minimum(low, values), torch.maximum(high, values)
         carried[at, blurred:] = torch.minimum(torch.maximum(better, low), high)
@@ -433,12 +440,12 @@ def _advect_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None
 
 
 @lru_cache(maxsize=2)
-def _cell_indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...]:
+def _smoke_solver_cell_indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...]:
     """Indices along each axis of the cells in a table's rows, three of (X * Y * Z,) float32."""
     axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in shape), indexing="ij")
     return tuple(axis.reshape(-1) for axis in axes)
 
 
-def _stencil_offsets(shape: tuple[int, int, int]) -> list[int]:
+def _smoke_solver_stencil_offsets(shape: tuple[int, int, int]) -> list[int]:
     """How many rows of a table the eight cells of a stencil lie after the first."""
     return [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]

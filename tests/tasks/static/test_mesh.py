@@ -16,7 +16,7 @@ from PIL import Image
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Dataset
 from neuprim.core.task import SceneContext
-from neuprim.scenes.shading import encode_srgb
+from neuprim.scenes.shading import encode_scene_srgb
 from neuprim.tasks.static import mesh as generator
 from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images, load_mesh
 from neuprim.tasks.static.mesh.model import MeshFolder
@@ -41,7 +41,7 @@ def colours(scene: MeshSurface, points: list[list[float]], directions: list[list
     """(N, 3) display colours 0..255 of what rays meet; every ray must meet something."""
     hits = scene.intersect(np.array(points, np.float32), np.array(directions, np.float32))
     assert hits.hit.all()
-    return np.round(encode_srgb(hits.albedo) * 255).astype(int)
+    return np.round(encode_scene_srgb(hits.albedo) * 255).astype(int)
 
 
 def pixel(camera: Camera, point: list[float]) -> tuple[int, int]:
@@ -127,7 +127,7 @@ def test_where_the_texture_is_clear_there_is_a_hole(tmp_path: Path, mode: str, a
     hits = scene.intersect(at, towards)
     np.testing.assert_allclose(hits.distance, [(3 + s) / 2 if hole else (3 - s) / 2], atol=1e-5)
     np.testing.assert_allclose(hits.position, [[-s / 2, s if hole else -s, s / 2]], atol=1e-5)
-    assert encode_srgb(hits.albedo).round(3).tolist() == ([[0, 1, 0]] if hole else [[1, 0, 0]])
+    assert encode_scene_srgb(hits.albedo).round(3).tolist() == ([[0, 1, 0]] if hole else [[1, 0, 0]])
     assert scene.occluded(at, towards, 1.4).tolist() == [not hole] and scene.occluded(at, towards).all()
 
 

@@ -15,7 +15,7 @@ import trimesh
 
 from neuprim.core import notices
 from neuprim.core.errors import DataError
-from neuprim.scenes.shading import daylight_radiance, encode_srgb
+from neuprim.scenes.shading import encode_scene_srgb, scene_daylight_radiance
 from neuprim.tasks.static import mesh as generator
 from neuprim.tasks.static.mesh.model import MeshFolder
 from neuprim.tasks.static.mesh.surface import GREY, MeshSurface, SurfacePart, read_surfaces
@@ -89,16 +89,16 @@ def shown(path: Path, lit: bool = False) -> list[int]:
     scene = surface(path)
     at = np.array([[-0.5, 0.5, 3.0]], np.float32)
     image, hit = (
-        daylight_radiance(scene, at, DOWN)
+        scene_daylight_radiance(scene, at, DOWN)
         if lit
         else generator.unlit_mesh_radiance(scene, at, np.array(DOWN, np.float32))
     )
     assert hit.all()
-    return np.round(encode_srgb(image[0]) * 255).astype(int).tolist()
+    return np.round(encode_scene_srgb(image[0]) * 255).astype(int).tolist()
 
 
 def srgb(*linear: float) -> list[int]:
-    return np.round(encode_srgb(np.array(linear, np.float32)) * 255).astype(int).tolist()
+    return np.round(encode_scene_srgb(np.array(linear, np.float32)) * 255).astype(int).tolist()
 
 
 @pytest.mark.parametrize("lit", [False, True])
@@ -439,13 +439,13 @@ def colours_along_x(path: Path) -> list[list[float]]:
         for part in parts_of(path)
         for corners, colour in zip(part.corners, part.colour, strict=True)
     ]
-    return [np.round(encode_srgb(colour), 3).tolist() for _, colour in sorted(found, key=lambda f: f[0])]
+    return [np.round(encode_scene_srgb(colour), 3).tolist() for _, colour in sorted(found, key=lambda f: f[0])]
 
 
 def test_an_stl_that_starts_like_text_is_told_by_its_length(tmp_path: Path) -> None:
     path = write_stl(tmp_path / "a.stl", b"solid exported facet by CAD", 0, 0, 0)
     with pytest.warns(match="3 of 3 faces have no colour; drawn grey"):
-        assert colours_along_x(path) == [np.round(encode_srgb(GREY), 3).tolist()] * 3
+        assert colours_along_x(path) == [np.round(encode_scene_srgb(GREY), 3).tolist()] * 3
     mesh = trimesh.Trimesh(*cube()[:2], process=False)
     (tmp_path / "b.stl").write_bytes(mesh.export(file_type="stl_ascii").replace("solid", "SOLID two words", 1).encode())
     assert len(parts_of(tmp_path / "b.stl")[0].corners) == 12
@@ -457,7 +457,7 @@ def test_an_stl_that_starts_like_text_is_told_by_its_length(tmp_path: Path) -> N
 def test_colours_in_the_attributes_of_an_stl(tmp_path: Path) -> None:
     """Of both conventions: bit 15 says that there is one, and the reverse where the header has the whole's."""
     red, green = 31 << 10, 31 << 5
-    grey = np.round(encode_srgb(GREY), 3).tolist()
+    grey = np.round(encode_scene_srgb(GREY), 3).tolist()
     plain = write_stl(tmp_path / "a.stl", b"made by a scanner", 1 << 15 | red, red, 1 << 15 | green)
     assert colours_along_x(plain) == [[1, 0, 0], grey, [0, 1, 0]]
     whole = write_stl(tmp_path / "b.stl", b"COLOR=" + bytes([0, 0, 255, 255]) + b",MATERIAL=", red, 1 << 15, green)

@@ -18,9 +18,9 @@ from neuprim.core.data import Dataset
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import nonempty_text, validate_settings
-from neuprim.scenes.image_set import Progress, hash_settings
+from neuprim.scenes.image_set import Progress, hash_scene_settings
 from neuprim.scenes.raycast import Scene
-from neuprim.scenes.shading import DAYLIGHT, Daylight, daylight_radiance
+from neuprim.scenes.shading import DAYLIGHT, Daylight, scene_daylight_radiance
 from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, describe_solids_images
 from neuprim.tasks.static.mesh.gltf import read_gltf
 from neuprim.tasks.static.mesh.model import MeshFolder, Model, Up, find_model_file
@@ -74,7 +74,7 @@ def generate_mesh_images(
     progress(f"mesh: reading {path.name}", 0.0)
     model = MODEL_READERS[path.suffix.lower()](MeshFolder(path, settings.skip_missing))
     upward: Up = model.upward if settings.up == "auto" else settings.up
-    key = hash_settings(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
+    key = hash_scene_settings(replace(settings, path=Path(f"{path.name} {model.digest}"), up=upward), GENERATOR_VERSION)
     spacing = 2 * math.tan(FIELD_OF_VIEW / 2) / (settings.size * settings.supersampling)
 
     def build() -> Scene:
@@ -83,7 +83,9 @@ def generate_mesh_images(
     def facts(scene: MeshSurface) -> dict[str, Any]:
         return {"rendered_from": path.name, "scene_from_file": scene.scene_from_file.tolist()}
 
-    seen: Radiance = partial(daylight_radiance, light=LIGHT) if settings.shading == "daylight" else unlit_mesh_radiance
+    seen: Radiance = (
+        partial(scene_daylight_radiance, light=LIGHT) if settings.shading == "daylight" else unlit_mesh_radiance
+    )
     return describe_solids_images("mesh", key, settings, build, seen, facts).generate(cache_dir, progress)
 
 

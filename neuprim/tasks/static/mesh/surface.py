@@ -19,8 +19,8 @@ from neuprim.core.io.exr import MAX_PIXELS
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.notices import warn_once
 from neuprim.scenes.raycast import LIFT, Engine, Hits, Scene
-from neuprim.scenes.shading import dot
-from neuprim.scenes.shapes import Solid, corner_normals, parse_srgb, uniform_colour
+from neuprim.scenes.shading import shading_dot
+from neuprim.scenes.shapes import Solid, parse_solid_srgb, solid_corner_normals, uniform_colour
 from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
     MAX_PARTS,
@@ -33,7 +33,7 @@ from neuprim.tasks.static.mesh.model import (
     check_mesh_limits,
 )
 
-GREY = parse_srgb("#b4b4b4")  # of what the file says no colour of
+GREY = parse_solid_srgb("#b4b4b4")  # of what the file says no colour of
 _FARTHEST_UV = 1e6  # single precision has no fraction left there; coordinates beyond, or no numbers, are taken for 0
 
 
@@ -291,7 +291,7 @@ class MeshSurface(Scene):
         """As of any scene; normals are those of the visible side."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
-        side = np.where(dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
+        side = np.where(shading_dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
         albedo = self._base.sample_colours(hits.triangle, hits.weight, hits.distance)[:, :3]
         emission = (
             None if self._glow is None else self._glow.sample_colours(hits.triangle, hits.weight, hits.distance)[:, :3]
@@ -312,7 +312,7 @@ class MeshSurface(Scene):
         if not self._holes:
             return triangle, u, v, distance
         passing = np.flatnonzero(triangle >= 0)
-        step = np.float32(LIFT) / np.sqrt(dot(d, d))
+        step = np.float32(LIFT) / np.sqrt(shading_dot(d, d))
         for _ in range(_MAX_HOLES):
             passing = passing[self._is_hole(triangle[passing], u[passing], v[passing], distance[passing])]
             if not len(passing):
@@ -416,4 +416,4 @@ def _smooth_normals(
         unit = given / length
     unit *= np.where(np.einsum("fkc,fc->fk", unit, across) < 0, -1.0, 1.0)[:, :, None]
     usable = np.isfinite(unit).all(axis=2) & (length[..., 0] > 0)
-    return unit if usable.all() else np.where(usable[..., None], unit, corner_normals(mesh))
+    return unit if usable.all() else np.where(usable[..., None], unit, solid_corner_normals(mesh))

@@ -74,7 +74,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         for title, made in (
             ("harmonics", sh_warp._harmonic_kernels(3)),
             ("Adam", kernels_warp.adam_kernels()),
-            ("SSIM", kernels_warp.ssim_kernels()),
+            ("SSIM", kernels_warp.ssim_loss_kernels()),
             ("grid", (density_grid_warp._density_grid_kernel(),)),
             ("rays of volumes", (raymarch_warp._march_image_kernel(), raymarch_warp._march_depth_kernel())),
         ):

@@ -23,7 +23,7 @@ from neuprim.core.model.schema import ParameterSpec
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.render.backends import REFERENCE
 from neuprim.core.task import TaskSpec
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings, loss_settings
@@ -126,7 +126,7 @@ class TaskUnderTest:
     def initial_model(self, seed: int = 0) -> Primitives:
         """Return a model as a run starts with."""
         density, colour = self.build_fields()
-        return initial_model(density, colour, self.dataset, self.settings.model, seed)
+        return initial_model_to_train(density, colour, self.dataset, self.settings.model, seed)
 
     def perturbed_model(self, dtype: torch.dtype = torch.float64) -> Primitives:
         """Return a model whose parameters differ enough that nothing is zero or equal by chance."""

@@ -26,7 +26,7 @@ from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
 from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
 from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.used_settings import build_settings, loss_settings
@@ -290,7 +290,7 @@ def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup
     with attribute_errors(source):
         check_fields(density, colour, dataset)
     settings = replace(config.model, primitives=_starting_count_of_run(config))
-    model = initial_model(density, colour, dataset, settings, config.seed)
+    model = initial_model_to_train(density, colour, dataset, settings, config.seed)
     population = config.train.population
     if population.grow_to is None:
         population = replace(population, grow_to=config.model.primitives)

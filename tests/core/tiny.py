@@ -22,7 +22,7 @@ from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
 from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
@@ -98,7 +98,9 @@ def trainer(
         **{"strategy": "fixed", "every": 7, "start": 0.0, "stop": 1.0, **changes.pop("population", {})}
     )
     settings = TrainSettings(iterations=iterations, **changes, population=population)
-    model = initial_model(CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed)
+    model = initial_model_to_train(
+        CosineDensity(4), SphericalHarmonics(1, 3, 0.25), dataset, ModelSettings(primitives=12), seed
+    )
     parts = model, dataset, photometric({"ssim_weight": settings.ssim_weight}), settings, RenderSettings(), seed
     return Trainer(*parts) if group is None else DistributedTrainer(*parts, group)
 

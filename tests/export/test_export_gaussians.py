@@ -19,7 +19,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import ModelSettings
 from neuprim.export import shared
 from neuprim.export.gaussian_ply import LAYOUT, SIZES, Gaussians, draw_exported_gaussians, fit_gaussians
@@ -154,7 +154,7 @@ def test_what_it_wrote_starts_a_model_where_it_was(tmp_path: Path) -> None:
     path = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "size=moments"]).files[0]
     field = load_task("static").fields["SphericalHarmonics"](degree=1)  # type: ignore[index]
     settings = ModelSettings(primitives=9, init={"points": str(path)})
-    fresh = initial_model(CosineDensity(3), field, tiny.two_primitives(), settings, 0)  # type: ignore[arg-type]
+    fresh = initial_model_to_train(CosineDensity(3), field, tiny.two_primitives(), settings, 0)  # type: ignore[arg-type]
     assert torch.allclose(fresh.params["means"], marked.PLACES, atol=0.01)
     support, _ = CosineDensity(3).from_gaussians(
         torch.full((len(marked.RADII),), 0.99)

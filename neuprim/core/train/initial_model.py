@@ -23,7 +23,7 @@ _USUAL_OPACITY = 0.5
 """Of Gaussians that say how large they are, but not how opaque."""
 
 
-def initial_model(
+def initial_model_to_train(
     density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int
 ) -> Primitives:
     """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3
@@ -49,7 +49,7 @@ def initial_model(
         cloud = draw_points(points, settings.primitives, generator)
     elif where in ("matter", "box"):
         cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
-        cloud = _add_surroundings(cloud, dataset, settings, generator)
+        cloud = _add_initial_surroundings(cloud, dataset, settings, generator)
     else:
         raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
     check_points(cloud, settings.primitives, dataset)
@@ -84,7 +84,7 @@ def initial_model(
     return Primitives.initialise(density, colour, context)
 
 
-def _add_surroundings(
+def _add_initial_surroundings(
     cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator
 ) -> PointCloud:
     """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""

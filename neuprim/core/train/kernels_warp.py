@@ -39,7 +39,7 @@ _STEP_CODE = """
 
 
 @wp.func_native(_FINITE_CODE)
-def _finite(grad: wp.uint64, i: wp.int64) -> int: ...
+def _finite_gradient(grad: wp.uint64, i: wp.int64) -> int: ...
 
 
 @wp.func_native(_STEP_CODE)
@@ -60,7 +60,7 @@ def adam_kernels() -> tuple[Any, Any]:
         while n >= ends[k]:
             begin = ends[k]
             k += 1
-        if _finite(grads[k], n - begin) == 0:
+        if _finite_gradient(grads[k], n - begin) == 0:
             bad[0] = 1  # whichever thread writes it
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
@@ -135,7 +135,7 @@ _C1, _C2 = wp.constant(0.01**2), wp.constant(0.03**2)
 
 
 @functools.cache
-def ssim_kernels() -> tuple[Any, Any, Any, Any]:
+def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def along_rows(
         a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)
@@ -211,7 +211,7 @@ def ssim_kernels() -> tuple[Any, Any, Any, Any]:
     return along_rows, compare, back_along_columns, gradient
 
 
-def ssim_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
     weight (1 - SSIM).
 
@@ -228,7 +228,7 @@ def ssim_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[
     )
     window = _Window(*SSIM_WINDOW)
     first, second = array(a, wp.float32), array(b, wp.float32)
-    along_rows, compare, back_along_columns, gradient = ssim_kernels()
+    along_rows, compare, back_along_columns, gradient = ssim_loss_kernels()
     launch_kernel(along_rows, (H, w, C), (first, second, window, array(rows, _vec5)), device)
     launch_kernel(compare, (h, w, C), (array(rows, _vec5), window, array(S, wp.float32), array(maps, wp.vec3)), device)
     launch_kernel(back_along_columns, (H, w, C), (array(maps, wp.vec3), window, array(columns, wp.vec3)), device)

@@ -60,10 +60,10 @@ class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
         if device.on_numba(rendered):
-            from neuprim.core.train.ssim_cpu import ssim_with_gradient
+            from neuprim.core.train.ssim_cpu import ssim_loss_with_gradient
         else:
-            from neuprim.core.train.kernels_warp import ssim_with_gradient
-        means, grad = ssim_with_gradient(rendered.detach(), truth.detach(), weight)
+            from neuprim.core.train.kernels_warp import ssim_loss_with_gradient
+        means, grad = ssim_loss_with_gradient(rendered.detach(), truth.detach(), weight)
         parts["l1"], parts["ssim"] = means.tolist()
         ctx.save_for_backward(grad)
         return ((1 - weight) * means[0] + weight * (1 - means[1])).float()
@@ -95,7 +95,7 @@ def l1(settings: Mapping[str, Any]) -> Loss:
     return _image_loss("l1", lambda rendered, truth: (rendered - truth).abs().mean())
 
 
-def compressed(settings: Mapping[str, Any]) -> Loss:
+def compressed_loss(settings: Mapping[str, Any]) -> Loss:
     """L1 of log(1 + mu x) / log(1 + mu), mu = 16: shadows count more, highlights less."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
@@ -106,7 +106,7 @@ def compressed(settings: Mapping[str, Any]) -> Loss:
     return _image_loss("compressed", measure)
 
 
-def relative(settings: Mapping[str, Any]) -> Loss:
+def relative_loss(settings: Mapping[str, Any]) -> Loss:
     """Squared error over the squared rendered value, which carries no gradient (Mildenhall et al. 2022, RawNeRF)."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
@@ -127,7 +127,7 @@ def _image_loss(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:
 
 
 @dataclass(frozen=True)
-class PointResult:
+class PointLossResult:
     """One frame's points, evaluated and compared.
 
     Attributes:
@@ -151,7 +151,7 @@ class PointResult:
 
 def point_loss(
     model: Primitives, dataset: Dataset, samples: PointSamples, settings: TrainSettings, threads: int = 0
-) -> PointResult:
+) -> PointLossResult:
     """Compare a model with known extinction and source radiance at points.
 
     The loss is the mean square of errors over their scale: the extinction's, plus a small share of each of its
@@ -174,7 +174,7 @@ def point_loss(
             loss = loss + _COMPONENT_WEIGHT * part
     peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
     psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))
-    return PointResult(loss, parts, psnr, samples.name, found.rows, found.request_shares(wrong.detach().abs()))
+    return PointLossResult(loss, parts, psnr, samples.name, found.rows, found.request_shares(wrong.detach().abs()))
 
 
 # ---------------------------------------------------------------- sizes

@@ -61,7 +61,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 
 @exact_kernel
-def _largest_gradient_bits(x):  # type: ignore[no-untyped-def]
+def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
     """The largest of float32 numbers' bits without their signs: those of infinity or more where one is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
@@ -72,7 +72,7 @@ def _largest_gradient_bits(x):  # type: ignore[no-untyped-def]
 
 def _all_gradients_finite(gradients: list[Tensor]) -> bool:
     if all(device.on_numba(g) and g.dtype == torch.float32 for g in gradients):
-        return all(_largest_gradient_bits(g.contiguous().reshape(-1).numpy()) < _INFINITY for g in gradients)
+        return all(_largest_gradient_bits_of_step(g.contiguous().reshape(-1).numpy()) < _INFINITY for g in gradients)
     # one wait for the GPU; the largest of a NaN and anything is a NaN
     return bool(torch.isfinite(torch.stack([torch.linalg.vector_norm(g, torch.inf).double() for g in gradients])).all())
 

@@ -35,7 +35,7 @@ _MIN_GROWTHS = 3
 """Shares of the time between ``start`` and ``stop``: primitives are born at least between these."""
 
 
-def split_primitives(
+def split_population(
     model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float
 ) -> dict[str, Tensor]:
     """Make two children per parent, all first ones then all second ones, each carrying its parent's fields unchanged.
@@ -189,7 +189,7 @@ class RelocatePopulation(Population):
             return None
         new = torch.arange(count, count + births, device=weight.device)
         text = ", ".join(f"{what} {number}" for what, number in (("moved", moves), ("grew by", births)) if number)
-        return _split_into_rows(model, parents, torch.cat([idle, new]), births, text)
+        return _split_population_into_rows(model, parents, torch.cat([idle, new]), births, text)
 
     def _count_births(self, count: int) -> int:
         """How many primitives to add, by the same factor in each of the remaining interventions."""
@@ -207,10 +207,12 @@ class RelocatePopulation(Population):
         self.error = state["error"].clone() if "error" in state else None
 
 
-def _split_into_rows(model: Primitives, parents: Tensor, others: Tensor, births: int, text: str) -> PopulationChange:
+def _split_population_into_rows(
+    model: Primitives, parents: Tensor, others: Tensor, births: int, text: str
+) -> PopulationChange:
     """Split ``parents`` (P,): first children take their parents' rows, second ones the rows ``others`` (P,), of which
     the last ``births`` are new."""
-    children = split_primitives(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
+    children = split_population(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
     rows = torch.cat([parents, others])
     origin = torch.arange(model.count + births, device=parents.device)
     origin[others] = parents
@@ -277,7 +279,7 @@ class GradientPopulation(Population):
         position[kept] = torch.arange(len(kept), device=model.device)
         for name, value in halved.items():
             params[name][position[clones]] = value
-        children = split_primitives(model, splits, SPLIT_SHIFT, SPLIT_GAUSSIAN, SPLIT_GAUSSIAN)
+        children = split_population(model, splits, SPLIT_SHIFT, SPLIT_GAUSSIAN, SPLIT_GAUSSIAN)
         params = {n: torch.cat([params[n], copies[n], children[n]]) for n in params}
         origin = torch.cat([kept, clones, splits, splits])
         fresh = torch.zeros_like(origin, dtype=torch.bool)

@@ -14,7 +14,7 @@ Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
 NotNegative = Annotated[float, Range(at_least=0)]
 
 
-def _are_reductions(words: list[Any]) -> bool:
+def _are_training_reductions(words: list[Any]) -> bool:
     return all(isinstance(word, str) and re.fullmatch(r"(density|colour)\.\w+=\d{1,4}", word) for word in words)
 
 
@@ -41,9 +41,9 @@ class ModelSettings:
     sh_degree: Annotated[int, Range(0, 3)] = 3
     sh_every: Annotated[float, Range(at_least=0, says="a fraction of the budget, 0 for all bands at once")] = 0.1
     init: dict[str, Any] = field(default_factory=dict)
-    reduced: Annotated[list, Accepts(_are_reductions, "a list such as [density.neurons=0, colour.degree=1]")] = field(
-        default_factory=list
-    )
+    reduced: Annotated[
+        list, Accepts(_are_training_reductions, "a list such as [density.neurons=0, colour.degree=1]")
+    ] = field(default_factory=list)
 
     def __post_init__(self) -> None:
         validate_fields(self, "model")

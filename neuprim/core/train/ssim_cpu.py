@@ -34,7 +34,7 @@ _C1, _C2 = f(0.01**2), f(0.03**2)
 
 
 @inline
-def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
+def _vertical_loss_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
     """Blurs over 11 rows of flat images from position ``at``: x, y, xx, yy, xy, sums kept in registers."""
     for j in range(count):
         s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
@@ -51,7 +51,7 @@ def _vertical_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def
 
 
 @inline
-def _blur_columns(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
+def _blur_loss_columns(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
         for k in range(SSIM_TAPS):
@@ -60,7 +60,7 @@ def _blur_columns(V, g, at, pitch, count):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _blur_rows(out, V, step, count):  # type: ignore[no-untyped-def]
+def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
     for j in range(count):
         s = f(0)
         for k in range(SSIM_TAPS):
@@ -69,7 +69,7 @@ def _blur_rows(out, V, step, count):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _ssim_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
+def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
     """In place on blocks E[x], E[y], E[xx], E[yy], E[xy]: derivatives of scale x SSIM for E[x], E[xx], E[xy]; returns
     the sum of SSIM."""
     total = f(0)
@@ -89,7 +89,7 @@ def _ssim_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _ssim_maps(start, stop, x, y, height, channels, maps):  # type: ignore[no-untyped-def]
+def _ssim_loss_maps(start, stop, x, y, height, channels, maps):  # type: ignore[no-untyped-def]
     """Window rows start:stop: derivative maps of the mean SSIM; returns the sum of SSIM over them.
 
     x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
@@ -104,10 +104,10 @@ def _ssim_maps(start, stop, x, y, height, channels, maps):  # type: ignore[no-un
     for r in range(start, stop):
         for j0 in range(0, m, _BLOCK):
             size = min(_BLOCK, m - j0)
-            _vertical_moments(V, x, y, r * n + j0, n, size + reach)
+            _vertical_loss_moments(V, x, y, r * n + j0, n, size + reach)
             for q in range(5):
-                _blur_rows(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
-            total += _ssim_derivatives(s, size, scale)
+                _blur_loss_rows(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
+            total += _ssim_loss_derivatives(s, size, scale)
             for q, block in enumerate((_EX, _EXX, _EXY)):
                 row = maps[q, r + SSIM_TAPS - 1]
                 row[reach + j0 : reach + j0 + size] = s[block : block + size]
@@ -128,7 +128,7 @@ def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped
 
 
 @kernel
-def _spread_gradient(start, stop, x, y, height, channels, maps, weight, grad):  # type: ignore[no-untyped-def]
+def _spread_loss_gradient(start, stop, x, y, height, channels, maps, weight, grad):  # type: ignore[no-untyped-def]
     """Image rows start:stop of d loss / d x, the adjoint of the blur; returns the sum of |x - y|."""
     n = x.shape[0] // height
     pitch = maps.shape[2]
@@ -141,8 +141,10 @@ def _spread_gradient(start, stop, x, y, height, channels, maps, weight, grad):  
         for j0 in range(0, n, _BLOCK):
             size = min(_BLOCK, n - j0)
             for q in range(3):
-                _blur_columns(V, maps[q].reshape(-1), i * pitch + j0, pitch, size + reach)  # the window is symmetric
-                _blur_rows(s[q * _BLOCK :], V, channels, size)
+                _blur_loss_columns(
+                    V, maps[q].reshape(-1), i * pitch + j0, pitch, size + reach
+                )  # the window is symmetric
+                _blur_loss_rows(s[q * _BLOCK :], V, channels, size)
             at = i * n + j0
             total += _loss_gradient(grad[at:], x[at:], y[at:], s, size, l1_share, weight)
     return total
@@ -151,7 +153,7 @@ def _spread_gradient(start, stop, x, y, height, channels, maps, weight, grad):  
 _buffers = threading.local()
 
 
-def _bordered_maps(rows: int, columns: int) -> Any:
+def _bordered_loss_maps(rows: int, columns: int) -> Any:
     """Three maps with a zero border, reused by the next image of the same size in this thread."""
     maps = getattr(_buffers, "maps", None)
     if maps is None or maps.shape != (3, rows, columns):
@@ -159,7 +161,7 @@ def _bordered_maps(rows: int, columns: int) -> Any:
     return maps
 
 
-def ssim_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
+def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
     """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
     weight (1 - SSIM).
 
@@ -169,8 +171,8 @@ def ssim_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[
     H, W, C = rendered.shape
     x, y = (np.ascontiguousarray(image.numpy()).reshape(-1) for image in (rendered, truth))
     windows, m = H - SSIM_TAPS + 1, (W - SSIM_TAPS + 1) * C
-    maps = _bordered_maps(windows + 20, m + 20 * C)
-    ssim = sum(parallel_for(_ssim_maps, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
+    maps = _bordered_loss_maps(windows + 20, m + 20 * C)
+    ssim = sum(parallel_for(_ssim_loss_maps, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
     grad = np.empty(x.size, np.float32)
-    l1 = sum(parallel_for(_spread_gradient, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
+    l1 = sum(parallel_for(_spread_loss_gradient, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
     return torch.tensor([l1, ssim], dtype=torch.float64), torch.from_numpy(grad).reshape(H, W, C)

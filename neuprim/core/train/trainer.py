@@ -28,12 +28,12 @@ from neuprim.core.render.backends import best_render_backend_device
 from neuprim.core.render.near_plane import near_plane_extent, resolve_near
 from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
-from neuprim.core.train.losses import MaxScreenSize, PointResult, point_loss, scale_anisotropy
+from neuprim.core.train.losses import MaxScreenSize, PointLossResult, point_loss, scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.population import PopulationChange, make_population
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.train.trainer_state import check_state, hash_view_names, select_state_tensors
-from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_view, resolution_factor
+from neuprim.core.train.trainer_state import check_state, hash_training_views, select_state_tensors
+from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_training_view, resolution_factor
 
 MIN_COOLDOWN = 0.02
 """Smallest factor of the learning rates in a cool-down."""
@@ -124,7 +124,7 @@ class Trainer:
         seed: int,
     ) -> None:
         train = dataset.train
-        settings = _check_settings(settings, model, dataset)
+        settings = _check_training_settings(settings, model, dataset)
         cameras = [train.view(i).camera for i in range(len(train))]
         self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
@@ -202,7 +202,7 @@ class Trainer:
             tasks, samples = self._draw_views(), self._draw_points()
 
             # Add up losses and gradients, view by view. Points and regularisers join the last view.
-            points: PointResult | None = None
+            points: PointLossResult | None = None
             results, each = list[ViewResult](), list[Contributions]()
             for number, task in enumerate(tasks, start=1):
                 view = self._render_view(task, progress)
@@ -218,7 +218,7 @@ class Trainer:
                 del view, loss  # free what autograd saved before the next view is rendered
             if tasks:
                 results, contributions = self._combine_views(results, each, start)
-                cost, parts, psnr, name = _summarize_views(results)
+                cost, parts, psnr, name = _summarize_training_views(results)
             else:
                 assert samples is not None, "a step without views has points"
                 points = self._compare_points(samples)
@@ -327,7 +327,7 @@ class Trainer:
         index, settings = task.view, self.settings
         pixels = self._load_pixels(index) if self.prefetcher is None else self.prefetcher.take(index, task.upcoming)
         factor = resolution_factor(progress, settings.coarse, settings.coarse_until)
-        view, pixels = reduce_view(self.dataset.train.view(index), pixels, factor)
+        view, pixels = reduce_training_view(self.dataset.train.view(index), pixels, factor)
         background = task.background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
@@ -346,10 +346,10 @@ class Trainer:
         psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
         return _RenderedView(loss, parts, psnr, view.name, truth, contributions)
 
-    def _compare_points(self, samples: PointSamples) -> PointResult:
+    def _compare_points(self, samples: PointSamples) -> PointLossResult:
         return point_loss(self._quantized_model(), self.dataset, samples, self.settings, self.renderer.threads)
 
-    def _total_loss(self, loss: Tensor | None, points: PointResult | None) -> Tensor:
+    def _total_loss(self, loss: Tensor | None, points: PointLossResult | None) -> Tensor:
         """Add the losses of points and regularisers to that of the views, if there are views."""
         if points is not None:
             loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
@@ -358,7 +358,7 @@ class Trainer:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
         return loss
 
-    def _backward(self, loss: Tensor, view: _RenderedView | None, points: PointResult | None) -> float:
+    def _backward(self, loss: Tensor, view: _RenderedView | None, points: PointLossResult | None) -> float:
         """Add the gradients of ``loss`` to the parameters'; returns its value.
 
         Raises:
@@ -397,7 +397,7 @@ class Trainer:
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
         train = self.dataset.train
-        header = {"step": self.step, "elapsed": self.elapsed, "views": len(train), "names": hash_view_names(train)}
+        header = {"step": self.step, "elapsed": self.elapsed, "views": len(train), "names": hash_training_views(train)}
         return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
@@ -420,7 +420,7 @@ class Trainer:
         self._require_grad()
 
 
-def _check_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
+def _check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
     """Refuse settings that do not fit the model and the data; returns them with ``train.supervision`` decided."""
     if len(dataset.train) == 0:
         raise DataError(f"{dataset.name}: the training split is empty")
@@ -443,7 +443,7 @@ def _check_settings(settings: TrainSettings, model: Primitives, dataset: Dataset
     return settings
 
 
-def _summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
+def _summarize_training_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
     """Loss, mean parts, mean PSNR and name of a step, from its views in their order."""
     last, count = views[-1], len(views)
     parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}

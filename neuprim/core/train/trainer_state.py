@@ -14,7 +14,7 @@ from neuprim.core.data import ViewSet
 from neuprim.core.errors import CheckpointError
 
 
-def hash_view_names(views: ViewSet) -> str:
+def hash_training_views(views: ViewSet) -> str:
     """Hash the names of views: other frames or images of the same number are other data."""
     text = "\n".join(views.view(i).name for i in range(len(views)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]

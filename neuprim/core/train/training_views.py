@@ -62,7 +62,7 @@ def resolution_factor(progress: float, coarse: int, until: float) -> int:
     return coarse >> min(int(progress / until * stages), stages)
 
 
-def reduce_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
+def reduce_training_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
     """Average a view over blocks of ``factor`` x ``factor`` pixels; the remainder at the right and bottom is cut off.
 
     Colours are premultiplied, so the mean is what a camera with larger pixels sees. A large pixel is valid where all

@@ -18,7 +18,7 @@ from neuprim.core.data.dataset_check import DatasetError, check_dataset_views, c
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import ModelSettings
 from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
@@ -163,7 +163,7 @@ def test_starting_points(text: str) -> None:
     assert text in str(caught.value)
     data = replace(data, start=lambda views, count, generator: cloud)
     with pytest.raises(DatasetError, match="starting points"):  # where a run asks for them
-        initial_model(CosineDensity(1), SphericalHarmonics(0, 3), data, ModelSettings(primitives=6), 0)
+        initial_model_to_train(CosineDensity(1), SphericalHarmonics(0, 3), data, ModelSettings(primitives=6), 0)
 
 
 def test_an_orbit_has_every_condition_of_the_training_views() -> None:

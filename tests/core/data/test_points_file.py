@@ -18,7 +18,7 @@ from neuprim.core.model.colours import sh
 from neuprim.core.model.densities.cosine import CosineDensity, gaussian_support
 from neuprim.core.model.edge import EDGES
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import ModelSettings
 from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
@@ -26,7 +26,9 @@ from tests.core import tiny
 
 def fresh(path: Path | str, primitives: int = 50, edge: int = 0, **init: object) -> Primitives:
     settings = ModelSettings(primitives=primitives, init={"points": str(path), **init})
-    return initial_model(CosineDensity(4, edge=edge), SphericalHarmonics(1), tiny.two_primitives(), settings, 0)
+    return initial_model_to_train(
+        CosineDensity(4, edge=edge), SphericalHarmonics(1), tiny.two_primitives(), settings, 0
+    )
 
 
 def splats(path: Path, **changes: float) -> Path:

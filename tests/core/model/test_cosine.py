@@ -16,7 +16,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.reference.backend import pixel_ray_directions
-from neuprim.core.train.population import split_primitives
+from neuprim.core.train.population import split_population
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 
@@ -103,7 +103,7 @@ def test_split_carries_sigma(dtype: torch.dtype, bound: float, neurons: int, fac
     """Relative to S/m = (|b2| + sum |w2|)/m, the largest density the primitive can have."""
     t = scenes.tensors(40, neurons, seed=1, dtype=dtype)
     parents = torch.arange(40)
-    children = split_primitives(model(t), parents, 0.5, *factors)
+    children = split_population(model(t), parents, 0.5, *factors)
     child = geometry(children)
     rows, x = points_inside(child, 20)
     before, after = sigma_at(t, rows % 40, x), sigma_at(children, rows, x)

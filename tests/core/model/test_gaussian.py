@@ -20,7 +20,7 @@ from neuprim.core.model.fields import CustomDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.core.train.population import split_primitives
+from neuprim.core.train.population import split_population
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 from tests.core import tiny
@@ -159,7 +159,7 @@ def test_parameters_and_start() -> None:
 @pytest.mark.parametrize("factors", [(0.6, 0.9), (1 / 1.6, 1 / 1.6)])
 def test_split_keeps_the_mass_of_the_pair(factors: tuple[float, float]) -> None:
     m = model()
-    children = split_primitives(m, torch.arange(20), 0.5, *factors)
+    children = split_population(m, torch.arange(20), 0.5, *factors)
     pair = mass(children)[:20] + mass(children)[20:]
     before = mass({k: v.detach() for k, v in m.params.items()})
     assert torch.allclose(pair, before, rtol=1e-12, atol=0)

@@ -16,7 +16,7 @@ from neuprim.core.data import Dataset, Pixels, PointCloud, ViewSet
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
@@ -71,7 +71,7 @@ def abused(abuse: str, steps: int, primitives: int = 500) -> Trainer:
     population = PopulationSettings(strategy="relocate", every=50, start=0.0, stop=1.0)
     rates: dict[str, float] = {}
     density, colour = CosineDensity(8), SphericalHarmonics(3, 3, 0.1)
-    model = initial_model(density, colour, dataset, ModelSettings(primitives=primitives), 0)
+    model = initial_model_to_train(density, colour, dataset, ModelSettings(primitives=primitives), 0)
     if abuse == "rates times ten":
         rates = {s.name: 10 * s.lr for s in model.specs}
     settings = TrainSettings(iterations=steps, rates=rates, population=population)

@@ -12,7 +12,7 @@ from neuprim.core.train.optimizer import adam_step_reference
 
 pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
 
-from neuprim.core.train.kernels_warp import LAUNCH_PARAMETERS, adam_rows, ssim_with_gradient
+from neuprim.core.train.kernels_warp import LAUNCH_PARAMETERS, adam_rows, ssim_loss_with_gradient
 
 BETAS = (0.9, 0.999)
 ROWS = 23
@@ -68,7 +68,7 @@ def test_similarity_and_its_gradient_are_those_of_float64(shape: tuple[int, int,
     generator = torch.Generator().manual_seed(2)
     truth = torch.rand(*shape, generator=generator)
     rendered = (0.7 * truth + 0.3 * torch.rand(*shape, generator=generator)).requires_grad_()
-    means, grad = ssim_with_gradient(rendered, truth, 0.2)
+    means, grad = ssim_loss_with_gradient(rendered, truth, 0.2)
     exact = rendered.detach().double().requires_grad_()
     loss, parts = photometric_reference(exact, truth.double(), 0.2)
     loss.backward()
@@ -79,6 +79,6 @@ def test_similarity_and_its_gradient_are_those_of_float64(shape: tuple[int, int,
 
 def test_similarity_of_equal_images_pulls_nowhere() -> None:
     truth = torch.rand(20, 20, 3, generator=torch.Generator().manual_seed(3))
-    means, grad = ssim_with_gradient(truth, truth, 0.2)
+    means, grad = ssim_loss_with_gradient(truth, truth, 0.2)
     assert means.tolist() == pytest.approx([0.0, 1.0], abs=1e-6)
     assert float(grad.abs().max()) < 1e-7

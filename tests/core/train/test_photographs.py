@@ -15,7 +15,7 @@ from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.train import training_views
 from neuprim.core.train.losses import MaxScreenSize
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.train.training_views import Exposures, reduce_view, resolution_factor
+from neuprim.core.train.training_views import Exposures, reduce_training_view, resolution_factor
 from tests.core import tiny
 
 
@@ -59,7 +59,7 @@ def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
     height, width = pixels.rgb.shape[:2]
     mask = torch.ones(height, width, dtype=torch.bool)
     mask[1, 0] = False
-    small, rough = reduce_view(view, replace(pixels, mask=mask), 2)
+    small, rough = reduce_training_view(view, replace(pixels, mask=mask), 2)
     assert rough.rgb.shape == (height // 2, width // 2, 3) == (small.camera.height, small.camera.width, 3)
     assert torch.allclose(rough.rgb[3, 5], pixels.rgb[6:8, 10:12].mean((0, 1)), atol=1e-6)
     if pixels.alpha is not None and rough.alpha is not None:
@@ -72,7 +72,7 @@ def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
 
 def test_a_view_is_never_reduced_to_nothing(plain: Dataset) -> None:
     view, pixels = plain.train.view(0), plain.train.pixels(0)
-    small, few = reduce_view(view, pixels, 1024)
+    small, few = reduce_training_view(view, pixels, 1024)
     assert 4 <= small.camera.width < 8 and few.rgb.shape[1] == small.camera.width
 
 

@@ -22,7 +22,7 @@ from neuprim.core.train.population import (
     GradientPopulation,
     RelocatePopulation,
     make_population,
-    split_primitives,
+    split_population,
 )
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.static import SphericalHarmonics
@@ -86,7 +86,7 @@ def test_children_cover_what_is_said_of_them(
 ) -> None:
     """Shares of the parent's volume: in a child, in both, and of the children's own volumes together."""
     m = model(4)
-    children = split_primitives(m, torch.arange(4), SPLIT_SHIFT, *factors)
+    children = split_population(m, torch.arange(4), SPLIT_SHIFT, *factors)
     g = Geometry(children["means"], children["log_scales"], children["quats"])
     ball = 2 * torch.rand(200_000, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 1
     ball = ball[ball.norm(dim=1) < 1]

@@ -20,7 +20,7 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import Contributions
 from neuprim.core.task import Supervision
-from neuprim.core.train.initial_model import initial_model
+from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.population import FixedPopulation
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import MIN_COOLDOWN, StepReport, Trainer
@@ -323,12 +323,14 @@ def test_empty_splits_and_no_points(plain: Dataset) -> None:
         dataset, start=lambda views, count, generator: tiny.PointCloud(torch.zeros(0, 3), torch.zeros(0, 3))
     )
     with pytest.raises(DataError, match="two: no starting points"):
-        initial_model(model.density, model.colour, nowhere, ModelSettings(), 0)
+        initial_model_to_train(model.density, model.colour, nowhere, ModelSettings(), 0)
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 def test_few_points_still_make_a_model(plain: Dataset, count: int) -> None:
-    model = initial_model(tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=count), 0)
+    model = initial_model_to_train(
+        tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=count), 0
+    )
     assert model.count == count
     assert bool(torch.isfinite(model.geometry.scales).all()) and model.geometry.scales.min() > 0
 
@@ -344,7 +346,7 @@ def test_few_points_still_make_a_model(plain: Dataset, count: int) -> None:
 )
 def test_impossible_starting_values_name_their_key(plain: Dataset, key: str, value: object, expected: str) -> None:
     with pytest.raises(ConfigError, match=rf"model\.init\.{key}={value}: expected .*{expected}"):
-        initial_model(
+        initial_model_to_train(
             tiny.CosineDensity(2), tiny.SphericalHarmonics(0), plain, ModelSettings(primitives=5, init={key: value}), 0
         )
 

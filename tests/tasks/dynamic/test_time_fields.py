@@ -17,7 +17,7 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import Contributions
-from neuprim.core.train.population import RelocatePopulation, split_primitives
+from neuprim.core.train.population import RelocatePopulation, split_population
 from neuprim.core.train.settings import PopulationSettings
 from neuprim.tasks.dynamic import TASK, invisible_fraction_over_time
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
@@ -179,7 +179,7 @@ def test_colour_follows_equations_10_to_12() -> None:
 def test_a_split_carries_the_field_at_all_times(time: str) -> None:
     m = model(time)
     parents = torch.arange(0, COUNT, 3)
-    children = split_primitives(m, parents, 0.5, 0.6, 0.9)
+    children = split_population(m, parents, 0.5, 0.6, 0.9)
     rows = torch.arange(2 * len(parents))
     for t in (0.0, 0.37, 1.0):
         own = {s.name: children[s.name] for s in m.density.parameters()}
@@ -194,7 +194,7 @@ def test_a_window_divides_into_halves_that_stay_on_its_path() -> None:
     m = model("window+motion", divide_above=0.3)
     parents = torch.arange(COUNT)
     tau = m.params["log_window"].detach().exp()[:, 0]
-    children = split_primitives(m, parents, 0.5, 0.6, 0.9)
+    children = split_population(m, parents, 0.5, 0.6, 0.9)
     long = tau > 0.3
     assert bool(long.any()) and not bool(long.all())
     for half, sign in ((0, -0.5), (COUNT, 0.5)):

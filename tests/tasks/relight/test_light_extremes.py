@@ -15,8 +15,8 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.fields import RayNet
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.train.initial_model import initial_model
-from neuprim.core.train.losses import compressed, l1, relative
+from neuprim.core.train.initial_model import initial_model_to_train
+from neuprim.core.train.losses import compressed_loss, l1, relative_loss
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork, normalize_direction
@@ -24,7 +24,7 @@ from tests import scenes
 from tests.core import tiny
 from tests.numerics.equivalence import row_errors, undecided, weights
 
-LOSSES = {"l1": l1, "compressed": compressed, "relative": relative}
+LOSSES = {"l1": l1, "compressed": compressed_loss, "relative": relative_loss}
 COUNT = 20
 UNSHADOWED, SHADOWED = "none", "pixel"  # LightNetwork's ``visibility``
 
@@ -183,7 +183,9 @@ def fit(
 ) -> tuple[Trainer, list[float]]:
     dataset = tiny.two_primitives(train=Lit(6, 0.0, change, intensity), background=torch.zeros(3), color_space="linear")
     field = LightNetwork(3, visibility=UNSHADOWED)
-    first = start or initial_model(CosineDensity(2), field, dataset, ModelSettings(primitives=12, neurons=2), 0)
+    first = start or initial_model_to_train(
+        CosineDensity(2), field, dataset, ModelSettings(primitives=12, neurons=2), 0
+    )
     settings = TrainSettings(iterations=iterations, population=PopulationSettings(strategy="fixed"))
     trainer = Trainer(first, dataset, LOSSES[loss]({}), settings, RenderSettings(backend="reference"), 0)
     return trainer, [report.loss for report in trainer.run()]

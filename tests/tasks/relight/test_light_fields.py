@@ -16,7 +16,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.core.train.population import split_primitives
+from neuprim.core.train.population import split_population
 from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_light_harmonics
 from neuprim.tasks.relight.lighting import parse_light_intensities, parse_light_positions
@@ -67,7 +67,7 @@ def test_a_split_carries_the_colour(form: str) -> None:
     field = LightNetwork(4, form=form, visibility="none")
     m = model(field)
     parents = torch.arange(COUNT)
-    children = split_primitives(m, parents, 0.5, 0.6, 0.9)
+    children = split_population(m, parents, 0.5, 0.6, 0.9)
     whole = {k: v.detach() for k, v in m.params.items()}
     for half in (slice(0, COUNT), slice(COUNT, 2 * COUNT)):
         child = {k: v[half] for k, v in children.items()}

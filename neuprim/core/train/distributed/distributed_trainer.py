@@ -24,7 +24,7 @@ from neuprim.core.task import Loss
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
-from neuprim.core.train.trainer_state import hash_view_names
+from neuprim.core.train.trainer_state import hash_training_views
 
 _ALIGNMENT = 16
 """Numbers; tensors start at multiples of 64 bytes, which vector units read at once."""
@@ -92,7 +92,7 @@ class DistributedTrainer(Trainer):
         settings = hashlib.sha256(repr((self.settings, self.renderer)).encode())
         facts = {
             "steps done": self.step,
-            "training views": f"{len(views)} ({hash_view_names(views)})",
+            "training views": f"{len(views)} ({hash_training_views(views)})",
             "pixels of the first view": hashlib.sha256(views.pixels(0).rgb.numpy().tobytes()).hexdigest()[:16],
             "settings": settings.hexdigest()[:16],
             "state": digest.hexdigest()[:16],
@@ -162,7 +162,7 @@ class DistributedTrainer(Trainer):
         return self._agreed
 
 
-def _pad_to_alignment(numbers: int) -> int:
+def _pad_gradient_exchange(numbers: int) -> int:
     return -(-numbers // _ALIGNMENT) * _ALIGNMENT
 
 
@@ -181,14 +181,14 @@ class GradientSum:
         first = next(iter(params.values()))
         self._count = first.shape[0]
         sizes = [*(value.numel() for value in params.values()), self._count, self._count]
-        width = _pad_to_alignment(-(-sum(map(_pad_to_alignment, sizes)) // group.size))
+        width = _pad_gradient_exchange(-(-sum(map(_pad_gradient_exchange, sizes)) // group.size))
         self._buffer, self._received = (torch.zeros(group.size, width, device=first.device) for _ in range(2))
         self._sum = torch.zeros(width, device=first.device)
         self._empty = True
         flat, start, parts = self._buffer.reshape(-1), 0, []
         for size in sizes:
             parts.append(flat[start : start + size])
-            start += _pad_to_alignment(size)
+            start += _pad_gradient_exchange(size)
         *self._gradients, self._weight, self._error = parts
 
     def fits(self, params: Mapping[str, Tensor]) -> bool:

@@ -132,7 +132,7 @@ def validate_settings(cls: type[T], values: object, where: str = "") -> T:
         return values
     if not isinstance(values, Mapping):
         raise ConfigError(f"{where}={format_setting_value(values)}: expected settings, each as {where}.KEY=VALUE")
-    hints = field_types(cls)
+    hints = field_types(cls)  # type: ignore[arg-type]
     validate_setting_names(values, hints, where)
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
@@ -168,7 +168,7 @@ def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str,
 
 def validate_fields(settings: Any, where: str) -> None:
     """Check and convert a settings dataclass in its ``__post_init__``, as :func:`validate_settings` does."""
-    for name, hint in field_types(type(settings)).items():
+    for name, hint in field_types(type(settings)).items():  # type: ignore[arg-type]
         value = getattr(settings, name)
         made = validate_value(value, hint, join_setting_key(where, name))
         if made is not value:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -223,8 +224,8 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
 
 
 def _fit_gaussian_chunk(
-    density, own, still: Geometry, moved: Geometry, conditions: Conditions, size: str
-) -> tuple[Tensor, ...]:  # type: ignore[no-untyped-def]
+    density: Any, own: Any, still: Geometry, moved: Geometry, conditions: Conditions, size: str
+) -> tuple[Tensor, ...]:
     n, step = still.count, 2.0 / _SIDE
     ticks = (torch.arange(_SIDE, dtype=torch.float64) + 0.5) * step - 1
     ball = torch.cartesian_prod(ticks, ticks, ticks)

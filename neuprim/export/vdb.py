@@ -224,7 +224,9 @@ def _export_frame_conditions(placement: DensityGridPlacement, frame: int) -> dic
 
 def _export_source_frame(conditions: Conditions, placement: DensityGridPlacement | None) -> int | None:
     """Find the frame of the source with these conditions."""
-    for i in range(0 if placement is None else len(placement.numbers)):
+    if placement is None:
+        return None
+    for i in range(len(placement.numbers)):
         known = _export_frame_conditions(placement, i)
         same = (torch.allclose(known[k].float(), v.float(), atol=1e-6) for k, v in conditions.items())
         if known.keys() == conditions.keys() and all(same):

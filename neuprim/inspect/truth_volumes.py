@@ -49,10 +49,9 @@ def open_inspection_truth(
     scene = volume()
     if scene is not None:
         return scene.open_files(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
-    place = "the scene" if world.identity else f"that of the run's data, of {world.scale:g} scene units"
-    return InspectionGroundTruth(
-        frames, world
-    ), f"ground truth: {path}, taken as extinction in 1/scene unit, its world as {place}"
+    world_name = "the scene" if world.identity else f"that of the run's data, of {world.scale:g} scene units"
+    source = f"ground truth: {path}, taken as extinction in 1/scene unit, its world as {world_name}"
+    return InspectionGroundTruth(frames, world), source
 
 
 def pair_inspected_frames(

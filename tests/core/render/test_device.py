@@ -122,8 +122,9 @@ def test_a_run_keeps_a_model_where_it_is_drawn(card: Card, monkeypatch: pytest.M
     ):
         assert best_render_backend_device(model, settings, camera, {}) == wanted, settings
     row = replace(backends.TABLE[0], unsupported=lambda low, camera: "this model")
-    monkeypatch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
-    assert best_render_backend_device(model, RenderSettings(), camera, {}) == HOST
+    with monkeypatch.context() as patch:  # undone before the pretended card is
+        patch.setattr(backends, "TABLE", (row, *backends.TABLE[1:]))
+        assert best_render_backend_device(model, RenderSettings(), camera, {}) == HOST
 
 
 def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:

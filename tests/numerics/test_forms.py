@@ -64,7 +64,7 @@ def lowers(name: str, change: Callable[[Tensor], Any]) -> type[CosineDensity]:
 
 
 @pytest.mark.parametrize(
-    ("count", "backends"), [(1000, ["cpu", "reference"]), *((100, [b]) for b in FAST if b != "cpu")]
+    ("count", "backends"), [(2000, ["cpu", "reference"]), *((100, [b]) for b in FAST if b != "cpu")]
 )
 def test_no_wrong_form_crashes_or_passes(count: int, backends: list[str]) -> None:
     """In a process of its own: what this guards against is the end of the process. What refuses is the same for all."""

@@ -26,7 +26,7 @@ OPAQUE = 1.5  # optical depth beyond which alpha is compared instead
 RIM = (
     1e-6  # |D| below which float32 may not know whether a ray meets an ellipsoid, which a hard edge's gradients hang on
 )
-FUNCTIONALS = 2
+FUNCTIONALS = 4
 KEEPING = ("cpu", "reference")  # what others keep of a frame serves one backward pass
 _SHORTEST = 1e-2  # share of the central chord below which a soft edge's error is compared with that of one as long
 

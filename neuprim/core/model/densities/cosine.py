@@ -38,11 +38,11 @@ so far apart, and products with the other weights stay far from the ends of floa
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
-"""What ``model.density`` may say for it, in every task (:func:`neuprim.core.validation.choose`)."""
+"""What ``model.density`` may say for it, in every task (:func:`neuprim.core.validation.validate_choices`)."""
 
 
 DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "model.density.edge": EDGES}
-"""What of it trades quality for speed or size, in every task (:attr:`neuprim.core.task.TaskSpec.trade`)."""
+"""What of it trades quality for speed or size, in every task (:attr:`neuprim.core.task.TaskSpec.tunable_settings`)."""
 
 
 class CosineDensity(DensityField):

@@ -104,7 +104,7 @@ def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
 def span_of(spans: Shorts2d, pair: int, y: int) -> int:
-    """Of a pair's row of pixels (:mod:`~neuprim.core.render.cuda.spans`)."""
+    """Of a pair's row of pixels (:mod:`~neuprim.core.render.cuda.binning`)."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")

@@ -116,6 +116,7 @@ def drawn_cases(
     knobs = st.fixed_dictionaries({
         "sort": st.sampled_from(SORTS),
         "near": st.sampled_from([0.01, 0.3, 2.9]),
+        "depth": st.booleans(),
         "alpha_max": st.sampled_from([0.2, 0.99]),
         "depth_floor": st.just(1e-3),
     })  # fmt: skip

@@ -24,12 +24,15 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.export.shared import choose_export_views, find_export_rgb_channels
-from neuprim.webpage.model_page import PageScene, PageView, fullest_webpage_conditions
-from neuprim.webpage.scene_page import (
+from neuprim.webpage.model_page import (
     DrawView,
+    PageScene,
+    PageView,
+    fullest_webpage_conditions,
     held_out_webpage_views,
     initial_webpage_conditions,
     scene_page,
+    stored_up_axis,
     webpage_subtitle,
 )
 
@@ -53,11 +56,10 @@ def _write_html_export(job: ExportJob) -> ExportReport:
     level, limit = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0
     views, notes = _load_html_export_views(job, limit)
     conditions = initial_webpage_conditions(run.task.conditions, views, job.frames()[0] if job.conditions else {})
-    data = run.header.get("data")
     scene = PageScene(
         webpage_subtitle(run.task.name, str(run.header.get("data_source", "real"))),
         run.header["background"],
-        up=data.get("up", ()) if isinstance(data, Mapping) else (),
+        up=stored_up_axis(run.header),
         conditions=conditions,
         views=views,
         world=run.world,
@@ -69,8 +71,7 @@ def _write_html_export(job: ExportJob) -> ExportReport:
     shown = fullest_webpage_conditions(run.model, conditions)
     errors = {} if level == 0 else {"psnr": _measure_html_export_psnr(job, page.model, views, shown)}
     write_text(job.out, page.text)
-    size, numbers = len(page.text.encode()) / 1e6, page.numbers / 1e6
-    notes.append(f"{size:.2f} MB, {numbers:.2f} MB of them the model's numbers before base64")
+    notes.append(f"{len(page.text.encode()) / 1e6:.2f} MB")
     if run.settings.sort != "center" or run.settings.samples > 1:
         drawn = f"the run draws with sort={run.settings.sort} samples={run.settings.samples}"
         notes.append(f"{drawn}; the page by centres, one ray a pixel")

@@ -21,8 +21,13 @@ from neuprim.report import Viewer, error_map, write_report
 from neuprim.report.regions import WorstRegions
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
-from neuprim.webpage import PageScene
-from neuprim.webpage.scene_page import held_out_webpage_views, initial_webpage_conditions, scene_page, webpage_subtitle
+from neuprim.webpage.model_page import (
+    PageScene,
+    held_out_webpage_views,
+    initial_webpage_conditions,
+    scene_page,
+    webpage_subtitle,
+)
 
 _SHOWN_VIEWS = 8  # held-out views in renders/ and the report
 _ORBIT_FRAMES = 36

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import dataclasses
 import gzip
 import hashlib
 import html
@@ -11,7 +10,7 @@ import json
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import resources
 from typing import Any, NamedTuple
 
@@ -21,11 +20,14 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.cameras.world import World
+from neuprim.core.channels import Channels
 from neuprim.core.compression import bit_table, canonical_model, fit_quantizers, storage_order
 from neuprim.core.compression.quantizers import RotationQuantizer
 from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack_section
 from neuprim.core.conditions import FRAMES
+from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
+from neuprim.core.io.images import encode_webp_data_uri
 from neuprim.core.model.edge import EDGES, edge_profile
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.model.primitives import Primitives
@@ -40,10 +42,13 @@ _MAX_SLIDER_RANGE = 1e4
 _JSON_INFINITY = 1e30  # JSON has no infinity
 _SWEEP_SECONDS = 6.0
 _QUANTILE_ROWS = 100_000  # torch.quantile is limited
+_TRUTH_PIXELS, _STILL_PIXELS = 320, 640
+
+DrawView = Callable[[Primitives, Camera, Mapping[str, Tensor]], Tensor]
+"""(model, camera, conditions) -> (H, W, C), over the scene's background."""
 
 
-@dataclass(frozen=True)
-class Condition:
+class Condition(NamedTuple):
     """A condition of the task, and its initial value."""
 
     spec: ConditionSpec
@@ -89,13 +94,11 @@ class WebPage:
     Attributes:
         text: of the file.
         model: the model in the numbers that the page holds.
-        numbers: size of these, gzipped, bytes.
         nonce: identifies its scripts in its security policy, for a page that embeds it.
     """
 
     text: str
     model: Primitives
-    numbers: int
     nonce: str
 
 
@@ -139,7 +142,7 @@ def make_model_webpage(
         "center": middle,
         "radius": radius,
         "top": top,
-        "conditions": [_condition_json(condition, scene.views) for condition in scene.conditions],
+        "conditions": [_condition_json(condition) for condition in scene.conditions],
         "views": [_view_json(view) for view in scene.views],
         "still": bool(scene.still),
         **({} if scene.world is None or scene.world.identity else {"world": scene.world.to_json()}),
@@ -162,7 +165,7 @@ def make_model_webpage(
     }
     parts["nonce"] = hashlib.sha256("".join(parts.values()).encode()).hexdigest()[:32]  # no text inside can know it
     text = _PLACEHOLDER.sub(lambda place: parts[place.group(1)], texts["page.html"])
-    return WebPage(text, packed.model, len(packed.data), parts["nonce"])
+    return WebPage(text, packed.model, parts["nonce"])
 
 
 def _field_script(kind: str, field: Field) -> str:
@@ -177,6 +180,77 @@ def _field_script(kind: str, field: Field) -> str:
 
 
 # ---------------------------------------------------------------- scene
+
+
+def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int) -> list[PageView]:
+    """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; first the one with most contrast."""
+    count = min(limit, len(dataset.test))
+    views, contrasts = [], []
+    for index in (k * len(dataset.test) // count for k in range(count)):
+        view = dataset.test.view(index)
+        if isinstance(view.camera, Camera):
+            image = channels.display(dataset.test.pixels(index).over(dataset.background)).clamp(0.0, 1.0)
+            truth = encode_webp_data_uri(image, _TRUTH_PIXELS)
+            views.append(PageView(view.name, view.camera, view.conditions, truth))
+            contrasts.append(float(image.std()))
+    if views:  # the first frame of a sequence may be empty
+        views.insert(0, views.pop(contrasts.index(max(contrasts))))
+    return views
+
+
+def initial_webpage_conditions(
+    specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
+) -> list[Condition]:
+    """Return float64 conditions: those given, else of the first view, else the middle of a bounded range, else 1."""
+    shown = {**(views[0].conditions if views else {}), **given}
+    found = []
+    for spec in specs:
+        low, high = spec.range
+        middle = torch.full(spec.shape, 0.5 * (low + high) if high - low < 1e4 else 1.0)
+        found.append(Condition(spec, shown.get(spec.name, middle).double()))
+    return found
+
+
+def webpage_subtitle(task: str, data_source: str) -> str:
+    """Name the task, and the kind of data unless they are real."""
+    return task if data_source == "real" else f"{task}, {data_source} data"
+
+
+def scene_page(
+    name: str,
+    model: Primitives,
+    channels: Channels,
+    settings: RenderSettings,
+    draw: DrawView,
+    scene: PageScene,
+    level: int = 1,
+) -> WebPage:
+    """Make the page of a scene; its still, drawn by ``draw``, and its colour space are set here.
+
+    Raises:
+        ConfigError: channels that are not red, green and blue, or a field without a script for browsers.
+        CheckpointError: numbers that cannot be stored.
+    """
+    if channels.own is not None or channels.rgb is None:
+        raise ConfigError(
+            f"a page shows red, green and blue; this model has {channels.display_text or channels.name_list}"
+        )
+    still = ""
+    if scene.views:
+        start = {condition.spec.name: condition.value for condition in scene.conditions}
+        image = draw(model, scene.views[0].camera, scene.views[0].conditions or start)
+        still = encode_webp_data_uri(channels.display(image).clamp(0.0, 1.0), _STILL_PIXELS)
+    scene = replace(scene, still=still, linear=channels.color_space == "linear")
+    return make_model_webpage(name, model, channels.rgb, settings, scene, level)
+
+
+def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
+    """Return the upward direction (3,) in a model's header; +z unless it holds three finite numbers, not all 0."""
+    data = header.get("data")
+    up = data.get("up") if isinstance(data, Mapping) else None
+    if not isinstance(up, list) or len(up) != 3 or not all(isinstance(x, int | float) and math.isfinite(x) for x in up):
+        return 0.0, 0.0, 1.0
+    return tuple(map(float, up)) if any(up) else (0.0, 0.0, 1.0)
 
 
 def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
@@ -216,8 +290,7 @@ def _make_webpage_camera(middle: Sequence[float], radius: float, up: Sequence[fl
 def webpage_camera_numbers(camera: Camera) -> dict[str, Any]:
     """Return a camera as the scripts take it: world-to-camera R (row by row) and t, OpenCV axes; intrinsics, pixels."""
     view = camera.viewmat.detach().double().cpu()
-    names = [key.name for key in dataclasses.fields(camera) if key.name != "viewmat"]
-    numbers = {name: float(getattr(camera, name)) for name in names}
+    numbers = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     return {"R": view[:3, :3].flatten().tolist(), "t": view[:3, 3].tolist(), **numbers}
 
 
@@ -231,15 +304,12 @@ def _view_json(view: PageView) -> dict[str, Any]:
     }
 
 
-def _condition_json(condition: Condition, views: Sequence[PageView]) -> dict[str, Any]:
-    """Describe a condition for its controls. A range that is too long for a slider becomes that of the views."""
+def _condition_json(condition: Condition) -> dict[str, Any]:
+    """Describe a condition for its controls. A range that is too long for a slider becomes short."""
     spec = condition.spec
     low, high = (min(max(float(end), -_JSON_INFINITY), _JSON_INFINITY) for end in spec.range)
     if spec.shape == () and high - low > _MAX_SLIDER_RANGE:
-        values = [float(view.conditions[spec.name]) for view in views if spec.name in view.conditions] or [0.0]
-        low, high = min(values), max(values)
-        if low == high:
-            low, high = float(condition.value) - 1.0, float(condition.value) + 1.0
+        low, high = float(condition.value) - 1.0, float(condition.value) + 1.0
     place = spec.shape == (3,) and spec.unit.startswith("position")
     value = condition.value.double().tolist()
     return {"name": spec.name, "value": value, "range": [low, high], "place": place, "period": _SWEEP_SECONDS}

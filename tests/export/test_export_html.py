@@ -19,7 +19,7 @@ from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.webpage.scene_page import held_out_webpage_views
+from neuprim.webpage.model_page import held_out_webpage_views
 from tests.core import tiny
 from tests.page_models import random_model
 from tests.plugins import marked

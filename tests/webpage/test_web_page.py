@@ -57,7 +57,7 @@ def test_polynomials_are_good_to_float32(edge: int) -> None:
         value = torch.zeros_like(v)
         for coefficient in found[name]:
             value = value * v.square() + coefficient
-        assert float((value - truth).abs().max()) < 1e-7, name
+        assert float((value - truth).abs().max()) < 1e-9, name  # a hundredth of what float32 rounds
     assert sum(found["weights"]) == pytest.approx(1.0)
 
 

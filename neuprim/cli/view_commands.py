@@ -165,7 +165,7 @@ def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _inspect_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import print_notes
-    from neuprim.inspect import ViewOptions, parse_inspection_box
+    from neuprim.inspect import parse_inspection_box
     from neuprim.runs.inspect import InspectRequest, inspect_run
 
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
@@ -176,7 +176,8 @@ def _inspect_command(arguments: argparse.Namespace) -> int:
         arguments.conditions,
         arguments.grid,
         None if arguments.box is None else parse_inspection_box(arguments.box),
-        options=ViewOptions(tuple(arguments.level), arguments.primitive),
+        levels=tuple(arguments.level),
+        primitive=arguments.primitive,
         against=arguments.against,
         out=arguments.out,
         size=arguments.size,
@@ -232,7 +233,7 @@ def run_command_with_viewer(config: RunConfig, events: RunProgress, settings: Vi
     """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
     from neuprim.runs.fit import Note
     from neuprim.runs.run import run
-    from neuprim.viewer.live_training import LiveTraining
+    from neuprim.viewer.view import LiveTraining
 
     _print_open_host_warning(settings)
     with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:

@@ -6,36 +6,27 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
+from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.compute.device import HOST
 from neuprim.core.conditions import Warn, condition_flag, read_conditions
 from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.io.vdb import VdbGrid, write_vdb
 from neuprim.core.model.fields import Conditions, ConditionSpec
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActivePrimitives, Primitives
 from neuprim.core.volumes.density_grid import density_grid
+from neuprim.core.volumes.density_truth import DensityGridSource, DensityTruth
 from neuprim.inspect.layers import Scale
 
 _OUTSIDE = 0.002  # part of the absorption that may lie outside a model's box, at each of its faces
-
-
-@dataclass(frozen=True)
-class ViewOptions:
-    """Options of the built-in inspectors.
-
-    Attributes:
-        levels: of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of the largest value shown.
-        primitive: row of the primitive to show alone; None for the one that absorbs most.
-    """
-
-    levels: tuple[float, ...] = ()
-    primitive: int | None = None
 
 
 @dataclass(frozen=True)
@@ -49,7 +40,8 @@ class InspectionFrame:
         gain: factor on a volume's opacity; the same for all frames.
         focus: (3,) middle of the matter of all frames, scene units.
         channels: of the model's colours.
-        needed: names of the conditions of the model's task.
+        levels: of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of ``top``.
+        primitive: row of the primitive to show alone; None for the one that absorbs most.
         truth: computes (X, Y, Z) float32 ground truth on the grid; None if there is none.
         numbers: errors of the model against the ground truth.
         device: that computes the extinction on the grid.
@@ -65,8 +57,8 @@ class InspectionFrame:
     gain: float
     focus: tuple[float, ...] = (0.0, 0.0, 0.0)
     channels: Channels = field(default_factory=Channels)
-    needed: tuple[str, ...] = ()
-    options: ViewOptions = field(default_factory=ViewOptions)
+    levels: tuple[float, ...] = ()
+    primitive: int | None = None
     truth: Callable[[], np.ndarray] | None = None
     truth_name: str = ""
     numbers: Mapping[str, float] | None = None
@@ -134,16 +126,6 @@ class InspectionFrame:
         """Where the M active primitives are, float32."""
         return self.active.geometry
 
-    def density(self, row: int, points: Tensor) -> np.ndarray:
-        """Return (P,) float64 unclamped extinction of one primitive of the model at (P, 3) points inside it."""
-        params = {name: value.detach()[row : row + 1].double() for name, value in self.model.params.items()}
-        own = {s.name: params[s.name] for s in self.model.density.parameters()}
-        conditions = {name: value.double() for name, value in self.conditions.items()}
-        stored = Geometry(params["means"], params["log_scales"], params["quats"])
-        with torch.no_grad():
-            prim = torch.zeros(len(points), dtype=torch.int64)
-            return np.asarray(self.model.density.density(own, stored, prim, points.double(), conditions).numpy())
-
     @cached_property
     def masses(self) -> np.ndarray:
         """(M,) float64 total absorption of each active primitive; see :func:`measure_absorption`."""
@@ -151,14 +133,7 @@ class InspectionFrame:
 
     @cached_property
     def colours(self) -> np.ndarray:
-        """(M, 3) float32 display-referred colours at the primitives' centres, seen from the first viewpoint.
-
-        Raises:
-            ConfigError: a condition that the colours depend on was not given.
-        """
-        missing = [name for name in self.needed if name not in self.conditions]
-        if missing:
-            raise ConfigError(f"the primitives' colours depend on the {missing[0]}; give {condition_flag(missing[0])}")
+        """(M, 3) float32 display-referred colours at the primitives' centres, seen from the first viewpoint."""
         low, high = self.box
         center = torch.from_numpy((low + high) / 2).float()
         eye = center + torch.tensor([1.0, -1.6, 0.7]) * float(np.linalg.norm(high - low))
@@ -173,15 +148,14 @@ class InspectionFrame:
         Raises:
             ConfigError: there is no such primitive, or it is not active in this frame.
         """
-        wanted = self.options.primitive
+        wanted = self.primitive
         if wanted is None:
             return int(self.masses.argmax())
         if wanted >= (count := self.model.count):
             raise ConfigError(f"--primitive {wanted}: the model has {count} primitives, 0 to {count - 1}")
         found = np.flatnonzero(self.rows == wanted)
         if not len(found):
-            reason = f"it absorbs nothing at {self.title}; choose another one or another frame"
-            raise ConfigError(f"--primitive {wanted}: {reason}")
+            raise ConfigError(f"--primitive {wanted}: it absorbs nothing at {self.title}")
         return int(found[0])
 
 
@@ -204,7 +178,7 @@ def measure_absorption(active: ActivePrimitives) -> np.ndarray:
 # ---------------------------------------------------------------- which frames, and where
 
 
-class _GivenConditions(dict[str, Tensor]):
+class GivenConditions(dict[str, Tensor]):
     """Conditions of a frame; using one that was not given is an error that asks for it."""
 
     def __missing__(self, name: str) -> Tensor:
@@ -228,7 +202,7 @@ def read_inspected_conditions(
             found[spec.name] = [torch.tensor(sum(spec.range) / 2)]
     count = max((len(values) for values in found.values()), default=1)
     return [
-        _GivenConditions({name: values[i * len(values) // count] for name, values in found.items()})
+        GivenConditions({name: values[i * len(values) // count] for name, values in found.items()})
         for i in range(count)
     ]
 
@@ -258,8 +232,9 @@ def find_inspection_box(model: Primitives, frames: Sequence[Conditions]) -> np.n
     """
     lows, highs = [], []
     for conditions in frames[:: max(1, len(frames) // 5)]:
-        frame = InspectionFrame(model, conditions, "", torch.eye(4, dtype=torch.float64), (1, 1, 1), 1.0, 1.0)
-        geometry, weights = frame.geometry, np.nan_to_num(frame.masses, posinf=0.0)
+        with torch.no_grad():
+            active = model.active(conditions)
+        geometry, weights = active.geometry, np.nan_to_num(measure_absorption(active), posinf=0.0)
         if not weights.sum() > 0:
             continue
         reach = (geometry.rotations * geometry.scales[:, None, :]).norm(dim=2).double().numpy()
@@ -275,3 +250,52 @@ def _inspection_box_quantile(values: np.ndarray, weights: np.ndarray, part: floa
     order = values.argsort()
     total = weights[order].cumsum()
     return float(values[order[min(int(np.searchsorted(total, part * total[-1])), len(order) - 1)]])
+
+
+# ---------------------------------------------------------------- ground truth and files
+
+
+def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | None]) -> tuple[DensityTruth, str]:
+    """Open the ground truth that the user named, and say in a line what it is.
+
+    Args:
+        path: an OpenVDB file or a folder of them, or "scene" for what the run's scene was made from.
+        volume: opens the files of the run's scene; None if it has none.
+
+    Raises:
+        DataError: no such file, or the scene has no volumes.
+    """
+    place, scene = Path(path), volume()
+    if scene is None:
+        raise DataError(f"--against {path}: the run's scene has no volumes, which say how files are placed and scaled")
+    if path == "scene" and not place.exists():
+        return scene, "ground truth: the scene's own volumes"
+    if not place.exists():
+        raise DataError(f"--against {path}: no such file or folder; expected .vdb files, or scene for the scene's own")
+    return scene.open_files(place), f"ground truth: {path}, placed and scaled by the rules of the run's scene"
+
+
+def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> list[tuple[Conditions, int]]:
+    """Pair each frame to show with the nearest frame of the truth: (conditions, truth's frame), each frame once.
+
+    The conditions are those of the truth's frame.
+    """
+    pairs: dict[int, Conditions] = {}
+    for conditions in frames:
+        distances = [
+            sum(float((conditions[name] - value).abs().sum()) for name, value in frame.conditions.items())
+            for frame in truth.frames
+        ]
+        nearest = int(np.argmin(distances))
+        pairs.setdefault(nearest, GivenConditions({**conditions, **truth.frames[nearest].conditions}))
+    return [(conditions, number) for number, conditions in pairs.items()]
+
+
+def write_inspection_vdb(path: Path, frame: InspectionFrame, world: World) -> None:
+    """Write the frame's extinction, 1/scene unit, as OpenVDB in the world of its model, one voxel per grid point."""
+    scalars = {f"neuprim_condition_{name}": float(x) for name, x in frame.conditions.items() if x.numel() == 1}
+    metadata = {"neuprim_value": "extinction, 1/scene unit; each primitive clamped at 0 from below", **scalars}
+    transform = world.world_from_scene.numpy() @ frame.scene_from_index.numpy()
+    grid = VdbGrid.from_dense("extinction", frame.sigma, transform=transform, metadata=metadata)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_vdb(path, [grid], compression="zip")

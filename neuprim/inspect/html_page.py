@@ -9,10 +9,10 @@ import base64
 import html
 import json
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -25,7 +25,6 @@ from neuprim.inspect.layers import (
     InspectionGrid,
     Isosurfaces,
     Layer,
-    Lines,
     Mesh,
     Points,
     Scale,
@@ -42,57 +41,56 @@ _ALWAYS = (VOLUME, ISOSURFACE, SLICES, DIFFERENCE)  # they show grids that the p
 _SIZE_LIMIT = 2**29  # bytes of a page; browsers refuse longer strings
 
 
-class InspectionFrames(Protocol):
-    """What a page is made of: frames on one grid."""
+def write_inspection_page(
+    path: Path,
+    name: str,
+    up: str,
+    count: int,
+    frame: Callable[[int], InspectionFrame],
+    inspectors: Sequence[Inspector],
+) -> None:
+    """Write a page of ``count`` frames on one grid. It opens with the first inspector and offers built-in views, too.
 
-    name: str
-    up: str
-
-    def __len__(self) -> int: ...
-
-    def frame(self, index: int) -> InspectionFrame: ...
-
-
-def write_inspection_page(path: Path, frames: InspectionFrames, inspectors: Sequence[Inspector]) -> None:
-    """Write the page, whole or not at all. It opens with the first inspector and offers the built-in views, too.
+    Args:
+        name: of the run.
+        up: the scene's upward axis, "x", "y" or "z".
 
     Raises:
         ConfigError: more frames than one page holds.
     """
-    first = frames.frame(0)
+    first = frame(0)
     free = [view for view in _ALWAYS if view.shows != "both" or first.truth is not None]
     views = [*free, *(view for view in inspectors if view not in free)]
-    stored: list[dict[str, Any]] = []
+    frames: list[dict[str, Any]] = []
     size = 0
-    for i in range(len(frames)):
-        packed = InspectionFrameArrays()
-        stored.append(_inspection_frame_data(frames.frame(i), views, frames.up, packed))
-        size += packed.size
+    for i in range(count):
+        frames.append(_inspection_frame_data(frame(i), views, up))
+        size += sum(map(len, frames[-1]["arrays"]))
         if size > _SIZE_LIMIT:
             raise ConfigError(
-                f"--out {path}: more than {_SIZE_LIMIT >> 20} MiB after {i + 1} of {len(frames)} frames; "
+                f"--out {path}: more than {_SIZE_LIMIT >> 20} MiB after {i + 1} of {count} frames; "
                 "expected fewer, or a smaller --grid"
             )
+    layers = [x for one in frames for sides in one["layers"].values() for side in sides.values() for x in side]
+    colours = sorted({layer["scale"]["colours"] for layer in layers if layer.get("scale")})
     points, faces = unit_sphere(1)
-    kinds = {v.name: {"numbers": v.shows in ("sigma", "both"), "alone": v.shows == "primitive"} for v in views}
     data = {
-        "up": frames.up,
+        "up": up,
         "box": first.box.tolist(),
-        "views": kinds,
+        "views": {v.name: {"numbers": v.shows in ("sigma", "both"), "alone": v.shows == "primitive"} for v in views},
         "first": inspectors[0].name,
-        "maps": {name: colormap_bytes(name).ravel().tolist() for name in sorted(set(_inspection_colormaps(stored)))},
+        "maps": {name: colormap_bytes(name).ravel().tolist() for name in colours},
         "ball": {"points": points.ravel().round(6).tolist(), "faces": faces.ravel().tolist()},
-        "frames": stored,
+        "frames": frames,
     }
     template = resources.files(__package__).joinpath("page.html").read_text(encoding="utf-8")
     text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
-    title = html.escape(f"neuprim inspect: {frames.name}")
+    title = html.escape(f"neuprim inspect: {name}")
     write_text(path, template.replace("__TITLE__", title).replace("__DATA__", text))
 
 
-def _inspection_frame_data(
-    frame: InspectionFrame, views: Sequence[Inspector], up: str, packed: InspectionFrameArrays
-) -> dict[str, Any]:
+def _inspection_frame_data(frame: InspectionFrame, views: Sequence[Inspector], up: str) -> dict[str, Any]:
+    packed = InspectionFrameArrays()
     layers: dict[str, Any] = {}
     viewpoints: dict[str, Any] = {}
     for view in views:
@@ -105,13 +103,6 @@ def _inspection_frame_data(
     numbers = None if frame.numbers is None else dict(frame.numbers)
     words = {"title": frame.title, "truthName": frame.truth_name, "numbers": numbers}
     return {**words, "stands": viewpoints, "layers": layers, "arrays": packed.arrays}
-
-
-def _inspection_colormaps(frames: Sequence[dict[str, Any]]) -> Iterator[str]:
-    for frame in frames:
-        for sides in frame["layers"].values():
-            for layers in sides.values():
-                yield from (layer["scale"]["colours"] for layer in layers if layer.get("scale"))
 
 
 def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
@@ -146,11 +137,6 @@ class InspectionFrameArrays:
         # with the grid itself, so that its id stays its own
         self._grids: dict[tuple[int, float, float], tuple[np.ndarray, int, str]] = {}
 
-    @property
-    def size(self) -> int:
-        """Characters of all arrays."""
-        return sum(map(len, self.arrays))
-
     def pack_layers(self, layers: Sequence[Layer]) -> list[dict[str, Any]]:
         """Return the JSON of valid layers; arrays are given by their index in :attr:`arrays`."""
         return [self._pack(layer) for layer in layers]
@@ -162,22 +148,16 @@ class InspectionFrameArrays:
             return self._pack_grid(layer)
         scale = None if layer.values is None or layer.scale is None else _inspection_scale_data(layer.scale)
         found: dict[str, Any] = {"opacity": float(layer.opacity), "scale": scale}
+        points = layer.vertices if isinstance(layer, Mesh) else layer.centres
+        rgb = layer_colours(layer, len(points))
         if isinstance(layer, Ellipsoids):
-            count = min(len(layer.centres), ELLIPSOIDS_LIMIT)
-            exact = layer.values is None and layer.colours is not None and layer.colours.ndim == 2
-            rgb = layer.colours if exact else layer_colours(layer, len(layer.centres)) / 255.0
-            assert rgb is not None
-            rows = np.c_[layer.centres[:count], layer.axes[:count].reshape(-1, 9), rgb[:count]]
-            more = {"rows": self._store(rows, "<f4"), "count": count, "of": len(layer.centres)}
+            rows = np.c_[points, layer.axes.reshape(-1, 9), rgb / 255.0][:ELLIPSOIDS_LIMIT]
+            more = {"rows": self._store(rows, "<f4"), "count": len(rows), "of": len(points)}
             return {**found, "kind": "ellipsoids", **more}
-        points = layer.centres if isinstance(layer, Points) else layer.vertices
-        found |= {"points": self._store(points, "<f4"), "rgb": self._store(layer_colours(layer, len(points)), "u1")}
+        found |= {"points": self._store(points, "<f4"), "rgb": self._store(rgb, "u1")}
         if isinstance(layer, Points):
             return {**found, "kind": "points", "size": float(layer.size)}
-        if isinstance(layer, Mesh):
-            return {**found, "kind": "mesh", "rows": self._store(layer.faces, "<u4")}
-        assert isinstance(layer, Lines)
-        return {**found, "kind": "lines", "rows": self._store(layer.pairs, "<u4")}
+        return {**found, "kind": "mesh", "rows": self._store(layer.faces, "<u4")}
 
     def _pack_grid(self, layer: InspectionGrid) -> dict[str, Any]:
         scale, box = layer.scale, layer.box
@@ -186,19 +166,16 @@ class InspectionFrameArrays:
             stored, code = encode_inspected_values(layer.values.astype(np.float32, copy=False), scale)
             self._grids[key] = (layer.values, self._store(stored.ravel(order="F"), "u1"), code)
         _, index, code = self._grids[key]
+        size = box[1] - box[0]
         found = {"grid": index, "code": code, "shape": layer.values.shape, "low": box[0].tolist()}
-        found |= {
-            "size": (box[1] - box[0]).tolist(),
-            "step": float(layer.steps.min()),
-            "scale": _inspection_scale_data(scale),
-        }
+        found |= {"size": size.tolist(), "step": float(layer.spacing), "scale": _inspection_scale_data(scale)}
         if isinstance(layer, Volume):
             return {**found, "kind": "volume", "depth": float(layer.depth)}
         if isinstance(layer, Isosurfaces):
             return {**found, "kind": "isosurfaces", "level": float(min(layer.levels))}
         assert isinstance(layer, Slices)
         through = box.mean(0) if layer.through is None else np.asarray(layer.through, np.float64)
-        return {**found, "kind": "slices", "through": ((through - box[0]) / (box[1] - box[0])).tolist()}
+        return {**found, "kind": "slices", "through": ((through - box[0]) / size).tolist()}
 
     def _store(self, values: np.ndarray, dtype: str) -> int:
         self.arrays.append(base64.b64encode(zlib.compress(np.ascontiguousarray(values, dtype).tobytes(), 9)).decode())

@@ -44,24 +44,19 @@ class InspectionGrid:
     Attributes:
         values: (X, Y, Z).
         origin: (3,) position of ``values[0, 0, 0]``, scene units.
-        spacing: distance of neighbours, scene units: one number, or three along x, y and z.
+        spacing: distance of neighbours, scene units.
     """
 
     values: np.ndarray
     origin: np.ndarray
-    spacing: float | tuple[float, float, float]
+    spacing: float
     scale: Scale
-
-    @property
-    def steps(self) -> np.ndarray:
-        """(3,) float64 distances of neighbours along x, y and z."""
-        return np.broadcast_to(np.asarray(self.spacing, np.float64), 3)
 
     @property
     def box(self) -> np.ndarray:
         """(2, 3) float64 corners of the box that the grid's cells fill."""
-        low = np.asarray(self.origin, np.float64) - self.steps / 2
-        return np.stack([low, low + self.steps * self.values.shape])
+        low = np.asarray(self.origin, np.float64) - self.spacing / 2
+        return np.stack([low, low + self.spacing * np.array(self.values.shape)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,21 +147,6 @@ class Points(Painted):
     size: float = 8.0
 
 
-@dataclass(frozen=True, eq=False)
-class Lines(Painted):
-    """Straight line segments.
-
-    Attributes:
-        vertices: (N, 3) scene units.
-        pairs: (S, 2) integers, rows of ``vertices`` that are joined.
-        width: in pixels; ignored by a page.
-    """
-
-    vertices: np.ndarray
-    pairs: np.ndarray
-    width: float = 2.0
-
-
 @dataclass(frozen=True)
 class Text:
     """Lines of text in a corner of the picture."""
@@ -175,7 +155,7 @@ class Text:
     corner: Literal["upper_right", "lower_right"] = "lower_right"
 
 
-Layer = Volume | Slices | Isosurfaces | Ellipsoids | Mesh | Points | Lines | Text
+Layer = Volume | Slices | Isosurfaces | Ellipsoids | Mesh | Points | Text
 
 
 # ---------------------------------------------------------------- colours
@@ -198,7 +178,6 @@ def layer_colours(layer: Painted, count: int) -> np.ndarray:
 
 # ---------------------------------------------------------------- validation
 
-_KINDS = ", ".join(kind.__name__ for kind in get_args(Layer))
 _CORNERS = ("upper_right", "lower_right")
 _LARGEST = float(np.finfo(np.float32).max)
 
@@ -213,20 +192,20 @@ def validate_inspection_layers(found: Any) -> str | None:
     Returns:
         ``"returned WHAT; expected WHAT"``, or None if all layers are valid.
     """
-    expected = f"of neuprim.inspect.layers: {_KINDS}"
+    expected = f"of neuprim.inspect.layers: {', '.join(kind.__name__ for kind in get_args(Layer))}"
     if not isinstance(found, list | tuple):
         return f"returned a {type(found).__name__}; expected a list of layers {expected}"
     for i, layer in enumerate(found):
         if not isinstance(layer, get_args(Layer)):
             return f"returned a {type(layer).__name__} as layer {i}; expected one {expected}"
         try:
-            (
-                _check_inspection_text
-                if isinstance(layer, Text)
-                else _check_inspection_grid
-                if isinstance(layer, InspectionGrid)
-                else _check_inspection_shape
-            )(layer)
+            if isinstance(layer, Text):
+                _require_inspectable(isinstance(layer.text, str), "text", repr(layer.text), "text")
+                _require_inspectable(layer.corner in _CORNERS, "corner", repr(layer.corner), " or ".join(_CORNERS))
+            elif isinstance(layer, InspectionGrid):
+                _check_inspection_grid(layer)
+            else:
+                _check_inspection_shape(layer)
         except _InvalidLayer as problem:
             return f"returned layer {i}, a {type(layer).__name__}, whose {problem}"
     return None
@@ -237,19 +216,13 @@ def _require_inspectable(ok: object, name: str, found: object, expected: str) ->
         raise _InvalidLayer(f"{name} is {found}; expected {expected}")
 
 
-def _check_inspection_text(layer: Text) -> None:
-    _require_inspectable(isinstance(layer.text, str), "text", repr(layer.text), "text")
-    _require_inspectable(layer.corner in _CORNERS, "corner", repr(layer.corner), " or ".join(_CORNERS))
-
-
 def _check_inspection_grid(layer: Any) -> None:
     values = _check_inspection_array(layer, "values", (None, None, None))
     _require_inspectable(min(values.shape), "values", f"of shape {values.shape}", "at least one point along each axis")
     _check_inspection_array(layer, "origin", (3,))
     _check_inspection_scale(layer.scale)
-    several = isinstance(layer.spacing, tuple | list | np.ndarray) and len(layer.spacing) == 3
-    positive = all(_is_number(step, 0) and step for step in (layer.spacing if several else [layer.spacing]))
-    _require_inspectable(positive, "spacing", repr(layer.spacing), "a positive number of scene units, or three")
+    positive = _is_number(layer.spacing, 0) and layer.spacing
+    _require_inspectable(positive, "spacing", repr(layer.spacing), "a positive number of scene units")
     if isinstance(layer, Volume):
         _require_inspectable(_is_number(layer.depth, 0), "depth", repr(layer.depth), "a number from 0")
     if isinstance(layer, Slices) and layer.through is not None:
@@ -260,23 +233,19 @@ def _check_inspection_grid(layer: Any) -> None:
 
 
 def _check_inspection_shape(layer: Any) -> None:
-    points = _check_inspection_array(layer, "vertices" if isinstance(layer, Mesh | Lines) else "centres", (None, 3))
-    count = len(points)
+    count = len(_check_inspection_array(layer, "vertices" if isinstance(layer, Mesh) else "centres", (None, 3)))
     if isinstance(layer, Ellipsoids):
         _check_inspection_array(layer, "axes", (count, 3, 3))
-    if isinstance(layer, Mesh | Lines):
-        name, corners = ("faces", 3) if isinstance(layer, Mesh) else ("pairs", 2)
-        rows = _check_inspection_array(layer, name, (None, corners))
-        _require_inspectable(rows.dtype.kind in "iu", name, f"of type {rows.dtype}", "integers")
+    if isinstance(layer, Mesh):
+        rows = _check_inspection_array(layer, "faces", (None, 3))
+        _require_inspectable(rows.dtype.kind in "iu", "faces", f"of type {rows.dtype}", "integers")
         inside = not rows.size or 0 <= int(rows.min()) <= int(rows.max()) < count
-        _require_inspectable(inside, name, "an index beyond the vertices", f"rows 0 to {count - 1} of them")
-    if isinstance(layer, Points | Lines):
-        name = "size" if isinstance(layer, Points) else "width"
-        pixels = getattr(layer, name)
-        _require_inspectable(_is_number(pixels, 0) and pixels, name, repr(pixels), "a positive number of pixels")
+        _require_inspectable(inside, "faces", "an index beyond the vertices", f"rows 0 to {count - 1} of them")
+    if isinstance(layer, Points):
+        positive = _is_number(layer.size, 0) and layer.size
+        _require_inspectable(positive, "size", repr(layer.size), "a positive number of pixels")
     _require_inspectable(_is_number(layer.opacity, 0, 1), "opacity", repr(layer.opacity), "a number from 0 to 1")
     if layer.values is not None:
-        _require_inspectable(layer.colours is None, "colours", "given beside values", "one of them")
         _check_inspection_array(layer, "values", (count,))
         _check_inspection_scale(layer.scale)
     elif layer.colours is not None:
@@ -289,8 +258,6 @@ def _check_inspection_scale(scale: Any) -> None:
     _require_inspectable(isinstance(scale, Scale), "scale", f"a {type(scale).__name__}", "a Scale")
     ends = _is_number(scale.low) and _is_number(scale.high) and scale.low < scale.high
     _require_inspectable(ends, "scale", f"from {scale.low!r} to {scale.high!r}", "a lower and a higher number")
-    texts = isinstance(scale.title, str) and isinstance(scale.unit, str)
-    _require_inspectable(texts, "scale", f"of title {scale.title!r} and unit {scale.unit!r}", "texts")
     known = isinstance(scale.colours, str) and scale.colours in matplotlib.colormaps
     _require_inspectable(known, "scale", f"of colours {scale.colours!r}", "a colour map of matplotlib, as 'inferno'")
 
@@ -299,9 +266,8 @@ def _check_inspection_array(layer: Any, name: str, shape: tuple[int | None, ...]
     value = getattr(layer, name)
     _require_inspectable(isinstance(value, np.ndarray), name, f"a {type(value).__name__}", "a numpy array")
     fits = len(value.shape) == len(shape) and all(n in (None, m) for n, m in zip(shape, value.shape, strict=True))
-    _require_inspectable(
-        fits, name, f"of shape {value.shape}", f"({', '.join('N' if n is None else str(n) for n in shape)})"
-    )
+    expected = ", ".join("N" if n is None else str(n) for n in shape)
+    _require_inspectable(fits, name, f"of shape {value.shape}", f"({expected})")
     _require_inspectable(value.dtype.kind in "fiub", name, f"of type {value.dtype}", "real numbers")
     finite = not value.size or bool(-_LARGEST <= value.min() <= value.max() <= _LARGEST)  # False for NaN, too
     _require_inspectable(finite, name, "not finite in float32", "finite numbers")

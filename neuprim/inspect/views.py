@@ -29,7 +29,7 @@ def _inspect_difference(frame: InspectionFrame) -> list[Layer]:
 
 
 def _inspect_isosurface(frame: InspectionFrame) -> list[Layer]:
-    levels = frame.options.levels or tuple(part * frame.top for part in (0.1, 1 / 3, 2 / 3))
+    levels = frame.levels or tuple(part * frame.top for part in (0.1, 1 / 3, 2 / 3))
     scale = Scale(0.0, frame.top, _SURFACE_COLOURS, frame.scale.title, frame.scale.unit)
     return [Isosurfaces(frame.sigma, frame.origin, frame.step, scale, levels=levels)]
 
@@ -38,19 +38,12 @@ def _inspect_slices(frame: InspectionFrame) -> list[Layer]:
     return [Slices(frame.sigma, frame.origin, frame.step, frame.scale, through=np.array(frame.focus))]
 
 
-def _inspected_primitives(frame: InspectionFrame) -> np.ndarray:
-    """Return positions in ``frame.rows`` of the ellipsoids to draw, by what they absorb.
-
-    Their opacity is that of a ray along the mean radius through the mean extinction.
-    """
+def _inspect_primitives(frame: InspectionFrame) -> list[Layer]:
+    # A primitive's opacity is that of a ray along the mean radius through the mean extinction.
     order = frame.masses.argsort()[::-1]
     volume = frame.geometry.scales.double().numpy().prod(1)
     visible = 1 - np.exp(-2 * frame.masses / (4.18879 * volume) * volume ** (1 / 3)) >= _MIN_OPACITY
-    return np.asarray(order[visible[order]][:_MAX_ELLIPSOIDS])
-
-
-def _inspect_primitives(frame: InspectionFrame) -> list[Layer]:
-    chosen = _inspected_primitives(frame)
+    chosen = order[visible[order]][:_MAX_ELLIPSOIDS].copy()
     geometry = frame.geometry[torch.from_numpy(chosen)]
     axes = (geometry.rotations * geometry.scales[:, None, :]).transpose(1, 2).detach().numpy()
     text = f"{len(chosen)} of {frame.model.count} primitives at their true size\nleft out: opacity below 1/255"
@@ -63,14 +56,14 @@ def _inspect_primitive(frame: InspectionFrame) -> list[Layer]:
     geometry = frame.geometry[position : position + 1]
     axes = (geometry.rotations * geometry.scales[:, None, :])[0].double()
     points = geometry.means[0].double() + torch.from_numpy(unit) @ axes.T
-    sigma = frame.density(int(frame.rows[position]), points)
+    with torch.no_grad():
+        sigma = frame.active.sigma(torch.full((len(points),), position), points.float()).double().numpy()
     low, high = float(sigma.min()), float(sigma.max())
     reach = max(abs(low), abs(high)) or 1.0
     negative = low < 0
     colours = _SIGNED_COLOURS if negative else frame.scale.colours
     scale = Scale(-reach if negative else 0.0, reach, colours, frame.scale.title, frame.scale.unit)
-    used, surface = np.unique(faces, return_inverse=True)
-    mesh = Mesh(points.numpy()[used], surface.reshape(faces.shape), values=sigma[used], scale=scale)
+    mesh = Mesh(points.numpy(), faces, values=sigma, scale=scale)
     scales = ", ".join(f"{s:.3g}" for s in geometry.scales[0].tolist())
     center = ", ".join(f"{s:.3g}" for s in geometry.means[0].tolist())
     text = f"primitive {frame.rows[position]}\ncentre ({center})\nradii ({scales})\n"
@@ -144,30 +137,19 @@ def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_inspection_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
-    """Make the unit ball without the quarter x > 0 > y.
+    """Make (P, 3) float64 points and (F, 3) int64 triangles of the unit ball's surface without the quarter x > 0 > y.
 
-    The sphere and the two planes of the cut share no points on their edges, so that these stay sharp.
-
-    Returns:
-        (P, 3) float64 points throughout the ball, and (F, 3) int64 triangles of its surface.
+    The sphere and the two planes of the cut share no points, so that their edges stay sharp.
     """
     radius = np.linspace(0, 1, rings // 2)
     around, down = np.radians(np.linspace(0, 270, 2 * rings + 1)), np.linspace(0, np.pi, rings)
-    r, a, d = np.meshgrid(radius, around, down, indexing="ij")
-    solid = np.stack([r * np.sin(d) * np.cos(a), r * np.sin(d) * np.sin(a), r * np.cos(d)], -1)
-    index = np.arange(r.size).reshape(r.shape)
-    edges = np.concatenate([solid[-1, 0], solid[-1, -1]])  # copies for the planes where they meet the sphere
-    first, last = index[:, 0].copy(), index[:, -1].copy()
-    first[-1], last[-1] = r.size + np.arange(rings), r.size + rings + np.arange(rings)
-    faces = [
-        _inspection_ball_triangles(index[-1].T),
-        _inspection_ball_triangles(first.T),
-        _inspection_ball_triangles(last),
-    ]
-    return np.concatenate([solid.reshape(-1, 3), edges]), np.concatenate(faces)
-
-
-def _inspection_ball_triangles(index: np.ndarray) -> np.ndarray:
-    """Return (2 (A - 1) (B - 1), 3) triangles of an (A, B) sheet of points."""
-    a, b, c, d = (part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
-    return np.concatenate([np.stack([a, b, c], 1), np.stack([a, c, d], 1)])
+    sphere, first = (1.0, around[None], down[:, None]), (radius[None], 0.0, down[:, None])
+    last = (radius[:, None], around[-1], down[None])
+    points, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    for r, a, d in (sphere, first, last):
+        sheet = np.stack(np.broadcast_arrays(r * np.sin(d) * np.cos(a), r * np.sin(d) * np.sin(a), r * np.cos(d)), -1)
+        index = len(points) + np.arange(sheet.size // 3).reshape(sheet.shape[:2])
+        corners = [part.ravel() for part in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:])]
+        faces = np.concatenate([faces, *(np.stack([corners[0], corners[k], corners[k + 1]], 1) for k in (1, 2))])
+        points = np.concatenate([points, sheet.reshape(-1, 3)])
+    return points, faces

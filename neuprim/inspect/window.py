@@ -20,10 +20,7 @@ from neuprim.inspect.layers import (
     InspectionGrid,
     Isosurfaces,
     Layer,
-    Lines,
     Mesh,
-    Painted,
-    Points,
     Scale,
     Slices,
     Text,
@@ -106,14 +103,13 @@ class Window:
 
     def interact(self, count: int, frame: Callable[[int], InspectionFrame]) -> None:
         """Show the window until the user closes it, with a slider for more than one frame."""
-        self.add_slider(count, frame)
+        if count > 1:
+            self.add_slider(count, frame)
         self.draw(frame(0))
         self.plotter.show()
 
     def add_slider(self, count: int, frame: Callable[[int], InspectionFrame]) -> None:
         """Add a slider over ``count`` frames. A frame is drawn when the slider reaches it."""
-        if count < 2:
-            return
         shown = [0]
 
         def moved(value: float) -> None:
@@ -153,8 +149,12 @@ def _add_pyvista_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> No
         if isinstance(layer, Text):
             plotter.add_text(layer.text, position=layer.corner, font_size=8, color="white")
             continue
-        _ADD[type(layer)](plotter, layer)
-        scale = layer.scale if isinstance(layer, InspectionGrid) or layer.values is not None else None
+        if isinstance(layer, InspectionGrid):
+            _add_pyvista_grid(plotter, layer)
+            scale: Scale | None = layer.scale
+        else:
+            _add_pyvista_shape(plotter, layer)
+            scale = layer.scale if layer.values is not None else None
         if scale is not None and scale.title:
             scales[scale] = None
     for place, scale in enumerate(scales):
@@ -180,137 +180,71 @@ def _add_pyvista_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None
     plotter.add_scalar_bar(title, mapper=mapper, render=False, **size, **look)
 
 
+def _add_pyvista_grid(plotter: Any, layer: InspectionGrid) -> None:
+    scale = layer.scale
+    look = {"scalars": "values", "cmap": scale.colours, "clim": (scale.low, scale.high), "show_scalar_bar": False}
+    if isinstance(layer, Volume):
+        ramp = np.linspace(scale.low, scale.high, _OPACITY_STEPS)
+        plotter.add_volume(
+            _make_pyvista_image(layer, np.clip(layer.values, scale.low, scale.high)),
+            opacity=np.rint(255 * (1.0 - np.exp(-np.abs(ramp) * layer.depth * layer.spacing))),
+            opacity_unit_distance=layer.spacing,
+            shade=False,
+            mapper="smart",
+            **look,
+        )
+    elif isinstance(layer, Isosurfaces):
+        data, levels = _make_pyvista_image(layer, layer.values, around=1), sorted(layer.levels)
+        for i, level in enumerate(levels):
+            surface = data.contour([level], scalars="values")
+            opacity = 0.95 if i == len(levels) - 1 else min(0.22 + 0.2 * i, 0.95)
+            if surface.n_points:
+                plotter.add_mesh(surface, opacity=opacity, smooth_shading=True, specular=0.25, **look)
+    elif isinstance(layer, Slices):
+        x, y, z = layer.box.mean(0) if layer.through is None else layer.through
+        cut = _make_pyvista_image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
+        if any(part.n_points for part in cut):
+            plotter.add_mesh(cut, lighting=False, **look)
+
+
 def _make_pyvista_image(layer: InspectionGrid, values: np.ndarray, around: int = 0) -> Any:
     """Make ``pyvista.ImageData`` of values at the layer's points, with some layers of zeros around."""
     import pyvista
 
-    origin = np.asarray(layer.origin, np.float64) - around * layer.steps
-    found = pyvista.ImageData(dimensions=np.array(values.shape) + 2 * around, spacing=tuple(layer.steps), origin=origin)
+    origin = np.asarray(layer.origin, np.float64) - around * layer.spacing
+    spacing = (float(layer.spacing),) * 3
+    found = pyvista.ImageData(dimensions=np.array(values.shape) + 2 * around, spacing=spacing, origin=origin)
     found.point_data["values"] = np.pad(values.astype(np.float32, copy=False), around).ravel(order="F")
     return found
 
 
-def _add_pyvista_volume(plotter: Any, layer: Volume) -> None:
-    scale, step = layer.scale, float(layer.steps.min())
-    ramp = np.linspace(scale.low, scale.high, _OPACITY_STEPS)
-    plotter.add_volume(
-        _make_pyvista_image(layer, np.clip(layer.values, scale.low, scale.high)),
-        scalars="values",
-        cmap=scale.colours,
-        clim=(scale.low, scale.high),
-        opacity=np.rint(255 * (1.0 - np.exp(-np.abs(ramp) * layer.depth * step))),
-        opacity_unit_distance=step,
-        shade=False,
-        mapper="smart",
-        show_scalar_bar=False,
-    )
-
-
-def _add_pyvista_isosurfaces(plotter: Any, layer: Isosurfaces) -> None:
-    data, levels = _make_pyvista_image(layer, layer.values, around=1), sorted(layer.levels)
-    for i, level in enumerate(levels):
-        surface = data.contour([level], scalars="values")
-        if surface.n_points:
-            opacity = 0.95 if i == len(levels) - 1 else min(0.22 + 0.2 * i, 0.95)
-            plotter.add_mesh(
-                surface, opacity=opacity, smooth_shading=True, specular=0.25, **_pyvista_scale_arguments(layer.scale)
-            )
-
-
-def _add_pyvista_slices(plotter: Any, layer: Slices) -> None:
-    x, y, z = layer.box.mean(0) if layer.through is None else layer.through
-    cut = _make_pyvista_image(layer, layer.values).slice_orthogonal(x=x, y=y, z=z)
-    if any(part.n_points for part in cut):
-        plotter.add_mesh(cut, lighting=False, **_pyvista_scale_arguments(layer.scale))
-
-
-def _add_pyvista_ellipsoids(plotter: Any, layer: Ellipsoids) -> None:
-    count = len(layer.centres)
-    points, faces = _pyvista_ellipsoid_triangles(layer.centres, layer.axes, 2 if count <= _FINE_ELLIPSOIDS else 1)
-    if count:
-        data = _make_pyvista_polydata(points, faces=_pyvista_cells(faces))
-        colours = np.repeat(layer_colours(layer, count), len(points) // count, 0)
-        look = {"smooth_shading": True, "ambient": 0.3, "diffuse": 0.8, "specular": 0.15, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_pyvista_colour_bytes(data, colours))
-
-
-def _add_pyvista_mesh(plotter: Any, layer: Mesh) -> None:
-    if len(layer.faces):
-        data = _make_pyvista_polydata(layer.vertices, faces=_pyvista_cells(layer.faces))
-        look = {"smooth_shading": True, "ambient": 0.5, "diffuse": 0.6, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_pyvista_colour_arguments(layer, data))
-
-
-def _add_pyvista_points(plotter: Any, layer: Points) -> None:
-    if len(layer.centres):
-        data = _make_pyvista_polydata(layer.centres)
-        look = {"render_points_as_spheres": True, "point_size": layer.size, "opacity": layer.opacity}
-        plotter.add_mesh(data, **look, **_pyvista_colour_arguments(layer, data))
-
-
-def _add_pyvista_lines(plotter: Any, layer: Lines) -> None:
-    if len(layer.pairs):
-        data = _make_pyvista_polydata(layer.vertices, lines=_pyvista_cells(layer.pairs))
-        plotter.add_mesh(
-            data,
-            line_width=layer.width,
-            lighting=False,
-            opacity=layer.opacity,
-            **_pyvista_colour_arguments(layer, data),
-        )
-
-
-def _make_pyvista_polydata(points: np.ndarray, **cells: np.ndarray) -> Any:
+def _add_pyvista_shape(plotter: Any, layer: Any) -> None:
+    """Draw ellipsoids, a mesh or points, with a colour per vertex."""
     import pyvista
 
-    return pyvista.PolyData(np.ascontiguousarray(points, np.float32), **cells)  # type: ignore[arg-type]
-
-
-def _pyvista_cells(rows: np.ndarray) -> np.ndarray:
-    return np.c_[np.full(len(rows), rows.shape[1]), rows].ravel()
-
-
-def _pyvista_colour_arguments(layer: Painted, data: Any) -> dict[str, Any]:
-    """Return arguments of ``add_mesh`` that colour a layer's vertices; numbers are interpolated before colouring."""
-    if layer.values is not None and layer.scale is not None:
-        data.point_data["values"] = layer.values.astype(np.float32)
-        return _pyvista_scale_arguments(layer.scale)
-    return _pyvista_colour_bytes(data, layer_colours(layer, data.n_points))
-
-
-def _pyvista_colour_bytes(data: Any, colours: np.ndarray) -> dict[str, Any]:
-    data.point_data["colours"] = colours
-    return {"scalars": "colours", "rgb": True, "show_scalar_bar": False}
-
-
-def _pyvista_scale_arguments(scale: Scale) -> dict[str, Any]:
-    return {"scalars": "values", "cmap": scale.colours, "clim": (scale.low, scale.high), "show_scalar_bar": False}
-
-
-def _pyvista_ellipsoid_triangles(
-    centres: np.ndarray, axes: np.ndarray, subdivisions: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return (N V, 3) float32 points and (N F, 3) int64 triangles of N ellipsoids, one after the other."""
-    points, faces = unit_sphere(subdivisions)
-    placed = centres.astype(np.float64)[:, None, :] + np.einsum("nka,vk->nva", axes.astype(np.float64), points)
-    shifted = faces[None] + (np.arange(len(centres)) * len(points))[:, None, None]
-    return placed.reshape(-1, 3).astype(np.float32), shifted.reshape(-1, 3)
-
-
-_ADD: dict[type, Any] = {
-    Volume: _add_pyvista_volume,
-    Isosurfaces: _add_pyvista_isosurfaces,
-    Slices: _add_pyvista_slices,
-    Ellipsoids: _add_pyvista_ellipsoids,
-    Mesh: _add_pyvista_mesh,
-    Points: _add_pyvista_points,
-    Lines: _add_pyvista_lines,
-}
+    vertices = layer.vertices if isinstance(layer, Mesh) else layer.centres
+    colours = layer_colours(layer, len(vertices))
+    look: dict[str, Any] = {"smooth_shading": True, "ambient": 0.5, "diffuse": 0.6}
+    cells = {}
+    if isinstance(layer, Mesh):
+        cells["faces"] = np.c_[np.full(len(layer.faces), 3), layer.faces].ravel()
+    elif isinstance(layer, Ellipsoids):
+        points, triangles = unit_sphere(2 if len(vertices) <= _FINE_ELLIPSOIDS else 1)
+        placed = vertices.astype(np.float64)[:, None] + np.einsum("nka,vk->nva", layer.axes.astype(float), points)
+        faces = triangles + (np.arange(len(vertices)) * len(points))[:, None, None]
+        vertices, colours = placed.reshape(-1, 3), colours.repeat(len(points), 0)
+        cells["faces"] = np.c_[np.full(faces.size // 3, 3), faces.reshape(-1, 3)].ravel()
+        look = {"smooth_shading": True, "ambient": 0.3, "diffuse": 0.8, "specular": 0.15}
+    else:
+        look = {"render_points_as_spheres": True, "point_size": layer.size}
+    if len(vertices) and (not cells or len(cells["faces"])):
+        data = pyvista.PolyData(np.ascontiguousarray(vertices, np.float32), **cells)  # type: ignore[arg-type]
+        data.point_data["colours"] = colours
+        plotter.add_mesh(data, scalars="colours", rgb=True, opacity=layer.opacity, show_scalar_bar=False, **look)
 
 
 # ---------------------------------------------------------------- without a display
 
-_VARIABLE = "VTK_DEFAULT_OPENGL_WINDOW"
 _PROBE = """
 import pyvista
 plotter = pyvista.Plotter(off_screen=True, window_size=(32, 32))
@@ -337,38 +271,25 @@ def has_display() -> bool:
 
 @cache
 def prepare_headless() -> None:
-    """Choose the first of VTK's ways of drawing off screen that works here, for this process.
-
-    VTK ends the process if a library is missing, so another process tries first.
+    """Check that VTK can draw off screen here. It ends the process if a library is missing, so another one tries.
 
     Raises:
-        BackendUnavailable: none of them works; names the packages to install.
+        BackendUnavailable: it cannot; names the packages to install.
     """
-    chosen = os.environ.get(_VARIABLE)
-    ways = [chosen] if chosen else [""] * has_display() + ["vtkEGLRenderWindow", "vtkOSOpenGLRenderWindow"]
-    failures = []
-    for way in ways:
-        environment = {**os.environ, **({_VARIABLE: way} if way else {})}
-        failure = _probe_pyvista_drawing(environment)
-        if failure is None:
-            os.environ.update(environment)
-            return
-        failures.append(f"{way or 'display'}: {failure}")
-    raise BackendUnavailable(
-        f"VTK cannot draw pictures here ({'; '.join(failures)}); on Debian or Ubuntu: "
-        "apt install libegl1 libgl1-mesa-dri; --out FILE.html and --out FILE.vdb need none of it"
-    )
-
-
-def _probe_pyvista_drawing(environment: dict[str, str]) -> str | None:
-    """Draw in another process; return why it does not work, or None."""
-    command = [sys.executable, "-c", _PROBE]
     try:
-        done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=_PROBE_SECONDS)
+        done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=_PROBE_SECONDS)
+        failure = "" if "drawn" in done.stdout else "the picture is black"
+        if done.returncode < 0:
+            failure = f"ended by {signal.Signals(-done.returncode).name}"
+        elif done.returncode:
+            failure = (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1][:200]
     except subprocess.TimeoutExpired:
-        return f"no picture after {_PROBE_SECONDS:.0f} s"
-    if done.returncode < 0:
-        return f"ended by {signal.Signals(-done.returncode).name}"
-    if done.returncode:
-        return (done.stderr.strip().splitlines() or [f"status {done.returncode}"])[-1][:200]
-    return None if "drawn" in done.stdout else "the picture is black"
+        failure = f"no picture after {_PROBE_SECONDS:.0f} s"
+    if failure:
+        raise BackendUnavailable(
+            f"VTK cannot draw pictures here ({failure}); on Debian or Ubuntu: apt install libegl1 libgl1-mesa-dri; "
+            "--out FILE.html and --out FILE.vdb need none of it"
+        )
+    from vtkmodules.vtkCommonCore import vtkLogger
+
+    vtkLogger.SetStderrVerbosity(vtkLogger.VERBOSITY_ERROR)  # no warning about the displays that it tried

@@ -23,14 +23,15 @@ from neuprim.core.volumes.density_grid import POINTS_LIMIT, box_lattice, density
 from neuprim.core.volumes.density_truth import DensityTruth, measure_density_errors
 from neuprim.inspect.field import (
     InspectionFrame,
-    ViewOptions,
     describe_inspected_conditions,
     find_inspection_box,
+    open_inspection_truth,
+    pair_inspected_frames,
     read_inspected_conditions,
+    write_inspection_vdb,
 )
 from neuprim.inspect.html_page import write_inspection_page
 from neuprim.inspect.layers import Layer, validate_inspection_layers
-from neuprim.inspect.truth_volumes import open_inspection_truth, pair_inspected_frames, write_inspection_vdb
 from neuprim.inspect.window import Window, has_display, list_inspection_panels, prepare_headless, require_pyvista
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import INSPECTORS, PluginError
@@ -54,6 +55,8 @@ class InspectRequest:
         conditions: name -> text, as ``{"time": "0:1"}``.
         grid: points along the longest side of the box.
         box: (2, 3) in the coordinates of the run's data; None: around the ground truth, or what the model absorbs.
+        levels: of isosurfaces, 1/scene unit.
+        primitive: row of the one to show alone.
         against: ground truth, an OpenVDB file or folder, or "scene".
         up: "x", "y" or "z"; None: the scene's setting, or z.
         overwrite: whether files that exist may be replaced.
@@ -64,7 +67,8 @@ class InspectRequest:
     conditions: Mapping[str, str] = field(default_factory=dict)
     grid: int = 128
     box: np.ndarray | None = None
-    options: ViewOptions = field(default_factory=ViewOptions)
+    levels: tuple[float, ...] = ()
+    primitive: int | None = None
     against: str | None = None
     out: Path | None = None
     size: tuple[int, int] | None = None
@@ -102,7 +106,7 @@ def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> l
     if film.channels.hides_channels and any(i.shows == "model" for i in inspectors):
         events(Note(f"shown: {film.channels.display_text}"))
     if request.out is not None and kind == ".html":
-        write_inspection_page(request.out, film, inspectors)
+        write_inspection_page(request.out, film.name, film.up, len(film), film.frame, inspectors)
         return [request.out]
     if request.out is not None and kind == ".vdb":
         return _write_run_frames(request.out, film, lambda path, frame: write_inspection_vdb(path, frame, film.world))
@@ -168,16 +172,16 @@ class _RunFrames:
         run = open_run(request.run)
         self.model, self.device, self.world = run.model, computing_device(run.settings), run.world
         self.truth: DensityTruth | None = None
-        self.channels, self.needed = run.channels, tuple(c.name for c in run.task.conditions)
+        self.channels = run.channels
         self.up = request.up or str(run.scene.get("up", "z"))
         self.up = self.up if self.up in ("x", "y", "z") else "z"
-        self.options, self.name = request.options, run.directory.resolve().name
+        self.request, self.name = request, run.directory.resolve().name
         wanted = read_inspected_conditions(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
         if request.against is not None:
-            self.truth, words = open_inspection_truth(request.against, run.volume, run.world)
+            self.truth, words = open_inspection_truth(request.against, run.volume)
             events(Note(words))
-            pairs = pair_inspected_frames(wanted, self.truth, bool(request.conditions))
+            pairs = pair_inspected_frames(wanted, self.truth)
         self.pairs = pairs
         for path in [] if request.out is None else _output_paths(request.out, len(pairs)):
             refuse_existing(path, request.overwrite)
@@ -248,8 +252,8 @@ class _RunFrames:
             self.gain,
             self.focus,
             channels=self.channels,
-            needed=self.needed,
-            options=self.options,
+            levels=self.request.levels,
+            primitive=self.request.primitive,
             truth=None if truth is None else lambda: truth.grid(number, self.matrix, self.shape).numpy(),
             truth_name="" if truth is None else truth.frames[number].name,
             numbers=self.numbers[index],

@@ -17,7 +17,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.io.vdb import read_grid
 from neuprim.core.volumes.density_grid import box_lattice, density_at, density_grid
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS
-from neuprim.inspect import ViewOptions, window
+from neuprim.inspect import window
 from neuprim.inspect.field import (
     InspectionFrame,
     describe_inspected_conditions,
@@ -26,6 +26,7 @@ from neuprim.inspect.field import (
 )
 from neuprim.inspect.html_page import encode_inspected_values
 from neuprim.inspect.layers import Scale
+from neuprim.inspect.views import PRIMITIVE
 from neuprim.plugins.registry import load_task
 from neuprim.runs.fit import Event, Note
 from neuprim.runs.inspect import InspectRequest, inspect_run
@@ -93,22 +94,20 @@ def test_the_box_holds_the_matter_and_forgets_a_stray() -> None:
 
 def frame_of(time: float = 1.0, **options: Any) -> InspectionFrame:
     matrix, shape = box_lattice(np.array([[-0.5, -0.5, -0.4], [0.6, 0.5, 0.7]]), 24)
-    return InspectionFrame(
-        runs.model(), {"time": torch.tensor(time)}, "", matrix, shape, 8.0, 1.0, options=ViewOptions(**options)
-    )
+    return InspectionFrame(runs.model(), {"time": torch.tensor(time)}, "", matrix, shape, 8.0, 1.0, **options)
 
 
 def test_one_primitive_is_asked_where_it_has_moved_to() -> None:
-    frame = frame_of()
+    frame = frame_of(primitive=0)
     alone = runs.model()
     for name, value in alone.params.items():
         alone.params[name] = value[:1]
-    center = frame.geometry.means[0].double()
-    assert float(center[0]) == pytest.approx(0.15, abs=1e-6)
-    points = center + 0.06 * torch.randn(20, 3, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-    expected = density_at(alone, frame.conditions, points).numpy()
+    assert float(frame.geometry.means[0, 0]) == pytest.approx(0.15, abs=1e-6)
+    mesh, _ = PRIMITIVE.layers(frame)
+    inside = frame.geometry.means[0].double() + 0.999 * (torch.from_numpy(mesh.vertices) - frame.geometry.means[0])
+    expected = density_at(alone, frame.conditions, inside).numpy()
     assert expected.max() > 3
-    assert np.allclose(np.maximum(frame.density(0, points), 0), expected, rtol=1e-6)
+    assert np.abs(np.maximum(mesh.values, 0) - expected).max() < 0.02 * expected.max()
 
 
 def test_masses_are_the_integrals_of_the_density() -> None:
@@ -143,18 +142,6 @@ def test_a_volume_file_is_the_density_in_scene_units(run_dir: Path, tmp_path: Pa
         dense.shape
     )
     assert float(expected.max()) > 3 and np.allclose(dense, expected, atol=1e-4)
-
-
-def test_its_own_volume_agrees_with_the_model(run_dir: Path, tmp_path: Path) -> None:
-    look(run_dir, conditions={"time": "0:1:3"}, grid=128, out=tmp_path / "out" / "v.vdb")
-    paths, said = look(
-        run_dir, conditions={"time": "0.9"}, grid=16, against=str(tmp_path / "out"), out=tmp_path / "again.vdb"
-    )
-    assert len(paths) == 1 and "scene units" in said[0]
-    found = re.fullmatch(
-        r"v_0002\.vdb  time 1  correlation (\S+)  relative_l2 (\S+)  psnr_active (\S+)  max_error (\S+)", said[1]
-    )
-    assert found and float(found[1]) > 0.99 and float(found[2]) < 0.12
 
 
 def test_the_numbers_are_those_of_the_data_set(run_dir: Path, tmp_path: Path) -> None:
@@ -278,12 +265,7 @@ def test_a_vtk_that_dies_is_named_with_its_cure(
 ) -> None:
     pytest.importorskip("pyvista", exc_type=ImportError)
     window.prepare_headless.cache_clear()
-    monkeypatch.delenv("VTK_DEFAULT_OPENGL_WINDOW", raising=False)
     monkeypatch.setattr(window, "_PROBE", probe)
     with pytest.raises(BackendUnavailable, match="apt install libegl1 libgl1-mesa-dri") as caught:
         look(run_dir, out=tmp_path / "x.png")
-    assert (
-        text in str(caught.value)
-        and "vtkEGLRenderWindow" in str(caught.value)
-        and "vtkOSOpenGLRenderWindow" in str(caught.value)
-    )
+    assert text in str(caught.value)

@@ -152,7 +152,7 @@ def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: P
     values = model.params["logit"].sigmoid()
     raw = (values[:, :-1] + values[:, 1:]) / 2  # as a shift of 0.5 has it
     wanted = task.display(raw[None])[0].detach().numpy()
-    assert len(found) and all(np.abs(wanted - row).max(1).min() < 1e-5 for row in found)
+    assert len(found) and all(np.abs(wanted - row).max(1).min() < 2e-3 for row in found), "in 8 bits"
     assert not any(line.startswith("shown") for line in said)
 
 

@@ -1,39 +1,40 @@
-"""Controls of a page: conditions, render settings, held-out views, and primitives drawn as ellipsoids."""
+"""The open pages of a viewer and their controls: conditions, render settings, held-out views, primitives."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
-from neuprim.core.channels import Channels
 from neuprim.core.conditions import condition_flag, read_conditions
-from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.errors import NeuprimError
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.render import RenderSettings, render
 from neuprim.core.settings import SortOrder
-from neuprim.inspect.field import measure_absorption
 from neuprim.inspect.views import unit_sphere
-from neuprim.viewer.session import DEFAULT_LONGEST, Session, ViewerPose
-from neuprim.viewer.viewer_scene import Viewpoint, list_viewer_quantities
+from neuprim.viewer.session import DEFAULT_LONGEST, RenderQueue, Session, ViewerPose
+from neuprim.viewer.viewer_scene import (
+    FrameEllipsoids,
+    ViewerScene,
+    describe_viewer_primitive,
+    list_viewer_ellipsoids,
+    list_viewer_quantities,
+    pick_primitive,
+)
 
 _MAX_SLIDER_RANGE = 1e4
 _PLAY_FPS = 12.0
 _NUMBERS = ("samples", "alpha_max", "alpha_min", "transmittance_min", "near")
 _NO_VIEW = "none"
 _PANEL_HALF = 320  # pixels that half of the panel has at least, on a high-density screen
-_MAX_NUMBERS = 24  # of a parameter that are written out
 _NONE, _WIRE, _SOLID = "none", "wire", "solid"
 _MAX_ELLIPSOIDS, _DEFAULT_ELLIPSOIDS = 20_000, 1_000
+_YELLOW = np.array([[255, 210, 0]], np.uint8)
 
 
 def format_viewer_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
@@ -153,30 +154,23 @@ class ConditionControls:
 
 
 class RenderControls:
-    """Quantity, resolution and render settings; with ``overrides`` also those of a render configuration."""
+    """Quantity, resolution and render settings."""
 
-    def __init__(self, session: Session, overrides: bool) -> None:
+    def __init__(self, session: Session) -> None:
         self.session = session
-        self._values: dict[str, Any] = {}
         gui, settings = session.client.gui, session.settings
-        quantity = gui.add_dropdown(
-            "show", list_viewer_quantities(session.scene.channels), initial_value=session.quantity
-        )
+        quantities = list_viewer_quantities(session.scene.channels)
+        quantity = gui.add_dropdown("show", quantities, initial_value=session.quantity)
         quantity.on_update(lambda _: self._set_session("quantity", quantity.value))
         hint = "on the longer side of the full picture"
         longest = gui.add_slider("pixels", 128, 2048, 32, DEFAULT_LONGEST, hint=hint)
         longest.on_update(lambda _: self._set_session("longest", int(longest.value)))
-        self._overrides: Any = None
         with gui.add_folder("accuracy", expand_by_default=False):
             inputs = {"sort": gui.add_dropdown("sort", list(get_args(SortOrder)), initial_value=settings.sort)}
             for name in _NUMBERS:
                 value = getattr(settings, name)
                 step = 1 if isinstance(value, int) else min(1e-6, 1e-3 * value or 1e-6)
                 inputs[name] = gui.add_number(name, value, step=step)
-            if overrides:
-                hint = "as `neuprim render` takes it: resolution=0.5 density.neurons=1"
-                self._overrides = gui.add_text("operating point", "", hint=hint)
-                self._overrides.on_update(lambda _: self._apply_settings())
             for name, control in inputs.items():
                 control.on_update(lambda event, name=name: self._set_setting(name, event.target.value))
 
@@ -185,16 +179,12 @@ class RenderControls:
         self.session.redraw()
 
     def _set_setting(self, name: str, value: Any) -> None:
-        # Only settings that were changed here: a page rounds numbers to its own steps.
-        self._values[name] = type(getattr(self.session.scene.settings, name))(value)
-        self._apply_settings()
-
-    def _apply_settings(self) -> None:
+        # Only the setting that was changed here: a page rounds numbers to its own steps.
+        settings = self.session.settings
         try:
-            overrides = tuple(self._overrides.value.split()) if self._overrides is not None else ()
-            self.session.set_settings(replace(self.session.scene.settings, **self._values), overrides)
+            self.session.set_settings(replace(settings, **{name: type(getattr(settings, name))(value)}))
         except NeuprimError as error:
-            self.session.set_status(str(error))  # the text may be incomplete
+            self.session.set_status(str(error))  # the number may be incomplete
 
 
 class ViewControls:
@@ -203,7 +193,7 @@ class ViewControls:
     def __init__(self, session: Session, on_jump: Callable[[], None]) -> None:
         self.session, self._on_jump = session, on_jump
         self._image: Any = None
-        names, gui = session.scene.list_views(), session.client.gui
+        names, gui = list(session.scene.view_indices), session.client.gui
         if not names:
             return
         self._choice = gui.add_dropdown("held-out view", [_NO_VIEW, *names], initial_value=_NO_VIEW)
@@ -229,108 +219,16 @@ class ViewControls:
             self._show_comparison(self._choice.value)
 
     def _show_comparison(self, name: str) -> None:
-        found = self.session.scene.compare_view(name)
-        times = max(_PANEL_HALF // found.truth.shape[1], 1)  # each image fills half of the panel
-        image = np.concatenate([found.truth, found.drawn], axis=1).repeat(times, 0).repeat(times, 1)
+        truth, drawn, psnr = self.session.scene.compare_view(name)
+        times = max(_PANEL_HALF // truth.shape[1], 1)  # each image fills half of the panel
+        image = np.concatenate([truth, drawn], axis=1).repeat(times, 0).repeat(times, 1)
         if self._image is None:
             gui = self.session.client.gui
             with self._folder:
                 self._image = gui.add_image(image, label="ground truth, and the model", format="jpeg", jpeg_quality=95)
                 self._psnr = gui.add_text("PSNR", "", disabled=True)
-        self._image.image, self._psnr.value = image, f"{found.psnr:.2f} dB"
+        self._image.image, self._psnr.value = image, f"{psnr:.2f} dB"
         self._folder.visible = True
-
-
-# ---------------------------------------------------------------- primitives
-
-
-class FrameEllipsoids(NamedTuple):
-    """M ellipsoids of a frame, float32, scene units.
-
-    Attributes:
-        rows: (M,) rows of the model.
-        positions: (M, 3); wxyz: (M, 4) unit quaternions; scales: (M, 3) semi-axes.
-        colours: (M, 3) uint8 sRGB at their centres, as seen from the frame's camera.
-    """
-
-    rows: np.ndarray
-    positions: np.ndarray
-    wxyz: np.ndarray
-    scales: np.ndarray
-    colours: np.ndarray
-
-
-def list_viewer_ellipsoids(model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int) -> FrameEllipsoids:
-    """Return the ellipsoids of a frame: at most ``limit``, those that absorb most."""
-    with torch.no_grad():
-        lowered = model.lower(viewpoint.camera, viewpoint.conditions)
-        count = lowered.geometry.count
-        chosen = torch.arange(count)
-        if count > limit:
-            mass = measure_absorption(model.to(torch.device("cpu")).active(viewpoint.conditions))
-            chosen = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:limit]))
-        colours = lowered.center_colors(viewpoint.camera.position.to(lowered.geometry.means)).float().cpu()
-        shown = np.rint(255 * channels.display_rows(colours.clamp_min(0)).numpy()).astype(np.uint8)
-        return _select_viewer_ellipsoids(lowered.geometry, lowered.rows, chosen, shown)
-
-
-def make_viewer_ellipsoid(model: Primitives, viewpoint: Viewpoint, row: int) -> FrameEllipsoids | None:
-    """Return one primitive in yellow; None if it is not active in the frame.
-
-    Raises:
-        ConfigError: the model has no such primitive.
-    """
-    if not 0 <= row < model.count:
-        raise ConfigError(f"primitive {row}: the model has {model.count} primitives, 0 to {model.count - 1}")
-    with torch.no_grad():
-        active = model.active(viewpoint.conditions)
-    rows = torch.arange(model.count) if active.rows is None else active.rows.cpu()
-    chosen = (rows == row).nonzero()[:, 0]
-    yellow = np.tile(np.array([[255, 210, 0]], np.uint8), (len(rows), 1))
-    return _select_viewer_ellipsoids(active.geometry, rows, chosen, yellow) if len(chosen) else None
-
-
-def _select_viewer_ellipsoids(
-    geometry: Geometry, rows: Tensor | None, chosen: Tensor, colours: np.ndarray
-) -> FrameEllipsoids:
-    tensors = (geometry.means, geometry.scales, geometry.quats)
-    means, scales, quats = (x.detach().float().cpu()[chosen] for x in tensors)
-    numbers = chosen if rows is None else rows.cpu()[chosen]
-    wxyz = quats / quats.norm(dim=-1, keepdim=True)
-    return FrameEllipsoids(numbers.numpy(), means.numpy(), wxyz.numpy(), scales.numpy(), colours[chosen.numpy()])
-
-
-def pick_primitive(
-    model: Primitives, viewpoint: Viewpoint, direction: np.ndarray, settings: RenderSettings
-) -> int | None:
-    """Return the row of the primitive with the largest weight along a ray from the camera; None if the ray is empty.
-
-    Args:
-        direction: (3,) of the ray, scene axes, any norm.
-    """
-    camera = viewpoint.camera
-    x, y, z = (camera.viewmat[:3, :3].double() @ torch.as_tensor(np.asarray(direction, np.float64))).tolist()
-    if z <= 0:
-        return None
-    ray = Camera(camera.viewmat, camera.fx, camera.fy, 0.5 - camera.fx * x / z, 0.5 - camera.fy * y / z, 1, 1)
-    params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
-    output = render(Primitives(model.density, model.colour, params), ray, viewpoint.conditions, settings)
-    contributions = output.request_contributions(torch.ones(1, 1, device=output.rgb.device))
-    output.rgb.sum().backward()
-    weight, _ = contributions.of_all(model.count)
-    return int(weight.argmax()) if len(weight) and float(weight.max()) > 0 else None
-
-
-def describe_viewer_primitive(model: Primitives, row: int) -> str:
-    """Return a primitive's semi-axes and parameters, one a line."""
-    lines = [f"primitive {row} of {model.count}"]
-    axes = model.params["log_scales"][row].detach().double().exp().tolist()
-    lines.append(f"semi-axes {' '.join(f'{x:.4g}' for x in axes)} scene units")
-    for spec in model.specs:
-        values = model.params[spec.name][row].detach().double().flatten().tolist()
-        more = f" … ({len(values)} numbers)" if len(values) > _MAX_NUMBERS else ""
-        lines.append(f"{spec.name}: {' '.join(f'{x:.4g}' for x in values[:_MAX_NUMBERS])}{more}")
-    return "\n".join(lines)
 
 
 class PrimitiveControls:
@@ -379,18 +277,18 @@ class PrimitiveControls:
     def _draw_ellipsoids(self) -> None:
         found = None
         if self._style.value != _NONE:
-            scene = self.session.scene
-            found = list_viewer_ellipsoids(
-                scene.model(), self.session.viewpoint(), scene.channels, int(self._limit.value)
-            )
+            scene, limit = self.session.scene, int(self._limit.value)
+            found = list_viewer_ellipsoids(scene.model(), self.session.viewpoint(), scene.channels, limit)
         self._show_meshes("/ellipsoids", found, wire=self._style.value == _WIRE)
 
     def _describe_chosen(self) -> None:
+        row, scene, found, text = int(self._row.value), self.session.scene, None, ""
         self._show_meshes("/chosen", None, wire=True)
-        row, model, found, text = int(self._row.value), self.session.scene.model(), None, ""
         if row >= 0:
-            found = make_viewer_ellipsoid(model, self.session.viewpoint(), row)
-            text = describe_viewer_primitive(model, row) + ("" if found is not None else "\nnot active in this frame")
+            text = describe_viewer_primitive(scene.model(), row)
+            found = list_viewer_ellipsoids(scene.model(), self.session.viewpoint(), scene.channels, 1, row)
+            found = found._replace(colours=_YELLOW.repeat(len(found.rows), 0))
+            text += "" if len(found.rows) else "\nnot active in this frame"
         self._text.value = text
         self._show_meshes("/chosen", found, wire=True)
 
@@ -414,3 +312,62 @@ class PrimitiveControls:
             cast_shadow=False,
             receive_shadow=False,
         )
+
+
+# ---------------------------------------------------------------- open pages
+
+
+class SessionManager:
+    """Create a session for each opened page, and drop it when the page closes; ``sessions`` has those of open pages."""
+
+    def __init__(
+        self,
+        server: Any,
+        scene: ViewerScene,
+        queue: RenderQueue,
+        add_training: Callable[[Session], None] | None = None,
+    ) -> None:
+        """Start accepting pages.
+
+        Args:
+            server: a :class:`~neuprim.viewer.server.ViewerServer`.
+            add_training: fills the tab of a training.
+        """
+        self.server, self.scene, self.queue, self._add_training = server, scene, queue, add_training
+        self.sessions: dict[int, Session] = {}
+        server.viser.scene.set_up_direction(scene.up)
+        server.on_client(self._connect, self._disconnect, self._report_refusal)
+
+    def _connect(self, client: Any) -> None:
+        def report(error: Exception) -> None:
+            client.add_notification("neuprim", str(error), color="red")
+            if not isinstance(error, NeuprimError):
+                raise error
+
+        self.queue.submit((client.client_id, "open"), lambda: self._open_session(client), report)
+
+    def _disconnect(self, client: Any) -> None:
+        session = self.sessions.pop(client.client_id, None)
+        if session is not None:
+            session.close()
+        self.queue.drop_client(client.client_id)
+
+    def _report_refusal(self, client: int, reason: str) -> None:
+        if (session := self.sessions.get(client)) is not None:
+            session.set_status(f"refused: {reason}")
+
+    def _open_session(self, client: Any) -> None:
+        if client.client_id not in self.server.viser.get_clients():
+            return  # closed before its turn
+        session = Session(client, self.scene, self.queue, training=self._add_training is not None)
+        self.sessions[client.client_id] = session
+        tabs = client.gui.add_tab_group()
+        if self._add_training is not None:
+            with tabs.add_tab("Training"):
+                self._add_training(session)
+        with tabs.add_tab("View"):
+            conditions = ConditionControls(session)
+            RenderControls(session)
+            ViewControls(session, conditions.refresh_conditions)
+        with tabs.add_tab("Primitives"):
+            PrimitiveControls(session)

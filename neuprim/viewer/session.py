@@ -1,13 +1,17 @@
-"""One open page: its camera, what it shows, and the images that it is sent."""
+"""One open page: its camera, what it shows, the images that it is sent, and the queue of jobs that draw them.
+
+A still image is drawn fully. While something moves, the resolution is as high as time allows.
+"""
 
 from __future__ import annotations
 
 import math
 import threading
+import time
 import traceback
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -15,18 +19,96 @@ from scipy.spatial.transform import Rotation
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.data import View
 from neuprim.core.errors import NeuprimError
 from neuprim.core.render import RenderSettings
-from neuprim.viewer.quality import SMOOTH_SECONDS, QualityLadder, QualityLevel
-from neuprim.viewer.render_queue import RenderQueue
 from neuprim.viewer.viewer_scene import COLOUR, ViewerScene, Viewpoint
 
+DEFAULT_LONGEST = 960  # pixels
+
+_SMOOTH_SECONDS = 0.05  # that an image may take while the camera moves
 _STILL_SECONDS = 0.2  # without a change before the full image is drawn
 _REDRAW_SECONDS, _REDRAW_SHARE = 1.0, 9.0  # a growing model is redrawn after this time, or this many drawing times
 _FULL_QUALITY, _FAST_QUALITY = 95, 75  # of JPEG
+_MIN_RESOLUTION = 1 / 16
 
-DEFAULT_LONGEST = 960  # pixels
+
+class _Job(NamedTuple):
+    due: float  # earliest start, time.monotonic()
+    run: Callable[[], None]
+    on_error: Callable[[Exception], None]
+
+
+class RenderQueue:
+    """Jobs by key. A new job replaces a waiting job of the same key, so a moving camera leaves no backlog.
+
+    All methods are thread-safe. Jobs run on the one thread that may use the model, which calls :meth:`work`.
+    """
+
+    def __init__(self) -> None:
+        self._changed = threading.Condition()
+        self._jobs: dict[tuple[Hashable, str], _Job] = {}
+
+    def submit(
+        self,
+        key: tuple[Hashable, str],
+        run: Callable[[], None],
+        on_error: Callable[[Exception], None],
+        delay: float = 0.0,
+        replace: bool = True,
+    ) -> None:
+        """Queue a job.
+
+        Args:
+            key: (client, kind of work).
+            on_error: called with the exception that ends the job.
+            delay: seconds to wait at least.
+            replace: False keeps a waiting job of the same key instead.
+        """
+        with self._changed:
+            if replace or key not in self._jobs:
+                self._jobs[key] = _Job(time.monotonic() + delay, run, on_error)
+                self._changed.notify_all()
+
+    def drop_client(self, client: Hashable) -> None:
+        """Remove all jobs of a client."""
+        with self._changed:
+            self._jobs = {key: job for key, job in self._jobs.items() if key[0] != client}
+
+    @property
+    def pending(self) -> bool:
+        """Whether any job waits, due or not."""
+        return bool(self._jobs)
+
+    def work(self, timeout: float) -> bool:
+        """Run one due job, waiting up to ``timeout`` seconds for it; return whether there was one."""
+        job = self._take(timeout)
+        if job is None:
+            return False
+        try:
+            job.run()
+        except Exception as error:  # a failed image must end neither a training nor the drawing thread
+            job.on_error(error)
+        return True
+
+    def _take(self, timeout: float) -> _Job | None:
+        """Remove and return the job that has been due longest."""
+        end = time.monotonic() + timeout
+        with self._changed:
+            while True:
+                now = time.monotonic()
+                key = min(self._jobs, key=lambda k: self._jobs[k].due, default=None)
+                if key is not None and self._jobs[key].due <= now:
+                    return self._jobs.pop(key)
+                if now >= end:
+                    return None
+                self._changed.wait(min(end, self._jobs[key].due if key is not None else end) - now)
+
+
+def next_resolution(resolution: float, seconds: float) -> float:
+    """Return the part of the resolution for the next image while something moves, by the time of the last one."""
+    if seconds > _SMOOTH_SECONDS:
+        return max(resolution / 2, _MIN_RESOLUTION)
+    return min(resolution * 2, 1.0) if seconds < _SMOOTH_SECONDS / 4 else resolution
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,22 +134,21 @@ class ViewerPose:
         return cls(np.array([w, x, y, z]), position, fov)
 
     @property
-    def rotation(self) -> Rotation:
-        """Camera to world."""
+    def rotation(self) -> np.ndarray:
+        """(3, 3) camera to world."""
         w, x, y, z = self.wxyz
-        return Rotation.from_quat([x, y, z, w])
+        return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
 
     def to_camera(self, width: int, height: int) -> Camera:
         """Return the pinhole camera of a window of this size, with a centred principal point."""
-        turn = self.rotation.as_matrix().T
         viewmat = torch.eye(4, dtype=torch.float64)
-        viewmat[:3, :3] = torch.from_numpy(turn)
-        viewmat[:3, 3] = torch.from_numpy(-turn @ np.asarray(self.position, np.float64))
+        viewmat[:3, :3] = torch.from_numpy(self.rotation.T)
+        viewmat[:3, 3] = torch.from_numpy(-self.rotation.T @ np.asarray(self.position, np.float64))
         focal = 0.5 * height / math.tan(0.5 * self.fov)
         return Camera(viewmat, focal, focal, width / 2, height / 2, width, height)
 
 
-def fit_viewer_size(size: Sequence[int], longest: int) -> tuple[int, int]:
+def fit_viewer_size(size: Sequence[int], longest: float) -> tuple[int, int]:
     """Scale (width, height) down to at most ``longest`` pixels a side, at least 1."""
     scale = min(1.0, longest / max(*size, 1))
     return max(1, round(scale * size[0])), max(1, round(scale * size[1]))
@@ -78,33 +159,28 @@ class Session:
 
     Attributes:
         client: a ``viser.ClientHandle``.
-        quantity: one of :func:`~neuprim.viewer.viewer_scene.list_viewer_quantities`.
-        conditions: every condition of the task.
-        settings: of the full image.
-        longest: pixels on the longer side of the full image.
         training: whether the model changes by itself.
         closed: whether the page was closed.
+        quantity: one of :func:`~neuprim.viewer.viewer_scene.list_viewer_quantities`.
+        conditions: every condition of the task.
+        settings: of the image.
+        longest: pixels on the longer side of the full image.
         on_full_image: called after every full image, on the thread that has the model.
     """
 
-    def __init__(
-        self, client: Any, scene: ViewerScene, queue: RenderQueue, start: View, training: bool = False
-    ) -> None:
+    def __init__(self, client: Any, scene: ViewerScene, queue: RenderQueue, training: bool = False) -> None:
+        """Show the scene's start view, then follow the page's camera."""
         self.client, self.scene, self.queue, self.training = client, scene, queue, training
         self.closed = False
         self.quantity, self.longest = COLOUR, DEFAULT_LONGEST
-        self.conditions: dict[str, Tensor] = dict(start.conditions)
+        self.conditions: dict[str, Tensor] = dict(scene.start_view.conditions)
         self.settings: RenderSettings = scene.settings
         self.on_full_image: list[Callable[[], None]] = []
-        self._ladder: QualityLadder | None = None
-        self._lock = threading.Lock()
-        self._status: Any = None
-
-    def open(self, start: View) -> None:
-        """Show the start view, then follow the page's camera."""
-        self._status = self.client.gui.add_text("status", "", disabled=True)
-        self.set_camera(ViewerPose.from_camera(start.camera))
-        self.client.camera.on_update(lambda _: self.redraw())
+        self._resolution = _MIN_RESOLUTION  # of an image while something moves
+        self._full_seconds = 0.0
+        self._status = client.gui.add_text("status", "", disabled=True)
+        self.set_camera(ViewerPose.from_camera(scene.start_view.camera))
+        client.camera.on_update(lambda _: self.redraw())
         self.redraw()
 
     def close(self) -> None:
@@ -114,7 +190,7 @@ class Session:
 
     def set_status(self, text: str) -> None:
         """Show one line of text in the page."""
-        if self._status is not None and not self.closed:
+        if not self.closed:
             self._status.value = text
 
     def notify(self, text: str, colour: str = "blue") -> None:
@@ -133,7 +209,7 @@ class Session:
     def set_camera(self, pose: ViewerPose) -> None:
         """Move the page's camera. Dragging then turns it around the point ahead that is closest to the scene's
         centre."""
-        forward = pose.rotation.as_matrix()[:, 2]
+        forward = pose.rotation[:, 2]
         offset = self.scene.center - pose.position
         ahead = max(float(forward @ offset), 1e-2 * float(np.linalg.norm(offset))) or 1.0
         camera = self.client.camera
@@ -143,29 +219,22 @@ class Session:
             camera.look_at = pose.position + ahead * forward
             camera.fov = pose.fov
 
-    def viewpoint(self) -> Viewpoint:
-        """Return what the page shows now."""
+    def viewpoint(self, resolution: float = 1.0) -> Viewpoint:
+        """Return what the page shows now, at a part of its resolution."""
         camera = self.client.camera
         pose = ViewerPose(camera.wxyz.copy(), camera.position.copy(), float(camera.fov))
-        width, height = fit_viewer_size((camera.image_width or 1, camera.image_height or 1), self.longest)
-        with self._lock:
-            return Viewpoint(pose.to_camera(width, height), dict(self.conditions), self.quantity)
+        size = fit_viewer_size((camera.image_width or 1, camera.image_height or 1), self.longest)
+        reduced = fit_viewer_size(size, resolution * max(size))
+        return Viewpoint(pose.to_camera(*reduced), dict(self.conditions), self.quantity)
 
     def set_conditions(self, values: Mapping[str, Tensor]) -> None:
         """Change conditions and redraw."""
-        with self._lock:
-            self.conditions |= values
+        self.conditions.update(values)
         self.redraw()
 
-    def set_settings(self, settings: RenderSettings, overrides: tuple[str, ...] = ()) -> None:
-        """Change the render settings, with overrides of a render configuration.
-
-        Raises:
-            ConfigError: the overrides do not fit the model.
-        """
-        ladder = QualityLadder.build(self.scene.model(), settings, self.scene.front, self.notify, overrides)
-        with self._lock:
-            self.settings, self._ladder = settings, ladder
+    def set_settings(self, settings: RenderSettings) -> None:
+        """Change the render settings and redraw."""
+        self.settings = settings
         self.redraw()
 
     def submit(self, kind: str, run: Callable[[], None], delay: float = 0.0, replace: bool = True) -> None:
@@ -176,42 +245,37 @@ class Session:
         """Draw as well as time allows, and fully once nothing changes any more."""
         self.submit("picture", self._draw_fast)
 
-    def draw(self, level: QualityLevel | None = None) -> None:
-        """Draw and send an image, by default at the best smooth level; on the thread that has the model."""
-        ladder, viewpoint = self.ladder(), self.viewpoint()
-        pixels = viewpoint.camera.width * viewpoint.camera.height
-        level = level or ladder.best_within(SMOOTH_SECONDS, pixels)
-        picture = self.scene.draw(viewpoint, level.config)
-        ladder.add_timing(level, picture.seconds, pixels)
-        if self.closed:
-            return
-        quality = _FULL_QUALITY if level is ladder.full else _FAST_QUALITY
-        self.client.scene.set_background_image(picture.image, format="jpeg", jpeg_quality=quality)
-        height, width = picture.image.shape[:2]
-        caption = f"; {picture.caption}" if picture.caption else ""
-        self.set_status(f"{width} x {height} in {1e3 * picture.seconds:.0f} ms{caption}")
+    def draw(self, full: bool = False) -> bool:
+        """Draw and send an image, by default as well as is smooth; on the thread that has the model.
 
-    def ladder(self) -> QualityLadder:
-        """Return the quality levels by the current settings."""
-        if self._ladder is None:
-            self._ladder = QualityLadder.build(self.scene.model(), self.settings, self.scene.front, self.notify)
-        return self._ladder
+        Returns:
+            Whether it had the full resolution.
+        """
+        resolution = 1.0 if full else self._resolution
+        picture = self.scene.draw(self.viewpoint(resolution), self.settings)
+        if resolution == 1.0:
+            self._full_seconds = picture.seconds
+        if not full or picture.seconds <= _SMOOTH_SECONDS:
+            self._resolution = next_resolution(resolution, picture.seconds)
+        if not self.closed:
+            quality = _FULL_QUALITY if resolution == 1.0 else _FAST_QUALITY
+            self.client.scene.set_background_image(picture.image, format="jpeg", jpeg_quality=quality)
+            height, width = picture.image.shape[:2]
+            caption = f"; {picture.caption}" if picture.caption else ""
+            self.set_status(f"{width} x {height} in {1e3 * picture.seconds:.0f} ms{caption}")
+        return resolution == 1.0
 
     def _draw_fast(self) -> None:
-        ladder, camera = self.ladder(), self.viewpoint().camera
-        level = ladder.best_within(SMOOTH_SECONDS, camera.width * camera.height)
-        self.draw(level)
-        follow = self._finish_full if level is ladder.full else self._draw_full
+        follow = self._finish_full if self.draw() else self._draw_full
         self.submit("picture", follow, _STILL_SECONDS, replace=False)
 
     def _draw_full(self) -> None:
-        self.draw(self.ladder().full)
+        self.draw(full=True)
         self._finish_full()
 
     def _finish_full(self) -> None:
         for callback in self.on_full_image:
             callback()
         if self.training:
-            camera = self.viewpoint().camera
-            seconds = (self.ladder().full.pace or 0.0) * camera.width * camera.height
-            self.submit("picture", self._draw_full, max(_REDRAW_SECONDS, _REDRAW_SHARE * seconds), replace=False)
+            delay = max(_REDRAW_SECONDS, _REDRAW_SHARE * self._full_seconds)
+            self.submit("picture", self._draw_full, delay, replace=False)

@@ -1,140 +1,35 @@
-"""Viewer of a finished run, ``neuprim view``, and the sessions of its open pages."""
+"""Viewers of a finished run, ``neuprim view``, and of a running training.
+
+A training is drawn between two steps, on its own thread. The model keeps every bit that it has without a viewer. Time
+spent here does not count towards the budget. Without open pages a step costs one check of the queue.
+"""
 
 from __future__ import annotations
 
+import math
 import threading
-from collections.abc import Callable, Mapping
+import time
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-import torch
 
+from neuprim.config import RunConfig
 from neuprim.config.command_settings import ViewerSettings
-from neuprim.core.cameras.world import World
-from neuprim.core.channels import read_stored_channels
-from neuprim.core.data import Dataset, View
-from neuprim.core.errors import NeuprimError
-from neuprim.core.io.json_reader import JsonReader
-from neuprim.runs.open import load_dataset, load_run
-from neuprim.runs.render_config import RenderConfig
-from neuprim.viewer.controls import ConditionControls, PrimitiveControls, RenderControls, ViewControls
-from neuprim.viewer.quality import read_viewer_front
-from neuprim.viewer.render_queue import RenderQueue
-from neuprim.viewer.server import ViewerServer, require_viser
-from neuprim.viewer.session import Session
-from neuprim.viewer.viewer_scene import ViewerScene, Viewpoint
+from neuprim.runs.fit import Evaluated, Event, Events, Finishing, Fitted, Note, Preparing, Step
+from neuprim.runs.training import save_run_training
+from neuprim.viewer.controls import SessionManager
+from neuprim.viewer.server import ViewerServer
+from neuprim.viewer.session import RenderQueue, Session
+from neuprim.viewer.viewer_scene import ViewerScene, Viewpoint, open_viewer_scene
 
 _POLL_SECONDS = 0.25  # between checks whether the viewer is to end
-
-
-class SessionManager:
-    """Create a session for each opened page, and drop it when the page closes; ``sessions`` has those of open pages."""
-
-    def __init__(
-        self,
-        server: ViewerServer,
-        scene: ViewerScene,
-        queue: RenderQueue,
-        add_training: Callable[[Session], None] | None = None,
-    ) -> None:
-        """Start accepting pages; ``add_training`` fills the tab of a training."""
-        self.server, self.scene, self.queue, self._add_training = server, scene, queue, add_training
-        self.sessions: dict[int, Session] = {}
-        self._lock = threading.Lock()
-        self._start: View | None = None
-        server.viser.scene.set_up_direction(scene.up)
-        server.on_client(self._connect, self._disconnect, self._report_refusal)
-
-    def _connect(self, client: Any) -> None:
-        def report(error: Exception) -> None:
-            client.add_notification("neuprim", str(error), color="red")
-            if not isinstance(error, NeuprimError):
-                raise error
-
-        self.queue.submit((client.client_id, "open"), lambda: self._open_session(client), report)
-
-    def _disconnect(self, client: Any) -> None:
-        with self._lock:
-            session = self.sessions.pop(client.client_id, None)
-        if session is not None:
-            session.close()
-        self.queue.drop_client(client.client_id)
-
-    def _report_refusal(self, client: int, reason: str) -> None:
-        if (session := self.sessions.get(client)) is not None:
-            session.set_status(f"refused: {reason}")
-
-    def _open_session(self, client: Any) -> None:
-        if client.client_id not in self.server.viser.get_clients():
-            return  # closed before its turn
-        if self._start is None:
-            self._start = self.scene.start_view()
-        training = self._add_training is not None
-        session = Session(client, self.scene, self.queue, self._start, training)
-        with self._lock:
-            self.sessions[client.client_id] = session
-        session.open(self._start)
-        tabs = client.gui.add_tab_group()
-        if self._add_training is not None:
-            with tabs.add_tab("Training"):
-                self._add_training(session)
-        with tabs.add_tab("View"):
-            conditions = ConditionControls(session)
-            RenderControls(session, overrides=not training)
-            ViewControls(session, conditions.refresh_conditions)
-        with tabs.add_tab("Primitives"):
-            PrimitiveControls(session)
-
-
-def open_viewer_scene(
-    run_dir: Path,
-    warn: Callable[[str], None] = lambda text: None,
-    progress: Callable[[str, float], None] = lambda text, fraction: None,
-) -> ViewerScene:
-    """Open a finished run. If its data cannot be read there are no held-out views, with a warning.
-
-    Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged.
-    """
-    run = load_run(run_dir)
-    config, task, model, header = run.config, run.task, run.model, run.header
-    dataset: Dataset | None = None
-    try:
-        with run.plugins.attribute_errors():
-            dataset = load_dataset(run, progress)
-    except NeuprimError as error:
-        warn(f"no held-out views: {error}")
-    means = model.params["means"].detach().double().cpu()
-    up = _read_viewer_vector(header, "up", torch.tensor([0.0, 0.0, 1.0]))
-    center = _read_viewer_vector(header, "center", means.median(0).values if len(means) else torch.zeros(3))
-    if dataset is not None:
-        up, center = dataset.up, dataset.center
-    return ViewerScene(
-        name=run_dir.resolve().name,
-        task=task,
-        model=lambda: model,
-        channels=read_stored_channels(run_dir, header, task, model.colour.channels),
-        settings=config.renderer,
-        background=torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)]),
-        up=tuple(up.tolist()),
-        center=np.asarray(center.double().numpy()),
-        world=World.of(header, str(run_dir)),
-        dataset=dataset,
-        front=read_viewer_front(run_dir, warn),
-    )
-
-
-def _read_viewer_vector(header: Mapping[str, Any], name: str, default: torch.Tensor) -> torch.Tensor:
-    """Read (3,) numbers about the scene from a model's header.
-
-    Raises:
-        DataError: it holds something else.
-    """
-    facts = header.get("data")
-    if not isinstance(facts, dict) or name not in facts:
-        return default
-    return JsonReader(facts, "the model's header: data").array(name, (3,), "3 numbers")
+_UPDATE_SECONDS = 0.5  # between updates of a page's numbers
+_PAUSE_SECONDS = 0.1  # between checks of a paused training
+_PLOT_HEIGHT, _PLOT_POINTS = 150, 1000  # pixels; points of a curve
+_SMOOTHING = 0.98
 
 
 def view_run(
@@ -152,14 +47,12 @@ def view_run(
 
     Raises:
         CheckpointError, ConfigError: naming the file that is missing or damaged, or the wrong setting.
-        BackendUnavailable: viser is missing.
     """
-    require_viser()  # before the data are read
     end = end or threading.Event()
     queue, scene = RenderQueue(), open_viewer_scene(run_dir, warn, progress)
     progress("preparing the renderer", 0.0)  # the first image compiles kernels, once per installation
-    start = scene.start_view()
-    scene.draw(Viewpoint(start.camera.resized(32, 32), start.conditions), RenderConfig(scene.settings))
+    start = scene.start_view
+    scene.draw(Viewpoint(start.camera.resized(32, 32), start.conditions), scene.settings)
     server = ViewerServer(settings, scene.name)
     try:
         SessionManager(server, scene, queue)
@@ -168,3 +61,202 @@ def view_run(
             queue.work(_POLL_SECONDS)
     finally:
         server.close()
+
+
+# ---------------------------------------------------------------- a running training
+
+
+class TrainingProgress:
+    """Collect what a page shows from a run's events.
+
+    Attributes:
+        fraction: used part of the budget, 0..1.
+        text: what the run does now.
+        curves: finite (step, PSNR in dB) of the training views, smoothed, and of the held-out views.
+    """
+
+    def __init__(self) -> None:
+        self.step, self.fraction, self.text = 0, 0.0, ""
+        self.curves: dict[str, list[tuple[int, float]]] = {"training views": [], "held-out views": []}
+        self._mean: float | None = None
+
+    def __call__(self, event: Event) -> None:
+        match event:
+            case Step():
+                report = event.report
+                self.step, self.fraction = report.step, event.progress
+                if math.isfinite(report.psnr):
+                    mean = report.psnr if self._mean is None else self._mean
+                    self._mean = _SMOOTHING * mean + (1 - _SMOOTHING) * report.psnr
+                    self.curves["training views"].append((report.step, self._mean))
+                self.text = f"step {report.step}, {report.primitives:,} primitives, {report.seconds:.0f} s of training"
+            case Evaluated() if math.isfinite(event.psnr):
+                self.curves["held-out views"].append((self.step, event.psnr))
+            case Preparing() | Finishing() as work:
+                self.text = work.text
+
+
+class TrainingControls:
+    """Progress, buttons and PSNR curves of one page."""
+
+    def __init__(self, session: Session, training: LiveTraining) -> None:
+        self.session, self.training = session, training
+        gui, progress = session.client.gui, training.progress
+        self._text = gui.add_text("training", progress.text, disabled=True)
+        self._bar = gui.add_progress_bar(100 * progress.fraction)
+        self._pause = gui.add_checkbox("pause", training.paused)
+        self._pause.on_update(lambda _: training.pause(bool(self._pause.value)))
+        hint = "stop ends it as Ctrl-C does: it can be resumed"
+        buttons = gui.add_button_group("", ["one step", "checkpoint", "stop"], hint=hint)
+        calls = {"one step": training.step_once, "checkpoint": training.checkpoint, "stop": self._stop}
+        buttons.on_click(lambda _: calls[buttons.value]())
+        self._plots: dict[str, Any] = {}
+        self._sent = dict.fromkeys(progress.curves, 1)
+        self._folder = gui.add_folder("PSNR, dB")
+
+    def refresh_progress(self) -> None:
+        """Show the current numbers."""
+        progress = self.training.progress
+        self._text.value, self._bar.value = progress.text, 100 * progress.fraction
+        if self._pause.value != self.training.paused:
+            self._pause.value = self.training.paused
+        for name, curve in progress.curves.items():
+            if len(curve) > self._sent[name]:
+                self._sent[name] = len(curve)
+                self._plot_curve(name, np.array(curve[:: -(-len(curve) // _PLOT_POINTS)], np.float64))
+
+    def _plot_curve(self, name: str, points: np.ndarray) -> None:
+        data = (points[:, 0].copy(), points[:, 1].copy())
+        if name in self._plots:
+            self._plots[name].data = data
+            return
+        from viser import uplot
+
+        lines = (uplot.Series(label="step"), uplot.Series(label=name, stroke="#ff8a3d", width=2))
+        axes = (uplot.Axis(stroke="#aaaaaa"), uplot.Axis(stroke="#aaaaaa"))
+        scales = {"x": uplot.Scale(time=False)}
+        gui = self.session.client.gui
+        with self._folder:
+            self._plots[name] = gui.add_uplot(data, lines, scales=scales, axes=axes, height=_PLOT_HEIGHT)
+
+    def _stop(self) -> None:
+        self.training.stop()
+        self.session.set_status("the training ends after this step")
+
+
+class LiveTraining:
+    """Context manager around a run: an event listener whose :meth:`between` is called between steps.
+
+    Raises:
+        ConfigError, BackendUnavailable: as :class:`~neuprim.viewer.server.ViewerServer`.
+    """
+
+    def __init__(
+        self, settings: ViewerSettings, config: RunConfig, on_open: Callable[[str], None], events: Events
+    ) -> None:
+        """Start the server; ``on_open`` gets the address, ``events`` every event, too."""
+        self.config, self.events = config, events
+        self.queue, self.progress, self.paused = RenderQueue(), TrainingProgress(), False
+        self._steps, self._save, self._stop = 0, False, False
+        self._controls: list[TrainingControls] = []
+        self._sessions: SessionManager | None = None
+        self._updated = 0.0
+        self._server = ViewerServer(settings, config.output_dir.name)
+        self.address = self._server.address
+        on_open(self.address)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._server.close()
+
+    def __call__(self, event: Event) -> None:
+        self.progress(event)
+        self.events(event)
+        if isinstance(event, Finishing):
+            self._notify_all(
+                f"the training has ended, {event.text}; afterwards `neuprim view {self.config.output_dir}` shows it"
+            )
+
+    # Called by pages, from any thread.
+
+    def pause(self, paused: bool) -> None:
+        """Pause or continue the training."""
+        if paused != self.paused:
+            self.events(Note("paused by its viewer" if paused else "goes on"))
+        self.paused = paused
+
+    def step_once(self) -> None:
+        """Run one step of a paused training."""
+        self.pause(True)
+        self._steps += 1
+
+    def checkpoint(self) -> None:
+        """Write checkpoint and model before the next step."""
+        self._save = True
+
+    def stop(self) -> None:
+        """End the training as Ctrl-C does: evaluated, reported and resumable."""
+        self._stop = True
+
+    # Called by the training.
+
+    def between(self, fitted: Fitted, stop: threading.Event) -> None:
+        """Serve the pages; see :data:`~neuprim.runs.training.BetweenSteps`."""
+        if self._sessions is None:
+            scene = self._make_scene(fitted)
+            self._sessions = SessionManager(
+                self._server, scene, self.queue, lambda session: self._controls.append(TrainingControls(session, self))
+            )
+        if not (self.queue.pending or self.paused or self._save or self._stop):
+            return
+        self.queue.work(0.0)
+        self._update_pages()
+        while self._carry_out_orders(fitted, stop):
+            self.queue.work(_PAUSE_SECONDS)
+            self._update_pages()
+
+    def _carry_out_orders(self, fitted: Fitted, stop: threading.Event) -> bool:
+        """Carry out orders; return whether the training stays paused."""
+        if self._stop:
+            stop.set()
+        if self._save:
+            self._save = False
+            save_run_training(fitted)
+            self._notify_all(f"step {fitted.trainer.step} is saved in {self.config.output_dir}")
+        if stop.is_set() or not self.paused:
+            return False
+        if self._steps:
+            self._steps -= 1
+            return False
+        return True
+
+    def _notify_all(self, text: str) -> None:
+        for controls in self._controls:
+            controls.session.notify(text)
+
+    def _update_pages(self) -> None:
+        now = time.monotonic()
+        if now < self._updated + _UPDATE_SECONDS:
+            return
+        self._updated = now
+        self._controls = [controls for controls in self._controls if not controls.session.closed]
+        for controls in self._controls:
+            controls.refresh_progress()
+
+    def _make_scene(self, fitted: Fitted) -> ViewerScene:
+        dataset = fitted.dataset
+        conditions = tuple(spec.within(dataset.world) for spec in fitted.task.conditions)
+        return ViewerScene(
+            name=self.config.output_dir.name,
+            task=replace(fitted.task, conditions=conditions),
+            model=lambda: fitted.trainer.model,
+            channels=fitted.channels,
+            settings=fitted.trainer.renderer,
+            background=dataset.background,
+            up=tuple(dataset.up.tolist()),
+            center=np.asarray(dataset.center.numpy()),
+            world=dataset.world,
+            dataset=dataset,
+        )

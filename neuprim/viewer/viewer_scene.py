@@ -1,4 +1,4 @@
-"""The model that a viewer shows: drawing it from a viewpoint, and comparing it with held-out views."""
+"""The model that a viewer shows: drawing it from a viewpoint, held-out views, and its primitives."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import math
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -13,21 +16,24 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.cameras.world import World
-from neuprim.core.channels import Channels
+from neuprim.core.channels import Channels, read_stored_channels
 from neuprim.core.data import Dataset, View
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.images import to_uint8
 from neuprim.core.metrics import psnr
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import TaskSpec
+from neuprim.inspect.field import measure_absorption
 from neuprim.inspect.layers import colormap_bytes
 from neuprim.runs.measure import render_image
-from neuprim.runs.open import move_to_render_device
-from neuprim.runs.render_config import RenderConfig
-from neuprim.viewer.quality import Front
-from neuprim.webpage import PageView
-from neuprim.webpage.scene_page import held_out_webpage_views, initial_webpage_conditions
+from neuprim.runs.open import load_dataset, load_run, move_to_render_device
+from neuprim.webpage.model_page import (
+    PageView,
+    held_out_webpage_views,
+    initial_webpage_conditions,
+    stored_up_axis,
+)
 
 COLOUR, ALPHA, DEPTH = "colour", "alpha", "depth"
 
@@ -35,7 +41,7 @@ _MAX_RAYS = 2**26  # the renderer draws them at once in 2 GB
 _MIN_ALPHA = 0.05  # below, a pixel has no meaningful depth
 _START_CANDIDATES = 8
 _START_FOV = 0.7  # radians
-_CACHED_MODELS = 4
+_MAX_NUMBERS = 24  # of a parameter that are written out
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,77 +53,17 @@ class Viewpoint:
     quantity: str = COLOUR
 
 
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """A drawn image, (H, W, 3) uint8 sRGB at its rendered resolution; the meaning of its colours, may be empty."""
+class Picture(NamedTuple):
+    """A drawn image, (H, W, 3) uint8 sRGB; the meaning of its colours, may be empty; and the time that it took."""
 
     image: np.ndarray
     caption: str
     seconds: float
 
 
-@dataclass(frozen=True, eq=False)
-class ViewComparison:
-    """A held-out view: ground truth and rendering, (H, W, 3) uint8 sRGB, and their PSNR in dB."""
-
-    truth: np.ndarray
-    drawn: np.ndarray
-    psnr: float
-
-
 def list_viewer_quantities(channels: Channels) -> list[str]:
     """Colour, alpha, depth, and each channel if there are several."""
     return [COLOUR, ALPHA, DEPTH, *(f"channel {name}" for name in channels.names if channels.count > 1)]
-
-
-def draw_viewer_picture(
-    model: Primitives, viewpoint: Viewpoint, config: RenderConfig, background: Tensor, channels: Channels
-) -> Picture:
-    """Draw a model that the render configuration was applied to.
-
-    Depth is camera z, averaged along each ray, shown from its 2nd to its 98th percentile.
-
-    Raises:
-        NeuprimError: the renderer refuses.
-    """
-    start = time.perf_counter()
-    view = config.scale_view(View("", viewpoint.camera, viewpoint.conditions))
-    settings = replace(config.settings, depth=viewpoint.quantity == DEPTH)
-    width, height = view.camera.width, view.camera.height
-    if width * height * settings.samples**2 > _MAX_RAYS:
-        size = f"{width} x {height} pixels with renderer.samples={settings.samples}"
-        raise ConfigError(f"{size} take more than {_MAX_RAYS:,} rays; lower either")
-    with torch.no_grad():
-        output = render(model, view.camera, view.conditions, settings, background)
-    caption = ""
-    if viewpoint.quantity == COLOUR:
-        image = to_uint8(channels.display(output.rgb.cpu())).numpy()
-    elif viewpoint.quantity == ALPHA:
-        image = _to_viewer_grey(output.alpha.cpu())
-    elif viewpoint.quantity == DEPTH:
-        assert output.depth is not None
-        image, caption = _colour_viewer_depth(output.depth.cpu().numpy(), output.alpha.cpu().numpy())
-    else:
-        index = [f"channel {name}" for name in channels.names].index(viewpoint.quantity)
-        image = _to_viewer_grey(output.rgb[..., index].cpu())
-        caption = f"{channels.names[index]}, 0 is black and 1 is white, {channels.color_space}"
-    return Picture(image, caption, time.perf_counter() - start)
-
-
-def _to_viewer_grey(values: Tensor) -> np.ndarray:
-    return np.asarray(to_uint8(values[..., None].expand(-1, -1, 3)).numpy())
-
-
-def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
-    """(H, W, 3) uint8, near is bright and empty is black; and a caption."""
-    solid = alpha > _MIN_ALPHA
-    image = np.zeros((*depth.shape, 3), np.uint8)
-    if not solid.any():
-        return image, "nothing is in sight"
-    near, far = (float(x) for x in np.percentile(depth[solid], (2.0, 98.0)))
-    part = np.clip((depth[solid] - near) / max(far - near, 1e-12), 0.0, 1.0)
-    image[solid] = colormap_bytes("viridis")[np.minimum((256 * (1.0 - part)).astype(np.int64), 255)]
-    return image, f"depth {near:.4g} (bright) to {far:.4g} scene units"
 
 
 @dataclass(eq=False)
@@ -133,7 +79,6 @@ class ViewerScene:
         center: (3,) point that a camera turns around, scene units.
         world: coordinates in which positions are typed and shown.
         dataset: for held-out views; None if its files are gone.
-        front: see :func:`~neuprim.viewer.quality.read_viewer_front`.
     """
 
     name: str
@@ -146,55 +91,66 @@ class ViewerScene:
     center: np.ndarray
     world: World = field(default_factory=World)
     dataset: Dataset | None = None
-    front: Front = ()
-    _cache: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
-    def prepare_model(self, config: RenderConfig, view: View) -> Primitives:
-        """Return the model with a render configuration applied, on its device; a few are cached."""
-        model = self.model()
-        if not config.reduced and not config.storage and model.device.type != "cpu":
-            return model  # of a training, which keeps it on its device
-        changes = (tuple(config.reduced.items()), tuple(config.storage.items()))
-        key = (id(model), *changes, config.settings.device, config.settings.backend)
-        if key not in self._cache:
-            if len(self._cache) >= _CACHED_MODELS:
-                self._cache.pop(next(iter(self._cache)))
-            self._cache[key] = move_to_render_device(config.prepare_model(model), config.settings, view)
-        return self._cache[key]
+    def draw(self, viewpoint: Viewpoint, settings: RenderSettings) -> Picture:
+        """Draw the current model.
 
-    def draw(self, viewpoint: Viewpoint, config: RenderConfig) -> Picture:
-        """Draw the current model; see :func:`draw_viewer_picture`."""
-        model = self.prepare_model(config, View("", viewpoint.camera, viewpoint.conditions))
-        return draw_viewer_picture(model, viewpoint, config, self.background, self.channels)
+        Depth is camera z, averaged along each ray, shown from its 2nd to its 98th percentile.
 
-    def list_views(self) -> list[str]:
-        """Return the names of the held-out views with a pinhole camera."""
-        return list(self._view_indices())
+        Raises:
+            NeuprimError: the renderer refuses.
+        """
+        start = time.perf_counter()
+        camera, channels = viewpoint.camera, self.channels
+        if camera.width * camera.height * settings.samples**2 > _MAX_RAYS:
+            size = f"{camera.width} x {camera.height} pixels with renderer.samples={settings.samples}"
+            raise ConfigError(f"{size} take more than {_MAX_RAYS:,} rays; lower either")
+        settings = replace(settings, depth=viewpoint.quantity == DEPTH)
+        with torch.no_grad():
+            output = render(self.model(), camera, viewpoint.conditions, settings, self.background)
+        caption = ""
+        if viewpoint.quantity == COLOUR:
+            image = to_uint8(channels.display(output.rgb.cpu())).numpy()
+        elif viewpoint.quantity == ALPHA:
+            image = _to_viewer_grey(output.alpha.cpu())
+        elif viewpoint.quantity == DEPTH:
+            assert output.depth is not None
+            image, caption = _colour_viewer_depth(output.depth.cpu().numpy(), output.alpha.cpu().numpy())
+        else:
+            index = list_viewer_quantities(channels).index(viewpoint.quantity) - 3
+            image = _to_viewer_grey(output.rgb[..., index].cpu())
+            caption = f"{channels.names[index]}, 0 is black and 1 is white, {channels.color_space}"
+        return Picture(image, caption, time.perf_counter() - start)
 
-    def load_view(self, name: str) -> View:
-        """Return a held-out view of :meth:`list_views`."""
-        assert self.dataset is not None
-        return self.dataset.test.view(self._view_indices()[name])
-
-    def compare_view(self, name: str) -> ViewComparison:
-        """Draw a held-out view and compare it with its ground truth, as ``metrics.json`` does."""
-        assert self.dataset is not None
-        index = self._view_indices()[name]
-        view, pixels = self.dataset.test.view(index), self.dataset.test.pixels(index)
-        truth = pixels.over(self.dataset.background)
-        model = self.prepare_model(RenderConfig(self.settings), view)
-        drawn = render_image(model, view, self.settings, self.dataset.background)
-        images = [np.asarray(to_uint8(self.channels.display(image)).numpy()) for image in (truth, drawn)]
-        return ViewComparison(images[0], images[1], psnr(drawn, truth, pixels.mask))
-
-    def _view_indices(self) -> Mapping[str, int]:
+    @cached_property
+    def view_indices(self) -> Mapping[str, int]:
+        """Name -> index of the held-out views with a pinhole camera."""
         if self.dataset is None:
             return {}
         views = self.dataset.test
         return {view.name: i for i in range(len(views)) if isinstance((view := views.view(i)).camera, Camera)}
 
+    def load_view(self, name: str) -> View:
+        """Return a held-out view of :attr:`view_indices`."""
+        assert self.dataset is not None
+        return self.dataset.test.view(self.view_indices[name])
+
+    def compare_view(self, name: str) -> tuple[np.ndarray, np.ndarray, float]:
+        """Draw a held-out view and compare it with its ground truth, as ``metrics.json`` does.
+
+        Returns:
+            Ground truth and rendering, (H, W, 3) uint8 sRGB, and their PSNR in dB.
+        """
+        assert self.dataset is not None
+        view, pixels = self.load_view(name), self.dataset.test.pixels(self.view_indices[name])
+        truth = pixels.over(self.dataset.background)
+        drawn = render_image(self.model(), view, self.settings, self.dataset.background)
+        images = [np.asarray(to_uint8(self.channels.display(image)).numpy()) for image in (truth, drawn)]
+        return images[0], images[1], psnr(drawn, truth, pixels.mask)
+
+    @cached_property
     def start_view(self) -> View:
-        """Return the first view: the held-out view with most contrast, else the whole model from the side."""
+        """The first view: the held-out view with most contrast, else the whole model from the side."""
         if self.dataset is not None:
             views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES)
             if views:
@@ -211,3 +167,130 @@ class ViewerScene:
 
     def _initial_conditions(self, views: Sequence[PageView]) -> dict[str, Tensor]:
         return {c.spec.name: c.value.float() for c in initial_webpage_conditions(self.task.conditions, views, {})}
+
+
+def open_viewer_scene(
+    run_dir: Path, warn: Callable[[str], None], progress: Callable[[str, float], None]
+) -> ViewerScene:
+    """Open a finished run. If its data cannot be read there are no held-out views, with a warning.
+
+    Raises:
+        CheckpointError, ConfigError: naming the file that is missing or damaged.
+    """
+    run = load_run(run_dir)
+    task, model, header = run.task, run.model, run.header
+    dataset: Dataset | None = None
+    try:
+        with run.plugins.attribute_errors():
+            dataset = load_dataset(run, progress)
+    except NeuprimError as error:
+        warn(f"no held-out views: {error}")
+    means = model.params["means"].detach().double().cpu()
+    center = means.median(0).values if len(means) else torch.zeros(3)
+    scene = ViewerScene(
+        name=run_dir.resolve().name,
+        task=task,
+        model=lambda: model,
+        channels=read_stored_channels(run_dir, header, task, model.colour.channels),
+        settings=run.config.renderer,
+        background=torch.tensor([float(x) for x in header.get("background", [0.0] * model.colour.channels)]),
+        up=stored_up_axis(header) if dataset is None else tuple(dataset.up.tolist()),
+        center=np.asarray((center if dataset is None else dataset.center).double().numpy()),
+        world=World.of(header, str(run_dir)),
+        dataset=dataset,
+    )
+    placed = move_to_render_device(model, scene.settings, scene.start_view)
+    scene.model = lambda: placed
+    return scene
+
+
+def _to_viewer_grey(values: Tensor) -> np.ndarray:
+    return np.asarray(to_uint8(values[..., None].expand(-1, -1, 3)).numpy())
+
+
+def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
+    """Return (H, W, 3) uint8, near is bright and empty is black; and a caption."""
+    solid = alpha > _MIN_ALPHA
+    image = np.zeros((*depth.shape, 3), np.uint8)
+    if not solid.any():
+        return image, "nothing is in sight"
+    near, far = (float(x) for x in np.percentile(depth[solid], (2.0, 98.0)))
+    part = np.clip((depth[solid] - near) / max(far - near, 1e-12), 0.0, 1.0)
+    image[solid] = colormap_bytes("viridis")[np.minimum((256 * (1.0 - part)).astype(np.int64), 255)]
+    return image, f"depth {near:.4g} (bright) to {far:.4g} scene units"
+
+
+# ---------------------------------------------------------------- primitives
+
+
+class FrameEllipsoids(NamedTuple):
+    """M ellipsoids of a frame, float32, scene units.
+
+    Attributes:
+        rows: (M,) rows of the model.
+        positions: (M, 3); wxyz: (M, 4) unit quaternions; scales: (M, 3) semi-axes.
+        colours: (M, 3) uint8 sRGB at their centres, as seen from the frame's camera.
+    """
+
+    rows: np.ndarray
+    positions: np.ndarray
+    wxyz: np.ndarray
+    scales: np.ndarray
+    colours: np.ndarray
+
+
+def list_viewer_ellipsoids(
+    model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int, row: int | None = None
+) -> FrameEllipsoids:
+    """Return the ellipsoids of a frame: at most ``limit``, those that absorb most; or that of one ``row``, if any."""
+    with torch.no_grad():
+        lowered = model.lower(viewpoint.camera, viewpoint.conditions)
+        geometry = lowered.geometry
+        rows = torch.arange(model.count) if lowered.rows is None else lowered.rows.cpu()
+        chosen = torch.arange(len(rows)) if row is None else (rows == row).nonzero()[:, 0]
+        if len(chosen) > limit:
+            mass = measure_absorption(model.to(torch.device("cpu")).active(viewpoint.conditions))
+            chosen = torch.from_numpy(np.sort(np.argsort(-mass, kind="stable")[:limit]))
+        colours = lowered.center_colors(viewpoint.camera.position.to(geometry.means)).float().cpu()
+        shown = np.rint(255 * channels.display_rows(colours.clamp_min(0)).numpy()).astype(np.uint8)
+        means, scales, quats = (x.float().cpu()[chosen] for x in (geometry.means, geometry.scales, geometry.quats))
+    wxyz = quats / quats.norm(dim=-1, keepdim=True)
+    return FrameEllipsoids(rows[chosen].numpy(), means.numpy(), wxyz.numpy(), scales.numpy(), shown[chosen.numpy()])
+
+
+def pick_primitive(
+    model: Primitives, viewpoint: Viewpoint, direction: np.ndarray, settings: RenderSettings
+) -> int | None:
+    """Return the row of the primitive with the largest weight along a ray from the camera; None if the ray is empty.
+
+    Args:
+        direction: (3,) of the ray, scene axes, any norm.
+    """
+    camera = viewpoint.camera
+    x, y, z = (camera.viewmat[:3, :3].double() @ torch.as_tensor(np.asarray(direction, np.float64))).tolist()
+    if z <= 0:
+        return None
+    ray = Camera(camera.viewmat, camera.fx, camera.fy, 0.5 - camera.fx * x / z, 0.5 - camera.fy * y / z, 1, 1)
+    params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
+    output = render(Primitives(model.density, model.colour, params), ray, viewpoint.conditions, settings)
+    contributions = output.request_contributions(torch.ones(1, 1, device=output.rgb.device))
+    output.rgb.sum().backward()
+    weight, _ = contributions.of_all(model.count)
+    return int(weight.argmax()) if len(weight) and float(weight.max()) > 0 else None
+
+
+def describe_viewer_primitive(model: Primitives, row: int) -> str:
+    """Return a primitive's semi-axes and parameters, one a line.
+
+    Raises:
+        ConfigError: the model has no such primitive.
+    """
+    if not 0 <= row < model.count:
+        raise ConfigError(f"primitive {row}: the model has {model.count} primitives, 0 to {model.count - 1}")
+    axes = model.params["log_scales"][row].detach().double().exp().tolist()
+    lines = [f"primitive {row} of {model.count}", f"semi-axes {' '.join(f'{x:.4g}' for x in axes)} scene units"]
+    for spec in model.specs:
+        values = model.params[spec.name][row].detach().double().flatten().tolist()
+        more = f" … ({len(values)} numbers)" if len(values) > _MAX_NUMBERS else ""
+        lines.append(f"{spec.name}: {' '.join(f'{x:.4g}' for x in values[:_MAX_NUMBERS])}{more}")
+    return "\n".join(lines)

@@ -27,6 +27,8 @@ def test_without_viser_it_says_how_to_get_it(
     run_dir: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setitem(sys.modules, "viser", None)
+    for module in ("view", "server"):
+        monkeypatch.delitem(sys.modules, f"neuprim.viewer.{module}", raising=False)
     for argv in (
         ["view", str(run_dir)],
         ["run", "task=static", "scene=solids", "viewer=true", f"output_dir={run_dir}-new"],

@@ -387,7 +387,6 @@ def _read_records(folder: Path) -> None:
     from neuprim.search.target_record import read_target_record as read_target
     from neuprim.search.tradeoff_record import read_tradeoff_record
     from neuprim.search.tradeoff_record import write_tradeoff_csv as write_points
-    from neuprim.viewer.quality import read_viewer_front
 
     _read_run(folder)
     if (sweep := read_sweep(folder)) is not None:
@@ -398,7 +397,6 @@ def _read_records(folder: Path) -> None:
     if (target := read_target(folder / "target")) is not None:
         target.write(folder / "again")
         repr((target.words, target.finished("size"), [one.count for one in target.attempts if one.outcome]))
-    read_viewer_front(folder / "run")
     if (points := read_tradeoff_record(folder / "run/tradeoff/tradeoff.json")) is not None:
         write_points(folder / "out.csv", points, 40)
     trials.read_trial(folder)

@@ -20,7 +20,7 @@ pytest.importorskip("viser", reason="the package viser is not installed")
 from neuprim.config import compose
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.runs.run import run
-from neuprim.viewer.live_training import LiveTraining
+from neuprim.viewer.view import LiveTraining
 from tests.browsers import browser
 from tests.core import tiny
 from tests.short_runs import words

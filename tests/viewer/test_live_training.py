@@ -21,7 +21,7 @@ from neuprim.config.command_settings import ViewerSettings
 from neuprim.core import checkpoint
 from neuprim.runs.fit import Event, Fitted, Note, Step
 from neuprim.runs.run import run
-from neuprim.viewer.live_training import LiveTraining
+from neuprim.viewer.view import LiveTraining
 from tests.core import tiny
 from tests.short_runs import words
 from tests.viewer_client import Visitor, visit
@@ -186,7 +186,7 @@ def test_a_picture_that_fails_ends_no_training(
     def broken(*args: Any) -> None:
         raise RuntimeError("no such picture")
 
-    monkeypatch.setattr("neuprim.viewer.viewer_scene.draw_viewer_picture", broken)
+    monkeypatch.setattr("neuprim.viewer.viewer_scene.ViewerScene.draw", broken)
 
     def look(live: LiveTraining, page: Visitor) -> None:
         until(page, lambda: any("no such picture" in str(m) for m in page.messages))

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -19,21 +17,11 @@ from neuprim.core.compression import is_compressed
 from neuprim.core.conditions import condition_flag, named, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
-from neuprim.core.io.files import StagedOutput, refuse_existing, staged_output, write_json
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.files import StagedOutput, refuse_existing, staged_output
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin
 from neuprim.runs.open import COMPRESSED, Progress, StoredRun, ignore_progress, load_run, open_run
-from neuprim.version import __version__
-
-EXPORTS_FILE = "exports.json"
-"""In a run directory: formats and packages it was exported with, newest last."""
-
-_MAX_ENTRIES = 200  # only the newest are kept
-_MAX_FILES = 20  # of one export, which may have a thousand frames
-_MAX_CHARACTERS = 500  # of one text
-_MAX_BYTES = 1 << 24  # a larger file was written by something else
 
 # ---------------------------------------------------------------- export
 
@@ -75,8 +63,7 @@ def export_run(
             report = exporter.write(job)
         files = _check_run_export_files(report, output, source.label)
         output.publish()
-    report = replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
-    return _record_run_export(name, job, report)
+    return replace(report, files=files, notes=(*notes, *(output.final_text(note) for note in report.notes)))
 
 
 def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
@@ -144,71 +131,6 @@ def _parse_run_export_option(text: str) -> Any:
         with suppress(ValueError):
             return kind(text)
     return text
-
-
-# ---------------------------------------------------------------- record
-
-
-def _record_run_export(word: str, job: ExportJob, report: ExportReport) -> ExportReport:
-    """Add an export to its run's list; returns its report, with a note if the list could not be written.
-
-    Args:
-        word: what chose the exporter, ``NAME`` or ``PACKAGE:NAME``.
-    """
-    path, info = job.run.directory / EXPORTS_FILE, EXPORTERS.find(word)
-    files = [_name_run_export_file(Path(file), job.run.directory) for file in report.files]
-    entry = {
-        "files": files[:_MAX_FILES],
-        **({"more_files": len(files) - _MAX_FILES} if len(files) > _MAX_FILES else {}),
-        "format": info.name,
-        "package": info.distribution,
-        "version": info.version,
-        "neuprim": __version__,
-        "time": datetime.now(UTC).isoformat(timespec="seconds"),
-        "options": _plain_run_export_options({**job.options, **job.conditions}),
-        "lossless": bool(report.lossless),
-    }
-    try:
-        write_json(path, [*_read_run_exports(path), entry][-_MAX_ENTRIES:])
-    except OSError as error:
-        note = f"{path}: not written ({error.strerror or error}); this export is not recorded"
-    except ValueError as error:
-        note = f"{path}: {error}; left as it is, this export is not recorded"
-    else:
-        return report
-    return replace(report, notes=(*report.notes, note))
-
-
-def _name_run_export_file(file: Path, directory: Path) -> str:
-    """Relative to the run directory if it lies in there, so that a run that was moved still finds it; else absolute."""
-    whole, inside = file.absolute(), directory.absolute()
-    return str(whole.relative_to(inside) if whole.is_relative_to(inside) else whole)[:_MAX_CHARACTERS]
-
-
-def _plain_run_export_options(options: Mapping[str, Any]) -> dict[str, Any]:
-    """Options as strict JSON holds them."""
-    plain: dict[str, Any] = {}
-    for key, value in options.items():
-        number = isinstance(value, bool | int) or (isinstance(value, float) and math.isfinite(value))
-        plain[str(key)[:_MAX_CHARACTERS]] = value if value is None or number else str(value)[:_MAX_CHARACTERS]
-    return plain
-
-
-def _read_run_exports(path: Path) -> list[Any]:
-    """Earlier entries. Raises ValueError for a file that is not a list of exports."""
-    try:
-        if path.stat().st_size > _MAX_BYTES:
-            raise ValueError(f"larger than {_MAX_BYTES} bytes; expected a list of exports")
-        text = path.read_bytes()
-    except FileNotFoundError:
-        return []
-    try:
-        entries = load_json(text)
-    except (ValueError, RecursionError) as error:
-        raise ValueError("not JSON; expected a list of exports") from error
-    if not isinstance(entries, list) or not all(isinstance(entry, dict) for entry in entries):
-        raise ValueError("expected a list of exports")
-    return entries
 
 
 # ---------------------------------------------------------------- import

@@ -1,4 +1,4 @@
-"""Charts: curves over time, one dot a view, and Pareto fronts, as SVG for a page or as a PNG file.
+"""Charts: curves and Pareto fronts, as SVG for a page or as a PNG file.
 
 An SVG takes its colours from the page's CSS variables, so that it follows light and dark mode.
 """
@@ -46,12 +46,11 @@ _LEAST_DECIBELS = 0.4  # least range of the y axis of a front: smaller differenc
 
 @dataclass(frozen=True)
 class ChartPoints:
-    """ChartPoints of one colour; those that are not finite are left out.
+    """Points of one colour; those that are not finite are left out.
 
     Attributes:
-        joined: connect them by a line.
+        joined: connect them by a line; points of a line are marked while they are few.
         band: draw many points as their median and range.
-        size: diameter in points; None marks the points of a line only while they are few.
         spread: half-lengths of horizontal error bars.
         labels: texts below the points.
         name: text in the chart's legend.
@@ -62,8 +61,6 @@ class ChartPoints:
     colour: str = TRAINING
     joined: bool = True
     band: bool = False
-    size: float | None = None
-    opacity: float = 1.0
     spread: Sequence[float] = ()
     labels: Sequence[str] = ()
     name: str = ""
@@ -79,15 +76,12 @@ class ChartPoints:
 
 @dataclass(frozen=True)
 class Chart:
-    """A chart of any kind; :func:`curve_chart`, :func:`view_chart` and :func:`front_chart` make the usual ones.
+    """A chart of any kind; :func:`curve_chart` and :func:`front_chart` make the usual ones.
 
     Attributes:
         title: for readers who do not see the chart, and above a PNG.
-        level: y of a dashed line from which the points hang.
         ring: a point that is ringed.
-        left, right: limits of the x axis.
         log_x, log_y: which axes are logarithmic.
-        whole: whether x counts things.
         least: least range of the y axis.
     """
 
@@ -96,13 +90,9 @@ class Chart:
     x_label: str
     y_label: str = ""
     size: tuple[int, int] = SMALL
-    level: float | None = None
     ring: tuple[float, float] | None = None
-    left: float | None = None
-    right: float | None = None
     log_x: bool = False
     log_y: bool = False
-    whole: bool = False
     least: float = 0.0
 
     def known(self) -> list[ChartPoints]:
@@ -130,37 +120,19 @@ class Dot(NamedTuple):
 def curve_chart(
     title: str, unit: str, lines: Sequence[ChartPoints], log: bool = False, size: tuple[int, int] = SMALL
 ) -> Chart:
-    """Return a chart of values over seconds, steps or frames.
+    """Return a chart of values over seconds, steps, views or frames.
 
     Args:
         unit: "seconds", which become minutes or hours where they are many, or any other label of the x axis.
         log: use a logarithmic y axis where the values span a large factor.
     """
     known = [line.finite() for line in lines]
-    right, divisor = float(max((np.max(line.x) for line in known if len(line.x)), default=0.0)), 1.0
-    if unit == "seconds" and right >= 180:
-        unit, divisor = ("minutes", 60.0) if right < 3 * 3600 else ("hours", 3600.0)
+    longest, divisor = float(max((np.max(line.x) for line in known if len(line.x)), default=0.0)), 1.0
+    if unit == "seconds" and longest >= 180:
+        unit, divisor = ("minutes", 60.0) if longest < 3 * 3600 else ("hours", 3600.0)
     values = np.concatenate([line.y for line in known]) if known else np.zeros(0)
     log = log and values.size > 0 and bool(values.min() > 0 and values.max() / values.min() >= _LOG_RATIO)
-    scaled = [replace(line, x=np.asarray(line.x) / divisor) for line in known]
-    end = right / divisor * 1.02 if right > 0 else 1
-    return Chart(title, scaled, unit, size=size, left=0, right=end, log_y=log)
-
-
-def view_chart(title: str, values: Sequence[float | None], mean: float | None, lowest: str | None) -> Chart:
-    """Return a chart of one value a view, hung from their mean.
-
-    Args:
-        lowest: text beside the lowest dot, e.g. the view's name.
-    """
-    known = [(i, v) for i, v in enumerate(values) if v is not None and math.isfinite(v)]
-    labels = [""] * len(known)
-    if lowest and len(known) > 1:
-        labels[min(range(len(known)), key=lambda i: known[i][1])] = lowest
-    size = 4.5 if len(known) <= 60 else 2.5
-    points = ChartPoints([i for i, _ in known], [v for _, v in known], HELD_OUT, False, size=size, labels=labels)
-    level = mean if mean is not None and math.isfinite(mean) else None
-    return Chart(title, [points], "view", level=level, left=-0.7, right=len(values) - 0.3, whole=True)
+    return Chart(title, [replace(line, x=np.asarray(line.x) / divisor) for line in known], unit, size=size, log_y=log)
 
 
 def front_chart(
@@ -179,15 +151,14 @@ def front_chart(
     marked = sorted((dot for dot in drawn if dot.mark is not None), key=lambda dot: dot.cost)
     others = [dot for dot in drawn if dot.mark is None]
 
-    def points(dots: Sequence[Dot], colour: str, joined: bool, size: float, opacity: float) -> ChartPoints:
+    def points(dots: Sequence[Dot], colour: str, joined: bool) -> ChartPoints:
         x, y, spread = [dot.cost for dot in dots], [dot.good for dot in dots], [dot.spread for dot in dots]
-        labels = [dot.mark or "" for dot in dots]
-        return ChartPoints(x, y, colour, joined, size=size, opacity=opacity, spread=spread, labels=labels)
+        return ChartPoints(x, y, colour, joined, spread=spread, labels=[dot.mark or "" for dot in dots])
 
-    both = [points(others, TRAINING, False, 4.5, 0.75), points(marked, HELD_OUT, joined and len(marked) > 1, 6.0, 1.0)]
     costs = [dot.cost for dot in drawn]
     log = bool(costs) and max(costs) / min(costs) >= _FRONT_LOG_RATIO
     ring = next(((dot.cost, dot.good) for dot in drawn if dot.reference), None)
+    both = [points(others, TRAINING, False), points(marked, HELD_OUT, joined)]
     return Chart(title, both, x_label, y_label, LARGE, ring=ring, log_x=log, least=_LEAST_DECIBELS)
 
 
@@ -201,9 +172,8 @@ def draw_svg(chart: Chart) -> str | None:
     with _style():
         figure = Figure(figsize=(width / 72, height / 72))
         left, bottom = 41.4 / width, 42 / height  # room for the labels
-        _draw_chart(
-            figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom)), chart, {name: name for name in _VARIABLES}
-        )
+        axes = figure.add_axes((left, bottom, 0.98 - left, 0.96 - bottom))
+        _draw_chart(axes, chart, {name: name for name in _VARIABLES})
         return _chart_to_svg_element(figure, chart.title)
 
 
@@ -229,24 +199,18 @@ def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None
 
 def _draw_chart(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
     known, ink, grid = chart.known(), palette[INK], palette[GRID]
-    if chart.level is not None:
-        axes.axhline(chart.level, color=ink, linewidth=1, linestyle=(0, (4, 3)), zorder=2)
-        for points in known:
-            axes.vlines(points.x, chart.level, points.y, color=palette[points.colour], linewidth=1, alpha=0.45)
     for points in known:
-        _draw_chart_points(axes, points, palette.get(points.colour, points.colour))
-        _draw_chart_labels(axes, points, chart.level is not None, ink)
+        _draw_chart_points(axes, points, palette.get(points.colour, points.colour), ink)
     if any(points.name for points in known):
         axes.legend(frameon=False, labelcolor=ink)
     if chart.ring is not None:
         axes.plot(*chart.ring, marker="o", markersize=11, markerfacecolor="none", markeredgecolor=ink, zorder=4)
     axes.set_xlabel(chart.x_label, color=ink)
-    axes.margins(x=0.05, y=0.05 if chart.level is None and not chart.least else 0.13)
+    axes.margins(x=0.05, y=0.13 if chart.least else 0.05)
     axes.set_xscale("log" if chart.log_x else "linear")
     axes.set_yscale("log" if chart.log_y else "linear")
-    axes.set_xlim(chart.left, chart.right)
-    _set_ticks(axes.xaxis, 6, chart.log_x, np.concatenate([np.asarray(points.x) for points in known]), chart.whole)
-    _set_ticks(axes.yaxis, 5, chart.log_y, np.concatenate([np.asarray(points.y) for points in known]))
+    _set_ticks(axes.xaxis, chart.log_x, np.concatenate([np.asarray(points.x) for points in known]))
+    _set_ticks(axes.yaxis, chart.log_y, np.concatenate([np.asarray(points.y) for points in known]))
     bottom, top = axes.get_ylim()
     if top - bottom < chart.least:
         axes.set_ylim((bottom + top - chart.least) / 2, (bottom + top + chart.least) / 2)
@@ -256,10 +220,9 @@ def _draw_chart(axes: Axes, chart: Chart, palette: Mapping[str, str]) -> None:
         spine.set_color(grid)
 
 
-def _draw_chart_points(axes: Axes, points: ChartPoints, colour: str) -> None:
+def _draw_chart_points(axes: Axes, points: ChartPoints, colour: str, ink: str) -> None:
     x, y = np.asarray(points.x), np.asarray(points.y)
-    marked = x.size == 1 if points.band else x.size <= _FEW
-    size = points.size if points.size is not None else 4.0 if marked else 0.0
+    marked = not points.joined or x.size == 1 or (x.size <= _FEW and not points.band)
     if points.band and x.size > 2 * _BUCKETS:
         groups = np.array_split(np.arange(x.size), _BUCKETS)
         middle, low, high = (np.array([f(y[group]) for group in groups]) for f in (np.median, np.min, np.max))
@@ -267,25 +230,16 @@ def _draw_chart_points(axes: Axes, points: ChartPoints, colour: str) -> None:
         axes.fill_between(x, low, high, color=colour, alpha=0.22, linewidth=0, zorder=2)
     if points.joined:
         axes.plot(x, y, color=colour, linewidth=1.5, label=points.name or None, zorder=3)
-    if size:
+    if marked:
         errors = points.spread if any(points.spread) else None
-        look: Any = {"color": colour, "alpha": points.opacity, "zorder": 4}
-        axes.errorbar(x, y, xerr=errors, linestyle="none", marker="o", markersize=size, markeredgewidth=0, **look)
+        look: Any = {"color": colour, "linestyle": "none", "marker": "o", "markersize": 4.5, "markeredgewidth": 0}
+        axes.errorbar(x, y, xerr=errors, zorder=4, **look)
+    for at, text in zip(zip(x, y, strict=True), points.labels, strict=False):
+        style: Any = {"ha": "center", "color": ink, "fontsize": 9, "parse_math": False}
+        axes.annotate(text, at, (0, -13), textcoords="offset points", **style)
 
 
-def _draw_chart_labels(axes: Axes, points: ChartPoints, aside: bool, colour: str) -> None:
-    """Write each point's label below it, or ``aside``, towards the middle of the chart."""
-    for i, (x, y, text) in enumerate(zip(points.x, points.y, points.labels, strict=False)):
-        if not text:
-            continue
-        right = i < len(points.labels) / 2
-        offset = ((8 if right else -8), 0) if aside else (0, -13)
-        across = "center" if not aside else "left" if right else "right"
-        style: Any = {"ha": across, "va": "center" if aside else "baseline", "color": colour}
-        axes.annotate(text, (x, y), offset, textcoords="offset points", fontsize=9, parse_math=False, **style)
-
-
-def _set_ticks(axis: Axis, most: int, log: bool, values: NDArray[np.float64], whole: bool = False) -> None:
+def _set_ticks(axis: Axis, log: bool, values: NDArray[np.float64]) -> None:
     from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullLocator
 
     if log:
@@ -294,7 +248,7 @@ def _set_ticks(axis: Axis, most: int, log: bool, values: NDArray[np.float64], wh
         axis.set_major_locator(LogLocator(subs=(1.0,) if ratio > 300 else few if ratio > _LOG_RATIO else many))
         axis.set_minor_locator(NullLocator())
     else:
-        axis.set_major_locator(MaxNLocator(nbins=most, steps=[1, 2, 2.5, 5, 10], integer=whole))
+        axis.set_major_locator(MaxNLocator(nbins=5, steps=[1, 2, 2.5, 5, 10]))
     axis.set_major_formatter(FuncFormatter(lambda value, _: _format_tick(value)))
 
 

@@ -1,24 +1,32 @@
-"""Error maps, and pictures written into the page itself."""
+"""Pictures of a report: error maps, the worst region of each held-out view, and pictures as a part of the page."""
 
 from __future__ import annotations
 
 import base64
 import io
+import math
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import torch
+import torch.nn.functional as F
 from numpy.typing import NDArray
 from PIL import Image, UnidentifiedImageError
 from torch import Tensor
 
-from neuprim.core.errors import ConfigError
+from neuprim.core.io import images
 from neuprim.core.metrics import comparable_images
 
 ERROR_SCALE = 0.2  # error at the bright end of :func:`error_map` and of the report's colour bar
 
 _INLINE_LIMIT = 400_000
 """Bytes up to which a picture enters the page unchanged; larger ones are compressed as WebP of quality 90."""
+
+_SIDE_SHARE, MIN_SIDE = 0.25, 16  # side of a region over the shorter side of its image, and in pixels
+MAX_REGIONS = 60  # views whose regions are kept: the worst of them
+_STEPS = 8  # places along a region's side at which regions are compared
 
 
 def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> NDArray[np.uint8]:
@@ -33,8 +41,6 @@ def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> ND
     Returns:
         (H, W, 3) uint8.
     """
-    if not scale > 0:
-        raise ConfigError(f"scale of the error map must be positive, found {scale}")
     first, second = comparable_images(rendered, truth)
     error = (first - second).abs().mean(-1).numpy()
     return _error_map_colors()[np.rint(np.clip(error / scale, 0.0, 1.0) * 255.0).astype(np.intp)]
@@ -54,27 +60,95 @@ def _error_map_colors() -> NDArray[np.uint8]:
 
 @dataclass(frozen=True)
 class InlinedPicture:
-    """A picture as a ``data:`` address, its size in pixels, and whether it was compressed on the way."""
+    """A picture as a ``data:`` address, and its size in pixels."""
 
     url: str
     width: int
     height: int
-    compressed: bool
 
 
-def inline_picture(path: Path) -> InlinedPicture | None:
-    """Return a picture file for an ``img`` element; None if it is damaged, as an interrupted run may leave it."""
-    content = path.read_bytes()
+def inline_picture(source: Path | Tensor) -> InlinedPicture | None:
+    """Return a picture file, or an (H, W, 3) image, for an ``img`` element; None for a damaged file."""
+    if isinstance(source, Tensor):
+        buffer = io.BytesIO()
+        Image.fromarray(images.to_uint8(source).numpy()).save(buffer, "PNG")
+        content = buffer.getvalue()
+    else:
+        content = source.read_bytes()
     try:
         with Image.open(io.BytesIO(content)) as image:
             image.load()
-            kind, plain = f"image/{(image.format or 'png').lower()}", image.mode in ("L", "P", "RGB", "RGBA")
-            compressed = len(content) > _INLINE_LIMIT and plain and getattr(image, "n_frames", 1) == 1
-            if compressed:
-                buffer, clear = io.BytesIO(), image.mode == "RGBA" or "transparency" in image.info
-                image.convert("RGBA" if clear else "RGB").save(buffer, "WEBP", quality=90, method=4)
+            kind = f"image/{(image.format or 'png').lower()}"
+            if len(content) > _INLINE_LIMIT and getattr(image, "n_frames", 1) == 1:
+                buffer = io.BytesIO()
+                image.convert("RGB").save(buffer, "WEBP", quality=90, method=4)
                 content, kind = buffer.getvalue(), "image/webp"
-            url = f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}"
-            return InlinedPicture(url, *image.size, compressed)
+            return InlinedPicture(f"data:{kind};base64,{base64.b64encode(content).decode('ascii')}", *image.size)
     except (UnidentifiedImageError, OSError, SyntaxError):
         return None
+
+
+# ---------------------------------------------------------------- worst regions
+
+
+@dataclass(frozen=True)
+class Region:
+    """A square of a view, in pixels from its upper left corner, and its PSNR, dB (infinite where nothing differs)."""
+
+    view: str
+    x: int
+    y: int
+    side: int
+    psnr: float
+
+    def of(self, image: Tensor) -> Tensor:
+        """Return the (side, side, C) part of an (H, W, C) image."""
+        return image[self.y : self.y + self.side, self.x : self.x + self.side]
+
+
+def worst_region(view: str, rendered: Tensor, truth: Tensor) -> Region:
+    """Return the square of a quarter of the shorter side with the largest mean squared error.
+
+    Args:
+        rendered, truth: (H, W, C) images in the same colour space.
+    """
+    height, width = truth.shape[:2]
+    side = min(max(round(_SIDE_SHARE * min(height, width)), MIN_SIDE), height, width)
+    error = (rendered.double() - truth.double()).square().mean(-1)[None, None]
+    stride = max(side // _STEPS, 1)
+    means = F.avg_pool2d(error, side, stride)[0, 0]
+    row, column = divmod(int(means.argmax()), means.shape[1])
+    mse = float(means[row, column])
+    return Region(view, column * stride, row * stride, side, -10 * math.log10(mse) if mse > 0 else math.inf)
+
+
+class WorstRegions:
+    """Collects the worst regions of views as they are measured, and writes those of the worst views.
+
+    Args:
+        display: turns a linear or many-channelled image into what a picture shows.
+    """
+
+    def __init__(self, display: Callable[[Tensor], Tensor]) -> None:
+        self._display = display
+        self._found: list[tuple[Region, Tensor]] = []
+
+    def add_view(self, name: str, rendered: Tensor, truth: Tensor) -> None:
+        """Remember a view's worst region."""
+        region = worst_region(name, rendered, truth)
+        if not math.isfinite(region.psnr):
+            return
+        first, second = region.of(truth), region.of(rendered)
+        shown = [images.to_uint8(self._display(x)) for x in (first, second)]
+        self._found.append((region, torch.cat([*shown, torch.from_numpy(error_map(second, first))], dim=1)))
+        self._found.sort(key=lambda found: found[0].psnr)
+        del self._found[MAX_REGIONS:]
+
+    def write(self, folder: Path) -> list[tuple[Region, Path]]:
+        """Write ``worst_000.png`` (truth, render and error side by side), the worst first; return them."""
+        written = []
+        for place, (region, picture) in enumerate(self._found):
+            path = folder / f"worst_{place:03d}.png"
+            images.write_png(path, picture)
+            written.append((region, path))
+        return written

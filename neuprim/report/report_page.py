@@ -14,15 +14,17 @@ from importlib.resources import files
 from pathlib import Path
 from string import Template
 
+from torch import Tensor
+
 from neuprim.report.charts import Chart, draw_svg
-from neuprim.report.pictures import InlinedPicture, inline_picture
+from neuprim.report.pictures import inline_picture
 from neuprim.report.run_record import as_reported_number
 
 MISSING = "–"
 
 _PIXELATED_BELOW = 256  # pictures narrower than this many pixels are enlarged with hard pixel edges
 
-Tile = tuple[str, str, str, str]  # label, value, unit and note of a number in large type, as HTML
+Tile = tuple[str, str, str]  # label, value and note of a number in large type, as HTML
 
 
 def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str = "", script: str = "") -> str:
@@ -58,15 +60,11 @@ def report_folded(title: str, body: str) -> str:
     return f"<details><summary>{title}</summary>{body}</details>"
 
 
-def masthead(eyebrow: str, title: str, more: str = "") -> str:
-    """Return the head of a page: a small line, its heading, and more HTML."""
+def masthead(eyebrow: str, title: str, badge: str = "", more: str = "") -> str:
+    """Return the head of a page: a small line, its heading, a marked note ("" for none), and more HTML."""
     head = f'<p class="eyebrow">{escape(eyebrow)}</p>\n<h1>{escape(title)}</h1>'
-    return f'<header class="masthead"><div>{head}{more}</div></header>'
-
-
-def badge(name: str, text: str = "") -> str:
-    """Return a marked note."""
-    return f'\n<p class="badge"><strong>{escape(name)}</strong> <span>{escape(text) if text else ""}</span></p>'
+    mark = f'\n<p class="badge">{escape(badge)}</p>' if badge else ""
+    return f'<header class="masthead"><div>{head}{mark}{more}</div></header>'
 
 
 def report_banner(notes: Iterable[str]) -> str:
@@ -74,33 +72,26 @@ def report_banner(notes: Iterable[str]) -> str:
     return "".join(f'<p class="banner" role="status">{text}</p>' for text in notes)
 
 
-def report_tiles(items: Sequence[Tile], lead: range = range(1)) -> str:
-    """Return numbers in large type; those of ``lead`` stand out."""
-    cells = []
-    for i, (label, value, unit, text) in enumerate(items):
-        number = f"<dd>{value}{f'<small>{unit}</small>' if unit else ''}</dd>"
-        kind = "tile lead" if i in lead else "tile"
-        cells.append(f'<div class="{kind}"><dt>{label}</dt>{number}<dd class="note" title="{text}">{text}</dd></div>')
-    return f'<dl class="tiles">{"".join(cells)}</dl>'
+def report_tiles(items: Iterable[Tile]) -> str:
+    """Return numbers in large type."""
+    cells = "".join(
+        f'<div class="tile"><dt>{label}</dt><dd>{value}</dd><dd class="note" title="{text}">{text}</dd></div>'
+        for label, value, text in items
+    )
+    return f'<dl class="tiles">{cells}</dl>'
 
 
-def figure(path: Path | None, caption: str, alternative: str, attributes: str = "") -> str:
-    """Return a picture file with its caption; a box with a note where the file is missing or damaged.
+def figure(source: Path | Tensor, caption: str, alternative: str, attributes: str = "") -> str:
+    """Return a picture with its caption; a box with a note where its file is missing or damaged.
 
     Args:
+        source: a file, or an (H, W, 3) image.
         caption, alternative, attributes: HTML.
     """
-    return picture(None if path is None else inline_picture(path), caption, alternative, path is not None, attributes)
-
-
-def picture(
-    shown: InlinedPicture | None, caption: str, alternative: str, exists: bool = True, attributes: str = ""
-) -> str:
-    """Return a picture as :func:`figure` does; ``exists`` says whether one of None is damaged or missing."""
     under = f"<figcaption>{caption}</figcaption>" if caption else ""
+    shown = inline_picture(source) if isinstance(source, Tensor) or source.is_file() else None
     if shown is None:
-        text = "file damaged" if exists else "no picture"
-        return f'<figure{attributes}><div class="absent">{text}</div>{under}</figure>'
+        return f'<figure{attributes}><div class="absent">no picture</div>{under}</figure>'
     kind = ' class="pixelated"' if shown.width < _PIXELATED_BELOW else ""
     size = f'width="{shown.width}" height="{shown.height}"'
     return f'<figure{attributes}><img src="{shown.url}" {size} alt="{alternative}"{kind}>{under}</figure>'
@@ -152,47 +143,42 @@ def format_report_setting(value: object) -> str:
     return str(value)
 
 
-def format_decimal(value: float | None, digits: int) -> str:
-    """Write a fixed number of decimals; the infinity sign for infinite values."""
+def format_decimal(value: float | None, digits: int, unit: str = "") -> str:
+    """Write a fixed number of decimals and a unit; the infinity sign for infinite values."""
     if value is None:
         return MISSING
-    return f"{value:,.{digits}f}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
-
-
-def _finite_report_number(value: object) -> float | None:
-    found = as_reported_number(value)
-    return found if found is not None and math.isfinite(found) else None
+    text = f"{value:,.{digits}f}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
+    return f"{text} {unit}" if unit else text
 
 
 def format_report_count(value: object) -> str:
     """Write a whole number with thousands separated; other numbers with up to two decimals."""
-    found = _finite_report_number(value)
+    found = as_reported_number(value)
     if found is None:
         return MISSING
     return f"{round(found):,}" if found == round(found) else f"{found:,.2f}"
 
 
-def format_report_bytes(value: object) -> tuple[str, str]:
-    """Return (number, unit) of a size in bytes, in powers of 1000."""
-    found = _finite_report_number(value)
+def format_report_bytes(value: object) -> str:
+    """Write a size in bytes, in powers of 1000."""
+    found = as_reported_number(value)
     if found is None:
-        return MISSING, ""
+        return MISSING
     for unit in ("B", "kB", "MB"):
         if abs(found) < 1000:
-            return (f"{found:.3g}" if unit != "B" and found < 100 else f"{found:.0f}"), unit
+            return f"{found:.3g} {unit}"
         found /= 1000
-    return f"{found:,.2f}", "GB"
+    return f"{found:,.2f} GB"
 
 
 def format_report_duration(seconds: object) -> str:
     """Write ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
-    found = _finite_report_number(seconds)
-    if found is None or found < 0:
+    found = as_reported_number(seconds)
+    if found is None:
         return MISSING
     if found < 59.95:
         return f"{found:.1f} s"
-    whole = round(found)
-    if whole < 3600:
-        return f"{whole // 60} min {whole % 60:02d} s"
-    minutes = round(found / 60)
+    minutes, rest = divmod(round(found), 60)
+    if minutes < 60:
+        return f"{minutes} min {rest:02d} s"
     return f"{minutes // 60} h {minutes % 60:02d} min"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,21 +11,20 @@ import torch
 from torch import Tensor
 
 from neuprim.core.io.files import write_text
-from neuprim.core.io.images import write_png
 from neuprim.core.metrics import metric_from_json
 from neuprim.report import report_page as elements
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
-from neuprim.report.pictures import InlinedPicture, color_bar, error_map, inline_picture
+from neuprim.report.pictures import color_bar, error_map
 from neuprim.report.report_page import (
     escape,
     format_decimal,
-    format_report_bytes,
     format_report_count,
     report_note,
     section,
 )
 
 _SLOWEST = 12.0  # multiples of the reference's time beyond which points are off the charts
+_DIFFERENCE = 0.1  # error at the bright end of the colour bar
 
 Command = Callable[[Sequence[str]], str]
 
@@ -36,19 +34,6 @@ class TradeoffPicture(NamedTuple):
 
     image: Tensor
     against: Tensor | None
-
-
-class _Texts(NamedTuple):
-    """What differs between pages of a finished run and of trained models."""
-
-    eyebrow: str
-    reference: str
-    compared_with: str
-    difference: float
-
-
-_RENDERED = _Texts("speed and accuracy of a finished run", "the reference", "the reference’s", 0.05)
-_TRAINED = _Texts("trade-offs of trained models", "the centre", "the ground truth", 0.2)
 
 
 def write_tradeoff_page(
@@ -62,10 +47,9 @@ def write_tradeoff_page(
         command: overrides of a point -> the command that draws or trains it.
     """
     page = _TradeoffPage(record, pictures, command)
-    title = f"{record['task']} / {record['scene']} – speed and accuracy"
+    title = f"{record['task']} / {record['scene']}"
     sections = [
-        page.heading(),
-        page.tiles(),
+        page.heading(title),
         page.charts(),
         page.cards("speed", "The front of speed", "Each is faster than all that are as good."),
         page.cards("size", "The front of size", "Each is smaller than all that are as good."),
@@ -74,7 +58,7 @@ def write_tradeoff_page(
         page.facts(),
     ]
     write_png_charts(folder / "front.png", page.fronts())
-    write_text(folder / "tradeoff.html", elements.render_page(title, sections, "compared"))
+    write_text(folder / "tradeoff.html", elements.render_page(f"{title} – speed and accuracy", sections, "compared"))
 
 
 class _TradeoffPage:
@@ -82,7 +66,7 @@ class _TradeoffPage:
         self.record, self.points, self.pictures, self.command = record, record["points"], pictures, command
         self.front: dict[str, list[int]] = {name: list(record["front"][name]) for name in ("speed", "size")}
         self.trained = bool(self.points[0].get("run_dir"))
-        self.texts = _TRAINED if self.trained else _RENDERED
+        self.reference = "the centre" if self.trained else "the reference"
 
     # ------------------------------------------------------------ numbers
 
@@ -90,18 +74,9 @@ class _TradeoffPage:
         value = metric_from_json(self.points[number]["quality"], name)
         return math.nan if value is None else value
 
-    def ratio(self, number: int) -> float:
-        return float(self.points[number].get("time_ratio", math.nan))
-
-    def spread(self, number: int) -> float:
-        return float(self.points[number].get("time_ratio_spread") or 0.0)
-
-    def name(self, number: int) -> str:
-        return str(self.points[number]["name"])
-
     def gain(self, front: str, number: int) -> str:
         if front == "speed":
-            return f"{1 / self.ratio(number):.2f}× as fast"
+            return f"{1 / float(self.points[number].get('time_ratio', math.nan)):.2f}× as fast"
         return f"{self.points[0]['bytes'] / self.points[number]['bytes']:.2f}× smaller"
 
     def change(self, number: int) -> str:
@@ -110,30 +85,12 @@ class _TradeoffPage:
 
     # ------------------------------------------------------------ sections
 
-    def heading(self) -> str:
+    def heading(self, title: str) -> str:
         source = self.record["data_source"]
-        more = "" if source == "real" else elements.badge(f"{source} data")
-        if self.trained:
-            more += "\n" + report_note(escape(self.record["length"]))
-        return elements.masthead(self.texts.eyebrow, f"{self.record['task']} / {self.record['scene']}", more)
-
-    def tiles(self) -> str:
-        base = self.points[0]
-        (size, unit), count = (
-            format_report_bytes(base["bytes"]),
-            base.get("primitives") or self.record.get("primitives"),
-        )
-        tiles = [
-            (self.texts.reference, format_decimal(base.get("ms_per_frame"), 2), "ms a frame", escape(self.name(0))),
-            ("PSNR", format_decimal(self.quality(0), 2), "dB", f"{len(self.record['same']['views'])} test views"),
-            ("Model file", size, unit, f"{format_report_count(count)} primitives"),
-        ]
-        for front, label in (("speed", "Fastest"), ("size", "Smallest")):
-            good = [i for i in self.front[front] if self.quality(i) >= self.quality(0) - 0.1]
-            if good:
-                value, _, what = self.gain(front, good[-1]).partition("×")
-                tiles.append((f"{label} within 0.1 dB", value, f"times{what}", escape(self.name(good[-1]))))
-        return elements.report_tiles(tiles, lead=range(3, len(tiles)))
+        badge = "" if source == "real" else f"{source} data"
+        more = "\n" + report_note(escape(self.record["length"])) if self.trained else ""
+        eyebrow = "trade-offs of trained models" if self.trained else "speed and accuracy of a finished run"
+        return elements.masthead(eyebrow, title, badge, more)
 
     def fronts(self) -> list[Chart]:
         """Return PSNR against time and against bytes; of a finished run the latter of smaller points alone."""
@@ -146,11 +103,11 @@ class _TradeoffPage:
         ]
 
     def _time_chart(self, title: str, quality: str, joined: bool) -> Chart:
-        dots = [
-            Dot(self.ratio(i), self.quality(i, quality), self.spread(i), self._mark("speed", i), i == 0)
-            for i in range(len(self.points))
-        ]
-        axis = f"time of a frame, as a multiple of that of {self.texts.reference}"
+        dots = []
+        for i, point in enumerate(self.points):
+            ratio, spread = float(point.get("time_ratio", math.nan)), float(point.get("time_ratio_spread") or 0.0)
+            dots.append(Dot(ratio, self.quality(i, quality), spread, self._mark("speed", i), i == 0))
+        axis = f"time of a frame, as a multiple of that of {self.reference}"
         return front_chart(title, axis, "PSNR, dB", dots, joined=joined, most=math.inf if self.trained else _SLOWEST)
 
     def _mark(self, front: str, number: int) -> str | None:
@@ -158,7 +115,7 @@ class _TradeoffPage:
 
     def charts(self) -> str:
         charts = [*self.fronts(), self._time_chart("PSNR against the exact image", "psnr_exact", False)]
-        text = f"Ringed: {self.texts.reference}. Orange and numbered: the front. Bars: half of the interquartile range."
+        text = f"Ringed: {self.reference}. Orange and numbered: the front. Bars: half of the interquartile range."
         if self.trained:
             text += " Trainings with another seed differ by some hundredths to tenths of a decibel."
         panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in charts], "charts")
@@ -168,60 +125,58 @@ class _TradeoffPage:
         """Return a card with picture, numbers and command for every point of a front."""
         cards = [self._card(-1, "ground truth", "")] if -1 in self.pictures else []
         if 0 not in self.front[front]:
-            cards.append(self._card(0, escape(self.name(0)), self.texts.reference))
+            cards.append(self._card(0, escape(self.points[0]["name"]), self.reference))
         for place, number in enumerate(self.front[front], 1):
-            cards.append(self._card(number, f"{place}. {escape(self.name(number))}", self.gain(front, number)))
+            name = escape(self.points[number]["name"])
+            cards.append(self._card(number, f"{place}. {name}", self.gain(front, number)))
         bar = f'<span class="bar" style="background: {color_bar()}"></span>'
-        text += f" Beside the picture: its difference from {self.texts.compared_with}."
-        scale = report_note(f"Difference: 0{bar}{self.texts.difference:g} or more.")
+        text += f" Beside the picture: its difference from {'the ground truth' if self.trained else 'the reference’s'}."
+        scale = report_note(f"Difference: 0{bar}{_DIFFERENCE:g} or more.")
         return section(title, f'{report_note(text)}{scale}<div class="points">{"".join(cards)}</div>')
 
     def _card(self, number: int, heading: str, gain: str) -> str:
         html = f'<article class="point"><header><span class="gain">{gain}</span><h3>{heading}</h3></header>'
         if number in self.pictures:
-            html += self._pair(self.pictures[number], "ground truth" if number < 0 else self.name(number))
+            image, against = self.pictures[number]
+            html += f'<div class="pair">{elements.figure(image, "", heading)}'
+            if against is not None:
+                error = torch.from_numpy(error_map(image, against, _DIFFERENCE)).float() / 255
+                html += elements.figure(error, "", f"difference of {heading}")
+            html += "</div>"
         if number < 0:
             return html + "</article>"
-        point, (size, unit) = self.points[number], format_report_bytes(self.points[number]["bytes"])
-        quality = f"{format_decimal(self.quality(number), 2)} dB ({self.change(number)})"
-        ssim = format_decimal(self.quality(number, "ssim"), 4)
-        ms, rate = format_decimal(point.get("ms_per_frame"), 2), format_decimal(point.get("frames_per_second"), 1)
-        numbers = f"{quality}, SSIM {ssim}; {ms} ms, {rate} frames/s; {size} {unit}"
+        point, ssim = self.points[number], format_decimal(self.quality(number, "ssim"), 4)
+        quality = f"{format_decimal(self.quality(number), 2)} dB ({self.change(number)}), SSIM {ssim}"
+        time = f"{format_decimal(point.get('ms_per_frame'), 2)} ms"
+        numbers = f"{quality}; {time}; {elements.format_report_bytes(point['bytes'])}"
         return f"{html}<p>{numbers}</p><code>{escape(self.command(point['words']))}</code></article>"
 
-    def _pair(self, picture: TradeoffPicture, name: str) -> str:
-        images = [(picture.image, escape(name))]
-        if picture.against is not None:
-            error = error_map(picture.image, picture.against, self.texts.difference)
-            images.append((torch.from_numpy(error).float() / 255, f"difference of {escape(name)}"))
-        figures = [elements.picture(_inline_image(image), "", text) for image, text in images]
-        return f'<div class="pair">{"".join(figures)}</div>'
-
     def table(self) -> str:
-        names = ["point", "PSNR", "change", "SSIM", "against exact, dB", "time", "±", "ms", "frames/s", "bytes"]
-        names += ["rounds"]
-        names += ["primitives", "numbers each", "steps", "ms a step", "seconds"] if self.trained else []
+        columns: dict[str, Callable[[int, Mapping[str, Any]], str]] = {
+            "PSNR": lambda i, p: format_decimal(self.quality(i), 3),
+            "change": lambda i, p: self.change(i),
+            "SSIM": lambda i, p: format_decimal(self.quality(i, "ssim"), 4),
+            "against exact, dB": lambda i, p: format_decimal(self.quality(i, "psnr_exact"), 1),
+            "time": lambda i, p: format_decimal(p.get("time_ratio"), 3),
+            "±": lambda i, p: format_decimal(p.get("time_ratio_spread"), 3),
+            "ms": lambda i, p: format_decimal(p.get("ms_per_frame"), 2),
+            "bytes": lambda i, p: format_report_count(p["bytes"]),
+        }
+        if self.trained:
+            columns |= {
+                "primitives": lambda i, p: format_report_count(p["primitives"]),
+                "numbers each": lambda i, p: format_report_count(p["parameters_per_primitive"]),
+                "steps": lambda i, p: format_report_count(p["steps"]),
+                "ms a step": lambda i, p: format_decimal(p["ms_per_step"], 2),
+                "seconds": lambda i, p: format_decimal(p["seconds"], 1),
+            }
         rows, marked = [], {*self.front["speed"], *self.front["size"]}
-        for i, p in enumerate(self.points):
-            cells = [
-                format_decimal(self.quality(i), 3),
-                self.change(i),
-                format_decimal(self.quality(i, "ssim"), 4),
-                format_decimal(self.quality(i, "psnr_exact"), 1),
-                format_decimal(p.get("time_ratio"), 3),
-                format_decimal(p.get("time_ratio_spread"), 3),
-                format_decimal(p.get("ms_per_frame"), 2),
-                format_decimal(p.get("frames_per_second"), 1),
-                format_report_count(p["bytes"]),
-                format_report_count(len(p["ms"])),
-            ]
-            if self.trained:
-                cells += [format_report_count(p[name]) for name in ("primitives", "parameters_per_primitive", "steps")]
-                cells += [format_decimal(p["ms_per_step"], 2), format_decimal(p["seconds"], 1)]
-            rows.append(elements.table_row(escape(self.name(i)), cells, ' class="front"' if i in marked else ""))
-        text = f"Time and ± are multiples of the time of {self.texts.reference} in the same round; orange: on a front."
+        for i, point in enumerate(self.points):
+            cells = [column(i, point) for column in columns.values()]
+            rows.append(elements.table_row(escape(point["name"]), cells, ' class="front"' if i in marked else ""))
+        text = f"Time and ± are multiples of the time of {self.reference} in the same round; orange: on a front."
         title = f"All {format_report_count(len(self.points))} {'models' if self.trained else 'points'}"
-        return section(title, elements.number_table(names, rows) + report_note(text))
+        return section(title, elements.number_table(["point", *columns], rows) + report_note(text))
 
     def left_out(self) -> str:
         rows = [
@@ -232,27 +187,18 @@ class _TradeoffPage:
 
     def facts(self) -> str:
         r, same, exact = self.record, self.record["same"], self.record.get("exact", {})
-        text = str(exact.get("drawn_by", elements.MISSING))
+        pairs = [
+            ("views", ", ".join(same["views"])),
+            ("image size", "×".join(map(str, same["image_size"]))),
+            ("exact images", exact.get("drawn_by")),
+            ("backend", r["backend"]),
+        ]
         if not exact.get("float64", True):
-            size = "×".join(map(str, exact["checked_size"]))
-            text += f"; {format_decimal(exact['psnr_against_float64'], 0)} dB from float64 at {size}"
-        pairs = [("views", ", ".join(same["views"])), ("image size", "×".join(map(str, same["image_size"])))]
-        pairs += [("exact images", text), ("backend", str(r["backend"]))]
+            pairs.append(("exact images against float64, dB", format_decimal(exact["psnr_against_float64"], 0)))
         if self.trained:
-            pairs += [
-                ("overrides of the centre", " ".join(r["words"]) or "none"),
-                ("budget", f"{r['budget_seconds']:g} s, of which {r['spent_seconds']:.0f} were used"),
-                ("seeds", str(r["seeds"])),
-            ]
-        else:
-            pairs.append(("model", same["model"][:16]))
-        pairs += [(name, str(value)) for name, value in (*same["machine"].items(), *same["versions"].items())]
-        pairs += [(f"{name} not measured", str(why)) for name, why in r.get("not_measured", {}).items()]
+            budget = f"{r['budget_seconds']:g} s, of which {r['spent_seconds']:.0f} were used"
+            words = " ".join(r["words"]) or "none"
+            pairs += [("overrides of the centre", words), ("budget", budget), ("seeds", r["seeds"])]
+        pairs += [*same["machine"].items(), *same["versions"].items()]
+        pairs += [(f"{name} not measured", why) for name, why in r.get("not_measured", {}).items()]
         return section("Where the numbers come from", elements.fact_list(pairs))
-
-
-def _inline_image(image: Tensor) -> InlinedPicture | None:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
-        write_png(path, image)
-        return inline_picture(path)

@@ -17,8 +17,8 @@ from neuprim.core.io.files import write_json
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.returns import call_task_clips, call_task_orbit
-from neuprim.report import Viewer, error_map, write_report
-from neuprim.report.regions import WorstRegions
+from neuprim.report.pictures import WorstRegions, error_map
+from neuprim.report.run_report import Viewer, write_report
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.webpage.model_page import (
@@ -67,7 +67,6 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
             images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
 
     views = measure_views(model, task, dataset, settings, fitted.lpips, write_view)
-    regions.write(folder)
     for clip in clips:
         if clip.source is not None:  # the frames of others are test views, written above
             for i in clip.views:
@@ -79,7 +78,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     orbit = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [display(render_image(model, view, settings, dataset.background)) for view in orbit]
     write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory, task.conditions, _make_run_viewer_page(fitted, directory))
+    write_report(directory, task.conditions, _make_run_viewer_page(fitted, directory), regions.write(folder))
     return metrics
 
 

@@ -13,8 +13,7 @@ from typing import Any
 import pytest
 
 from neuprim.core.errors import ConfigError
-from neuprim.report import Viewer, write_report
-from neuprim.report.run_report import VIEWER_LIMIT
+from neuprim.report.run_report import VIEWER_LIMIT, Viewer, write_report
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics

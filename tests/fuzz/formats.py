@@ -331,11 +331,11 @@ def _read_compressed(folder: Path) -> None:
 
 
 def _read_run(folder: Path) -> None:
-    from neuprim.report.run_record import read_reported_run, read_reported_view_numbers
+    from neuprim.report.run_record import read_reported_run
     from neuprim.runs.open import open_run, read_metrics
 
     run, record = open_run(folder / "run"), read_reported_run(folder / "run")
-    repr((run.settings, run.header.get("background"), record.shown, read_reported_view_numbers(record)))
+    repr((run.settings, run.header.get("background"), record.shown, record.view_numbers))
     if (folder / "run/metrics.json").exists():
         read_metrics(folder / "run")
 
@@ -343,7 +343,7 @@ def _read_run(folder: Path) -> None:
 def _records(folder: Path) -> None:
     """What runs, sweeps, chunks, searches and launches keep."""
     from neuprim.runs.launch.jobs import JobStatus, write_status
-    from neuprim.runs.launch_record import LaunchedRun, LaunchRecord
+    from neuprim.runs.sweep import LaunchedRun, LaunchRecord
     from neuprim.search.target_record import SettingChange, TargetRecord
     from neuprim.search.tradeoff_record import LeftOutPoint, TradeoffPoint, TradeoffRecord
     from neuprim.search.trials import Outcome
@@ -355,10 +355,6 @@ def _records(folder: Path) -> None:
     (folder / "run/metrics.json").write_text(json.dumps(numbers))
     lines = [{"step": i, "loss": 0.1, "primitives": 40, "seconds": 1.0 * i, "eval_psnr": 20.0} for i in (1, 2, 3)]
     (folder / "run/metrics.jsonl").write_text("\n".join(map(json.dumps, lines)) + "\n")
-    (folder / "run/renders").mkdir()
-    (folder / "run/renders/worst_0.png").touch()
-    region = [{"file": "worst_0.png", "name": "a", "psnr": 10.0, "x": 1, "y": 2, "side": 3}]
-    (folder / "run/renders/worst.json").write_text(json.dumps(region))
     runs = (LaunchedRun("0", ("a=1",), {"a": "1"}), LaunchedRun("1", ("a=2",), {"a": "2"}, "failed", "why", 2.5, 1))
     LaunchRecord(folder / "sweep.json", ("a=1,2",), runs).write()
     LaunchRecord(folder / "chunks.json", (), runs, 100).write()
@@ -381,18 +377,17 @@ def _records(folder: Path) -> None:
 
 def _read_records(folder: Path) -> None:
     from neuprim.runs.launch.jobs import read_status
-    from neuprim.runs.run import read_chunk_record
-    from neuprim.runs.sweep import read_sweep, read_sweep_runs, write_sweep_csv
+    from neuprim.runs.sweep import read_launch_record, read_sweep_runs, write_sweep_csv
     from neuprim.search import trials
     from neuprim.search.target_record import read_target_record as read_target
     from neuprim.search.tradeoff_record import read_tradeoff_record
     from neuprim.search.tradeoff_record import write_tradeoff_csv as write_points
 
     _read_run(folder)
-    if (sweep := read_sweep(folder)) is not None:
+    if (sweep := read_launch_record(folder / "sweep.json")) is not None:
         write_sweep_csv(folder / "out.csv", read_sweep_runs(sweep))
         replace(sweep, file=folder / "again/sweep.json").write()
-    if (chunks := read_chunk_record(folder)) is not None:
+    if (chunks := read_launch_record(folder / "chunks.json")) is not None:
         replace(chunks, file=folder / "again/chunks.json").write()
     if (target := read_target(folder / "target")) is not None:
         target.write(folder / "again")
@@ -454,7 +449,7 @@ _DATASETS, _IMAGES = "neuprim.tasks.static.datasets", "neuprim.core.io.images"
 
 _RECORDS: Files = {
     "run/metrics.jsonl": m.jsonl_of,
-    **dict.fromkeys(("run/metrics.json", "run/renders/worst.json", "run/tradeoff/tradeoff.json"), m.json_of),
+    **dict.fromkeys(("run/metrics.json", "run/tradeoff/tradeoff.json"), m.json_of),
     **dict.fromkeys(("sweep.json", "chunks.json", "target/target.json", "trial.json", "status.json"), m.json_of),
 }
 _SPLITS: Files = {"transforms_train.json": m.json_of, "transforms_test.json": m.json_of}

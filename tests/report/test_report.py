@@ -1,11 +1,10 @@
-"""The report of finished, interrupted and damaged runs: content, escaping, and that the page stands alone."""
+"""The report of a run: content, escaping, and that the page stands alone."""
 
 from __future__ import annotations
 
 import html.parser
 import json
 import math
-import os
 import re
 import shutil
 from pathlib import Path
@@ -16,11 +15,10 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.errors import DataError
 from neuprim.core.metrics import metric_to_json, psnr, ssim
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.report import error_map, write_report
-from neuprim.report.run_record import read_reported_run
+from neuprim.report.pictures import WorstRegions, error_map
+from neuprim.report.run_report import write_report
 from tests.reports import offered
 
 NAMES = ("r_0", "r_25", "night-view", "r_75")
@@ -73,7 +71,7 @@ def make_run(folder: Path, size: tuple[int, int] = (48, 64), lines: int = 400, n
     metrics: dict[str, Any] = {
         "task": "static", "scene": "chequered-ball", "split": "test", "data_source": "generated",
         "psnr": float(np.mean([e["psnr"] for e in entries])), "ssim": float(np.mean([e["ssim"] for e in entries])),
-        "psnr_worst": min(e["psnr"] for e in entries), "per_view": entries,
+        "psnr_worst": min(e["psnr"] for e in entries), "view_worst": "r_75", "per_view": entries,
         "primitives": 10_000, "parameters": 670_000, "parameters_per_primitive": 67, "model_bytes": 2_684_112,
         "iterations": 4000, "train_seconds": 664.2, "render_fps": 41.37, "backend": "cpu", "device": "16-core CPU",
         "checkpoint": "last", "downsampling": "200x200 from 800x800 by area", "background": [1.0, 1.0, 1.0], "seed": 0,
@@ -158,7 +156,7 @@ def test_a_finished_run_shows_what_it_measured(finished: Path) -> None:
     text = Structure(page).text
     assert "<title>static / chequered-ball – neuprim</title>" in page
     for expected in (
-        "generated data", "Metrics of the last checkpoint, not the best.",
+        "generated data: not photographs", "Metrics of the last checkpoint, not the best.",
         f"PSNR, mean {metrics['psnr']:.2f} dB 4 test views",
         f"PSNR, worst view {metrics['psnr_worst']:.2f} dB r_75", f"SSIM {metrics['ssim']:.4f}", "Primitives 10,000",
         "670,000 67 per primitive",
@@ -220,16 +218,19 @@ def test_the_page_stands_alone(finished: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("source", "badge"),
-    [("real", None), ("generated", "generated data"), ("simulated", "simulated data"), ("dreamt", "dreamt")],
+    ("entries", "badge"),
+    [
+        ({"data_source": "real"}, None),
+        ({"data_source": "simulated"}, "simulated data: not captured"),
+        ({"data_source": "dreamt"}, "dreamt"),
+        ({"data_source": "generated", "rendered_from": "a.glb"}, "generated data: rendered from a.glb"),
+    ],
 )
-def test_badge(quick: Path, source: str, badge: str | None) -> None:
-    change(quick, data_source=source)
+def test_badge(quick: Path, entries: dict[str, str], badge: str | None) -> None:
+    change(quick, **entries)
     page = page_of(quick)
     assert ('class="badge"' in page) == (badge is not None)
-    assert badge is None or f'class="badge"><strong>{badge}</strong>' in page
-    change(quick, data_source=...)
-    assert "data source not recorded" in page_of(quick)
+    assert badge is None or f'class="badge">{badge}<' in page
 
 
 def test_everything_from_outside_is_escaped(tmp_path: Path) -> None:
@@ -238,7 +239,7 @@ def test_everything_from_outside_is_escaped(tmp_path: Path) -> None:
     metrics = json.loads((run / "metrics.json").read_text(encoding="utf-8"))
     strings = {key: evil for key, value in metrics.items() if isinstance(value, str)}
     views = [{"name": evil, "psnr": 20.0, "ssim": 0.5}, {"name": "z", "psnr": 30.0, "ssim": 0.5}]
-    changed = {evil: [evil, [evil]], "plain": evil}
+    changed = {evil: [evil, [evil]], "plain": [None, evil]}
     change(run, **strings, per_view=views, versions={evil: evil}, non_default=changed, background=[evil])
     (run / "config.yaml").write_text("x: '</code></pre><script>bad</script>'\n", encoding="utf-8")
     page = page_of(run)
@@ -246,87 +247,38 @@ def test_everything_from_outside_is_escaped(tmp_path: Path) -> None:
     assert not {"script", "i"} & {tag for tag, _ in structure.elements}
     assert structure.text.count("<script>alert(1)</script>\"'&$x^2$<i>") >= len(strings)
     assert "</code></pre><script>bad</script>" in structure.text
-    # The name of the worst view is inside the chart too, as it is and not as a formula.
-    chart = re.search(r'<svg[^>]*aria-label="PSNR per view".*?</svg>', page, re.DOTALL)
-    assert chart and "&lt;script&gt;alert(1)&lt;/script&gt;" in chart[0] and "$x^2$" in chart[0]
-
-
-def test_any_missing_or_wrong_field_is_a_dash(quick: Path) -> None:
-    shutil.rmtree(quick / "renders")
-    dashes = Structure(page_of(quick)).text.count("–")
-    metrics = json.loads((quick / "metrics.json").read_text(encoding="utf-8"))
-    for key in metrics:
-        for value in (..., None, "text", [], {}, [1], {"a": 1}, True, float("nan")):
-            kept = {k: v for k, v in (metrics | {key: value}).items() if v is not ...}
-            (quick / "metrics.json").write_text(json.dumps(kept))
-            structure = Structure(page_of(quick))
-            shown = ("psnr", "ssim", "primitives", "model_bytes", "render_fps", "seed", "versions", "device")
-            if value is ... and key in shown:
-                assert structure.text.count("–") > dashes, key
 
 
 def test_infinite_psnr(quick: Path) -> None:
     views = [{"name": "a", **metric_to_json("psnr", math.inf), "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.9}]
-    change(quick, per_view=views, **metric_to_json("psnr", math.inf), psnr_worst=30.0)
+    change(quick, per_view=views, **metric_to_json("psnr", math.inf), psnr_worst=30.0, view_worst="b")
     text = Structure(page_of(quick)).text
     assert "PSNR, mean ∞ dB" in text and "a ∞ dB PSNR 1.0000 SSIM" in text and "PSNR, worst view 30.00 dB b" in text
 
 
-def test_an_interrupted_run_says_so(quick: Path) -> None:
-    (quick / "metrics.json").unlink()
-    with (quick / "metrics.jsonl").open("a") as log:
-        log.write('{"step": 50, "lo')
+def test_views_worse_than_nothing_and_not_measured_numbers_say_so(quick: Path) -> None:
+    change(quick, worse_than_black_image=["<a>"], views_empty=2, lpips=None, not_measured={"lpips": "no weights"})
+    change(quick, psnr_mask=20.0, psnr_black_image_mask=9.0, sigma_frames=[{"max_error": 0.25}, {"max_error": None}])
     text = Structure(page_of(quick)).text
-    assert "This run has not finished." in text and "The last logged step is 40 of 4,000." in text
-    assert "1 line of metrics.jsonl could not be read" in text
-    assert "PSNR, held-out – not logged yet" in text and "at step 40" in text
-    assert "Metrics of the last checkpoint" not in text and "static" in text
+    for expected in (
+        *(
+            "1 view is worse than a black image , which the mean hides: <a>.",
+            "Empty views 2",
+            "not measured: no weights",
+        ),
+        *("20.00 dB where anything ever is; a black image: 9.0 dB", "Largest error of extinction 25 %"),
+    ):
+        assert expected in text, expected
 
 
-def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
-    (tmp_path / "config.yaml").write_text("")
-    folder = tmp_path / "renders"
-    folder.mkdir()
-    for stem in ("010_a", "002_x_truth", "002_x_truth_truth", "002_x_truth_error", "1000_b", "note"):
-        save(folder / f"test_{stem}.png", scene(4, 4, 0.0))
-    views = read_reported_run(tmp_path).views
-    assert [(v.index, v.stem) for v in views] == [(2, "x_truth"), (10, "a"), (1000, "b")]
-    assert views[0].truth == folder / "test_002_x_truth_truth.png"
-    assert views[0].error == folder / "test_002_x_truth_error.png"
-    assert views[1].truth is None and views[1].error is None
-    assert Structure(page_of(tmp_path)).text.count("no picture") == 4
-
-
-def test_numbers_go_to_the_view_they_belong_to(quick: Path) -> None:
-    views = [{"name": "cam/a b", "psnr": 11.0, "ssim": 0.1}, {"name": "other", "psnr": 22.0, "ssim": 0.2}]
-    change(quick, per_view=views)
-    for kind in ("", "_truth", "_error"):
-        (quick / "renders" / f"test_000_a{kind}.png").rename(quick / "renders" / f"test_000_cam_a-b{kind}.png")
-    text = Structure(page_of(quick)).text
-    assert "cam/a b 11.00 dB PSNR" in text
-    assert "b – dB PSNR – SSIM" in text  # "b" is no other spelling of "other", whatever its index
-
-
-@pytest.mark.parametrize("step", ["replace", "render"])
-def test_a_failed_write_keeps_the_old_report(quick: Path, monkeypatch: pytest.MonkeyPatch, step: str) -> None:
-    (quick / "report.html").write_text("old")
-
-    def fail(*_: object) -> None:
-        raise OSError("disk full")
-
-    if step == "replace":
-        monkeypatch.setattr(os, "replace", fail)
-    else:
-        monkeypatch.setattr("neuprim.report.run_report._render_report", fail)
-    with pytest.raises(OSError, match="disk full"):
-        write_report(quick)
-    assert (quick / "report.html").read_text() == "old"
-    assert not list(quick.glob(".*"))
-
-
-def test_what_is_no_run_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(DataError, match="not a directory"):
-        write_report(tmp_path / "absent")
-    with pytest.raises(DataError, match="not a run directory"):
-        write_report(tmp_path)
-    assert not list(tmp_path.iterdir())
+def test_the_worst_regions_come_first_and_the_rest_is_folded(quick: Path) -> None:
+    regions = WorstRegions(lambda x: x)
+    for i in range(20):
+        truth = torch.full((40, 40, 3), 0.4)
+        rendered = truth.clone()
+        rendered[8:18, 8:18] += 0.1 + 0.02 * i
+        regions.add_view(f"<i>{i}", rendered, truth)
+    page = write_report(quick, regions=regions.write(quick / "renders")).read_text(encoding="utf-8")
+    assert "8 more" in page and "&lt;i&gt;19" in page and "<i>" not in page
+    assert page.count("worst region of view") == 20
+    assert page.index("worst region of view &lt;i&gt;19") < page.index("worst region of view &lt;i&gt;18")

@@ -1,9 +1,8 @@
-"""The report's parts: reading a run directory, error maps, pictures, charts, numbers as text."""
+"""The report's parts: reading a run directory, error maps, worst regions, pictures, charts, numbers as text."""
 
 from __future__ import annotations
 
 import base64
-import json
 import math
 import re
 from pathlib import Path
@@ -13,10 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
-from neuprim.core.errors import ConfigError, DataError, NonFiniteError
-from neuprim.report import ERROR_SCALE, error_map
-from neuprim.report.charts import HELD_OUT, TRAINING, ChartPoints, Dot, curve_chart, draw_svg, front_chart, view_chart
-from neuprim.report.pictures import inline_picture
+from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.report.charts import HELD_OUT, TRAINING, ChartPoints, Dot, curve_chart, draw_svg, front_chart
+from neuprim.report.pictures import ERROR_SCALE, MAX_REGIONS, WorstRegions, error_map, inline_picture, worst_region
 from neuprim.report.report_page import (
     escape,
     format_decimal,
@@ -27,36 +25,30 @@ from neuprim.report.report_page import (
 from neuprim.report.run_record import read_reported_run
 
 
-def test_a_resumed_run_counts_each_step_once(tmp_path: Path) -> None:
-    steps = [(10, 1.0), (20, 2.0), (30, 3.0), (20, 2.5), (30, 3.5), (40, 4.5)]
-    lines = [json.dumps({"step": s, "loss": v}) for s, v in steps]
-    (tmp_path / "metrics.jsonl").write_text("\n".join([*lines, "[1]", '{"loss": 3}', ""]))
-    run = read_reported_run(tmp_path)
-    assert [(line["step"], line["loss"]) for line in run.log] == [(10, 1.0), (20, 2.5), (30, 3.5), (40, 4.5)]
-    assert run.unreadable_lines == 2 and run.last("loss") == (40, 4.5) and run.last("psnr") is None
-
-
-@pytest.mark.parametrize(
-    ("name", "text", "message"),
-    [
-        ("metrics.json", "{", "metrics.json: not valid JSON"),
-        ("metrics.json", "[]", "expected a mapping, found list"),
-        ("config.yaml", "a: [", "config.yaml: not valid YAML"),
-        ("config.yaml", "- a", "expected a mapping, found list"),
-        ("config.yaml", b"\xff\xfe\x00", "not UTF-8"),
-    ],
-)
-def test_damaged_files_are_named(tmp_path: Path, name: str, text: str | bytes, message: str) -> None:
-    (tmp_path / name).write_bytes(text if isinstance(text, bytes) else text.encode())
-    with pytest.raises(DataError, match=message):
+@pytest.mark.parametrize("text", [b"{", b"[]", b"\xff\xfe\x00", b"[" * 100_000])
+def test_damaged_metrics_are_named(tmp_path: Path, text: bytes) -> None:
+    (tmp_path / "metrics.json").write_bytes(text)
+    with pytest.raises(DataError, match=r"metrics\.json: "):
         read_reported_run(tmp_path)
+
+
+def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
+    folder = tmp_path / "renders"
+    folder.mkdir()
+    for stem in ("010_a", "002_x_truth", "1000_b", "note", "003_unfinished"):
+        for kind in ("", "_truth", "_error") if "unfinished" not in stem else ("", "_truth"):
+            (folder / f"test_{stem}{kind}.png").touch()
+    views = read_reported_run(tmp_path).views
+    assert [(v.index, v.stem) for v in views] == [(2, "x_truth"), (10, "a"), (1000, "b")]
+    assert views[0].truth == folder / "test_002_x_truth_truth.png"
+    assert views[0].error == folder / "test_002_x_truth_error.png"
 
 
 def test_large_pictures_are_compressed(tmp_path: Path) -> None:
     noise = np.random.default_rng(0).integers(0, 256, (400, 400, 3), dtype=np.uint8)
     Image.fromarray(noise).save(tmp_path / "a.png")
     picture = inline_picture(tmp_path / "a.png")
-    assert picture and picture.compressed and picture.url.startswith("data:image/webp")
+    assert picture and picture.url.startswith("data:image/webp")
     assert (picture.width, picture.height) == (400, 400)
     assert len(picture.url) < (tmp_path / "a.png").stat().st_size
 
@@ -65,7 +57,7 @@ def test_small_pictures_are_the_files_byte_for_byte(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     Image.new("RGB", (5, 3), (200, 10, 40)).save(path)
     picture = inline_picture(path)
-    assert picture and not picture.compressed and base64.b64decode(picture.url.partition(",")[2]) == path.read_bytes()
+    assert picture and base64.b64decode(picture.url.partition(",")[2]) == path.read_bytes()
     path.write_bytes(path.read_bytes()[:50])
     assert inline_picture(path) is None
 
@@ -90,8 +82,34 @@ def test_error_map_refuses_what_it_cannot_show() -> None:
         error_map(image * float("nan"), image)
     with pytest.raises(DataError, match="shape"):
         error_map(image, torch.zeros(2, 3, 3))
-    with pytest.raises(ConfigError, match="positive"):
-        error_map(image, image, scale=0.0)
+
+
+@pytest.mark.parametrize(("x", "y"), [(0, 0), (80, 0), (0, 60), (90, 65), (41, 23)])
+def test_the_worst_region_is_where_the_error_is(x: int, y: int) -> None:
+    truth = torch.full((80, 120, 3), 0.4)
+    rendered = truth + 0.01
+    rendered[y : y + 10, x : x + 10] += 0.5
+    region = worst_region("a", rendered, truth)
+    assert region.side == 20
+    assert region.x <= x and region.y <= y and region.x + 20 >= min(x + 10, 120) and region.y + 20 >= min(y + 10, 80)
+    own = -10 * math.log10((region.of(rendered) - region.of(truth)).double().square().mean().item())
+    assert region.psnr == pytest.approx(own, abs=1e-6) and region.psnr < 13
+    small = worst_region("a", rendered[:9, :30], truth[:9, :30])
+    assert small.side == 9 and worst_region("a", truth, truth).psnr == math.inf
+
+
+def test_the_worst_regions_are_kept_and_the_exact_views_left_out(tmp_path: Path) -> None:
+    regions, truth = WorstRegions(lambda x: x), torch.full((40, 40, 3), 0.4)
+    regions.add_view("same", truth, truth)
+    assert regions.write(tmp_path) == []
+    for i in range(2 * MAX_REGIONS):
+        regions.add_view(f"v{i}", truth + 0.1 + 0.001 * ((i * 37) % (2 * MAX_REGIONS)), truth)
+    found = regions.write(tmp_path)
+    values = [region.psnr for region, _ in found]
+    assert len(found) == MAX_REGIONS and values == sorted(values)
+    with Image.open(found[0][1]) as image:
+        assert image.size == (48, 16)
+        assert image.getpixel((4, 4)) == (102, 102, 102), "the truth stands first"
 
 
 Pairs = list[tuple[float, float]]
@@ -119,8 +137,6 @@ def test_charts_keep_text_as_text_and_follow_the_page() -> None:
 def test_charts_of_nothing_and_of_one_point() -> None:
     assert curve([], [], "steps") is None
     assert curve([(0, 3)], [], "steps") is not None and curve([], [(7, 3)], "seconds") is not None
-    assert draw_svg(view_chart("x", [None, math.inf], math.inf, None)) is None
-    assert "a" in texts(draw_svg(view_chart("x", [None, 3.0, math.inf, 2.0], 2.5, "a")))
     assert draw_svg(front_chart("x", "cost", "dB", [Dot(math.nan, 3.0)])) is None
 
 
@@ -129,25 +145,26 @@ def test_a_front_is_marked_and_says_what_is_left_out() -> None:
     assert {"1", "2", "cost (1 beyond 12)"} <= texts(draw_svg(front_chart("x", "cost", "dB", dots, most=12.0)))
 
 
-def test_non_finite_log_values_are_left_out_of_the_curves(tmp_path: Path) -> None:
+def test_unreadable_lines_and_non_finite_values_are_left_out_of_the_curves(tmp_path: Path) -> None:
     lines = [
         '{"step": 1, "loss": 2, "psnr": 3}',
         '{"step": 2, "loss": NaN, "psnr": Infinity}',
         '{"step": 3, "loss": null, "psnr": true}',
+        "[1]",
+        '{"step": 4, "lo',
     ]
     (tmp_path / "metrics.jsonl").write_text("\n".join(lines))
     run = read_reported_run(tmp_path)
-    assert run.last("loss") == (1, 2) and run.last("psnr") == (1, 3)
     for key, value in (("loss", 2.0), ("psnr", 3.0)):
         assert run.series("step", key) == ([1.0], [value])
 
 
 def test_numbers_as_text() -> None:
-    assert [format_report_duration(s) for s in (8.34, 59.97, 247, 3599.7, 7500, None, -1, math.nan)] == [
-        "8.3 s", "1 min 00 s", "4 min 07 s", "1 h 00 min", "2 h 05 min", "–", "–", "–",
+    assert [format_report_duration(s) for s in (8.34, 59.97, 247, 3599.7, 7500, None, math.nan)] == [
+        "8.3 s", "1 min 00 s", "4 min 07 s", "1 h 00 min", "2 h 05 min", "–", "–",
     ]  # fmt: skip
     assert [format_report_bytes(b) for b in (0, 999, 1234, 45_600_000, 456_700_000, 7.25e9, "x")] == [
-        ("0", "B"), ("999", "B"), ("1.23", "kB"), ("45.6", "MB"), ("457", "MB"), ("7.25", "GB"), ("–", ""),
+        "0 B", "999 B", "1.23 kB", "45.6 MB", "457 MB", "7.25 GB", "–",
     ]  # fmt: skip
     assert [format_report_count(v) for v in (1234567, 67.25, None, math.inf)] == ["1,234,567", "67.25", "–", "–"]
     assert [format_decimal(v, 2) for v in (1.005, math.inf, -math.inf, None)] == ["1.00", "∞", "−∞", "–"]

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
 from PIL import Image
 
 from neuprim.report.run_record import read_reported_run
-from neuprim.report.sweep_page import COLOURS, SweepPageRun, better_table_direction, write_sweep_page
+from neuprim.report.sweep_page import SweepPageRun, better_sign, write_sweep_page
 from tests.browsers import browser
 
 
@@ -21,8 +22,8 @@ def run(folder: Path, psnr: float, size: int, **more: object) -> None:
     lines = [{"step": s, "seconds": s / 10, "eval_psnr": psnr - 10 + s} for s in (5, 10)]
     (folder / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
     (folder / "report.html").touch()
-    for name, colour in (("test_000_r_0", "red"), ("test_000_r_0_truth", "blue")):
-        Image.new("RGB", (8, 8), colour).save(folder / "renders" / f"{name}.png")
+    for kind, colour in (("", "red"), ("_truth", "blue"), ("_error", "black")):
+        Image.new("RGB", (8, 8), colour).save(folder / "renders" / f"test_000_r_0{kind}.png")
 
 
 def sweep(folder: Path) -> Path:
@@ -32,7 +33,11 @@ def sweep(folder: Path) -> Path:
         run(folder / name, psnr, size, lpips=None if name == "small" else 0.1 + psnr / 100)
         attempts, swept = 2 if name == "small" else 1, {"model.primitives": str(size)}
         runs.append(SweepPageRun(name, swept, "done", "", 2.0, attempts, read_reported_run(folder / name)))
-    runs.append(SweepPageRun("gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, None))
+    runs.append(
+        SweepPageRun(
+            "gone", {"model.primitives": "7"}, "failed", "no <images>", 0.1, 1, read_reported_run(folder / "gone")
+        )
+    )
     return write_sweep_page(folder, runs, ["task=static", "model.primitives=1,2"])
 
 
@@ -49,32 +54,32 @@ def test_it_stands_without_scripts_in_the_order_of_psnr(tmp_path: Path) -> None:
         "neuprim run -m task=static model.primitives=1,2" in text
         and "<strong>gone failed:</strong> no &lt;images&gt;" in text
     )
-    assert 'href="%3Cbest%3E/report.html"' in text and "started 2 times" in text
+    assert 'href="%3Cbest%3E/report.html"' in text and "<td>done</td><td>2</td>" in text
     assert text.count("<figure data-run=") == 3 and text.count("ground truth</figcaption>") == 1
-    assert all(text.count(colour) >= 3 for colour in COLOURS[:3]), "in the table, the key and both charts"
+    colours = set(re.findall(r'class="chip" style="background: (#\w+)"', text))
+    assert len(colours) == 4 and sum(text.count(colour) >= 4 for colour in colours) == 3, "table, key, both charts"
     assert "http" not in text.replace("http-equiv", "").replace("http://www.w3.org", ""), "nothing is loaded"
 
 
 @pytest.mark.parametrize(
     ("name", "expected"),
     [
-        *(("psnr", "more"), ("psnr_mask", "more"), ("lpips_3dgs", "less"), ("render_fps", "more")),
-        *(("parameters_per_primitive", None), ("iterations", None), ("glow", None), ("psnrx", None)),
+        *(("psnr", 1), ("psnr_mask", 1), ("lpips_3dgs", -1), ("render_fps", 1), ("sigma_max_error", -1)),
+        *(("parameters_per_primitive", 0), ("iterations", 0), ("glow", 0), ("psnrx", 0)),
     ],
 )
-def test_what_is_better_is_said_where_it_is_known(name: str, expected: str | None) -> None:
-    assert better_table_direction(name) == expected
+def test_what_is_better_is_said_where_it_is_known(name: str, expected: int) -> None:
+    assert better_sign(name) == expected
 
 
-def test_of_many_runs_each_has_its_colour_and_infinite_numbers_sort(tmp_path: Path) -> None:
+def test_of_many_runs_the_best_are_pictured_and_infinite_numbers_sort(tmp_path: Path) -> None:
     runs = []
-    for n in range(14):
+    for n in range(9):
         run(tmp_path / str(n), 10.0 + n, 100, psnr_infinite=n == 3)
         runs.append(SweepPageRun(str(n), {}, "done", "", 1.0, 1, read_reported_run(tmp_path / str(n))))
     text = write_sweep_page(tmp_path, runs, []).read_text()
     assert runs[3].numbers["psnr"] == math.inf and 'data-value="Infinity">∞' in text
-    assert len(set(__import__("re").findall(r'class="chip" style="background: (#\w+)"', text))) == 14
-    assert "8 of 14 runs, those with the best PSNR" in text
+    assert "8 of 9 runs, those with the best PSNR" in text
 
 
 def test_a_browser_sorts_and_ranks(tmp_path: Path) -> None:

@@ -15,9 +15,8 @@ from neuprim.core import checkpoint, notices
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import write_text
 from neuprim.core.notices import NeuprimWarning
-from neuprim.runs.open import read_metrics
+from neuprim.runs.open import read_metrics, result_files
 from neuprim.runs.run import run
-from neuprim.runs.run_directory import result_files
 from neuprim.runs.training import add_run_curve_line, cut_run_curve
 from tests.core import tiny
 from tests.short_runs import fit, words
@@ -35,7 +34,7 @@ class Stop(Exception):
 def test_a_resumed_run_has_no_results_until_its_own(scene: Path, tmp_path: Path) -> None:
     out = fit(words(scene, tmp_path / "run", 6))
     (out / "renders" / "mine.png").touch()
-    assert {"metrics.json", "report.html", "orbit.webp", "worst.json"} <= {path.name for path in result_files(out)}
+    assert {"metrics.json", "report.html", "orbit.webp", "worst_000.png"} <= {path.name for path in result_files(out)}
 
     def killed(*_: Any) -> None:
         raise Stop

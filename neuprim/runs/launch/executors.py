@@ -5,7 +5,6 @@ All machines of a cluster have neuprim and see the output directory under the sa
 
 from __future__ import annotations
 
-import itertools
 import logging
 import multiprocessing
 import os
@@ -14,17 +13,20 @@ import socket
 import tempfile
 from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import suppress
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 from urllib.parse import urlsplit
 
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import machine_cores
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.runs.launch.jobs import JobResult
-from neuprim.runs.launch.worker import WorkerTask, start_worker_process, worker_cache_variables, worker_environment
+from neuprim.runs.launch.jobs import (
+    JobResult,
+    WorkerTask,
+    start_worker_process,
+    worker_cache_variables,
+    worker_environment,
+)
 
 _RAY_TIMEOUT = 5.0
 """Seconds for a Ray cluster to answer; Ray itself would wait for minutes."""
@@ -35,32 +37,6 @@ _SLURM_MINUTES = 24 * 60
 
 class WorkerDied(Exception):
     """The process that had a task is gone; the text says what is known."""
-
-
-class LaunchExecutor(Protocol):
-    """Runs tasks in other processes.
-
-    Attributes:
-        workers: how many tasks it has at once. threads: of each.
-    """
-
-    workers: int
-    threads: int
-
-    def submit(self, task: WorkerTask) -> Any:
-        """Start a task; returns its handle."""
-
-    def done(self, handle: Any) -> bool:
-        """Whether the task is over."""
-
-    def result(self, handle: Any) -> JobResult:
-        """The result of a task that is over. Raises WorkerDied."""
-
-    def cancel(self, handle: Any) -> None:
-        """Remove a task from a queue, if it has not begun."""
-
-    def close(self, now: bool) -> None:
-        """Release everything; ``now`` kills what still works."""
 
 
 def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
@@ -98,76 +74,77 @@ def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int
     return min(settings.workers or machine_cores(), jobs), settings.threads or 1
 
 
-# ------------------------------------------------------------ processes of this machine
+def _one_line(error: BaseException) -> str:
+    return " ".join(str(error).split()) or type(error).__name__
 
 
-@dataclass
-class _WorkerProcess:
-    """A pool of one process: when the system kills a process, its pool breaks and no other. ``log`` has its output."""
-
-    pool: ProcessPoolExecutor
-    log: Path
-
-
-_ProcessHandle = tuple[Future[JobResult], _WorkerProcess]
+def _cannot_begin(error: BaseException) -> JobResult:
+    """The result of a job whose worker lacks a package; errors of the job itself are results already."""
+    return JobResult("failed", line=f"the worker cannot do it: {str(error).strip().splitlines()[-1]}", trace=str(error))
 
 
 class ProcessExecutor:
     """``launcher=processes``: workers that stay alive from one task to the next.
 
+    Each is a pool of one process: when the system kills a process, its pool breaks and no other.
+
     Args:
         folder: for the workers' logs.
+
+    Attributes:
+        workers: how many tasks it has at once. threads: of each.
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:
         self.workers, self.threads = divide_cores_among_jobs(settings, jobs)
-        self._folder, self._numbers = folder.absolute(), itertools.count()
-        self._idle: list[_WorkerProcess] = []
-        self._busy: list[_WorkerProcess] = []
+        self._folder = folder.absolute()
+        self._logs: dict[ProcessPoolExecutor, Path] = {}
+        self._idle: list[ProcessPoolExecutor] = []
+        self._busy: dict[Future[JobResult], ProcessPoolExecutor] = {}
 
-    def submit(self, task: WorkerTask) -> _ProcessHandle:
-        worker = self._idle.pop() if self._idle else self._new_worker()
+    def submit(self, task: WorkerTask) -> Future[JobResult]:
+        """Start a task."""
+        pool = self._idle.pop() if self._idle else self._new_pool()
         try:
-            future = worker.pool.submit(task)
+            future = pool.submit(task)
         except BrokenProcessPool:  # it was killed while it was idle
-            worker.pool.shutdown(wait=False)
-            worker = self._new_worker()
-            future = worker.pool.submit(task)
-        self._busy.append(worker)
-        return future, worker
+            pool = self._new_pool()
+            future = pool.submit(task)
+        self._busy[future] = pool
+        return future
 
-    def done(self, handle: _ProcessHandle) -> bool:
-        return handle[0].done()
-
-    def result(self, handle: _ProcessHandle) -> JobResult:
-        future, worker = handle
-        self._busy.remove(worker)
+    def result(self, future: Future[JobResult]) -> JobResult:
+        """The result of a future that is done. Raises WorkerDied."""
+        pool = self._busy.pop(future)
         try:
             result = future.result()
         except BrokenProcessPool:
-            worker.pool.shutdown(wait=False)
-            printed = f"; it printed {worker.log}" if worker.log.exists() and worker.log.stat().st_size else ""
+            log = self._logs[pool]
+            printed = f"; it printed {log}" if log.exists() and log.stat().st_size else ""
             raise WorkerDied(
                 f"its process was killed, as the system does when memory is full, or it crashed{printed}"
             ) from None
-        self._idle.append(worker)
+        self._idle.append(pool)
         return result
 
-    def cancel(self, handle: _ProcessHandle) -> None:
-        """Every task has begun; it stops by itself."""
+    def cancel(self, future: Future[JobResult]) -> None:
+        """Remove a task from a queue, if it has not begun; here every task has, and stops by itself."""
 
     def close(self, now: bool) -> None:
-        for worker in self._busy if now else []:
-            for process in list((worker.pool._processes or {}).values()):
+        """Release everything; ``now`` kills what still works."""
+        for pool in self._busy.values() if now else ():
+            for process in list((pool._processes or {}).values()):
                 process.kill()
-        if pools := [worker.pool for worker in (*self._idle, *self._busy)]:
-            with ThreadPoolExecutor(len(pools)) as closing:  # a worker takes a second to end
-                list(closing.map(ProcessPoolExecutor.shutdown, pools))
+        if self._logs:
+            with ThreadPoolExecutor(len(self._logs)) as closing:  # a worker takes a second to end
+                list(closing.map(ProcessPoolExecutor.shutdown, self._logs))
 
-    def _new_worker(self) -> _WorkerProcess:
-        log, context = self._folder / f"worker-{next(self._numbers)}.log", multiprocessing.get_context("spawn")
+    def _new_pool(self) -> ProcessPoolExecutor:
+        log = self._folder / f"worker-{len(self._logs)}.log"
         started = log, worker_environment(self.threads)
-        return _WorkerProcess(ProcessPoolExecutor(1, context, start_worker_process, started), log)
+        pool = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), start_worker_process, started)
+        self._logs[pool] = log
+        return pool
 
 
 # ------------------------------------------------------------ Ray
@@ -185,7 +162,7 @@ class RayExecutor:
         import ray  # an extra
 
         self._ray = ray
-        self._refs: list[Any] = []
+        self._futures: set[Any] = set()
         self._connected = not ray.is_initialized()
         if self._connected:
             _connect_to_ray(ray, settings.address or os.environ.get("RAY_ADDRESS") or "local")
@@ -193,38 +170,33 @@ class RayExecutor:
             self.workers, self.threads = _divide_ray_cluster_among_jobs(ray, settings, jobs)
             options = {"num_cpus": self.threads, **settings.options}
             self._call = ray.remote(WorkerTask.__call__).options(**options, max_retries=0)
-        except (ValueError, TypeError) as error:
+        except (ConfigError, ValueError, TypeError) as error:
             self.close(True)
-            raise ConfigError(f"launcher.options: Ray refuses them: {_job_error_line(error)}") from None
-        except ConfigError:
-            self.close(True)
-            raise
+            if isinstance(error, ConfigError):
+                raise
+            raise ConfigError(f"launcher.options: Ray refuses them: {_one_line(error)}") from None
 
     def submit(self, task: WorkerTask) -> Any:
-        self._refs.append(self._call.remote(task))
-        return self._refs[-1]
+        future = self._call.remote(task).future()
+        self._futures.add(future)
+        return future
 
-    def done(self, handle: Any) -> bool:
-        return bool(self._ray.wait([handle], timeout=0)[0])
-
-    def result(self, handle: Any) -> JobResult:
-        self._refs.remove(handle)
+    def result(self, future: Any) -> JobResult:
+        self._futures.remove(future)
         try:
-            result: JobResult = self._ray.get(handle)
+            result: JobResult = future.result()
             return result
-        except self._ray.exceptions.RayTaskError as error:  # the worker lacks a package; a job's errors are results
-            return JobResult(
-                "failed", line=f"the worker cannot do it: {_job_error_line(error.cause)}", trace=str(error)
-            )
+        except self._ray.exceptions.RayTaskError as error:
+            return _cannot_begin(error)
         except self._ray.exceptions.RayError as error:
-            raise WorkerDied(_job_error_line(error)) from None
+            raise WorkerDied(_one_line(error)) from None
 
-    def cancel(self, handle: Any) -> None:
-        self._ray.cancel(handle, force=False)
+    def cancel(self, future: Any) -> None:
+        self._ray.cancel(future.object_ref, force=False)
 
     def close(self, now: bool) -> None:
-        for ref in self._refs if now else []:
-            self._ray.cancel(ref, force=True)
+        for future in self._futures if now else ():
+            self._ray.cancel(future.object_ref, force=True)
         if self._connected:
             self._ray.shutdown()
 
@@ -238,7 +210,7 @@ def _connect_to_ray(ray: Any, address: str) -> None:
     try:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **options)
     except (ValueError, ConnectionError, RuntimeError, SystemExit) as error:
-        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_job_error_line(error)})") from None
+        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_one_line(error)})") from None
 
 
 def _check_ray_address(address: str) -> None:
@@ -247,17 +219,11 @@ def _check_ray_address(address: str) -> None:
         return
     try:
         parts = urlsplit(address if "://" in address else f"ray://{address}")
-        host, port = parts.hostname, parts.port
-    except ValueError:
-        host, port = None, None
-    if not host or not port:
-        raise ConfigError(f"launcher.address={address}: expected auto, HOST:PORT or ray://HOST:PORT")
-    try:
-        socket.create_connection((host, port), _RAY_TIMEOUT).close()
-    except OSError as error:
+        socket.create_connection((parts.hostname or "", parts.port or 0), _RAY_TIMEOUT).close()
+    except (OSError, ValueError) as error:
         raise BackendUnavailable(
-            f"launcher.address={address}: nothing answers there ({error}); "
-            "expected a machine where `ray start --head` runs"
+            f"launcher.address={address}: nothing answers there ({error}); expected auto, HOST:PORT or "
+            f"ray://HOST:PORT of a machine where `ray start --head` runs"
         ) from None
 
 
@@ -266,9 +232,8 @@ def _divide_ray_cluster_among_jobs(ray: Any, settings: LauncherSettings, jobs: i
     machines = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if len(machines) == 1 and settings.address is None:
         return divide_cores_among_jobs(settings, jobs)
-    most, cores = int(max(machines, default=1)), int(sum(machines))
-    workers = settings.workers or jobs
-    threads = settings.threads or max(min(cores // workers, most), 1)
+    most, workers = int(max(machines, default=1)), settings.workers or jobs
+    threads = settings.threads or max(min(int(sum(machines)) // workers, most), 1)
     if threads > most:
         raise ConfigError(
             f"launcher.threads={threads}: no machine of this Ray cluster has as many; expected at most {most}"
@@ -309,39 +274,33 @@ class SlurmExecutor:
             self._executor.update_parameters(**{**defaults, **settings.options})
         except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
             self.close(False)
-            with suppress(OSError):  # it has other files
-                folder.rmdir()
             if not isinstance(error, RuntimeError):
-                raise ConfigError(f"launcher.options: submitit refuses them: {_job_error_line(error)}") from None
+                raise ConfigError(f"launcher.options: submitit refuses them: {_one_line(error)}") from None
             raise BackendUnavailable(
-                f"launcher=slurm: {_job_error_line(error)}; launcher.address=local does without a cluster"
+                f"launcher=slurm: {_one_line(error)}; launcher.address=local does without a cluster"
             ) from None
 
     def submit(self, task: WorkerTask) -> Any:
         self._jobs.append(self._executor.submit(task))
         return self._jobs[-1]
 
-    def done(self, handle: Any) -> bool:
-        return bool(handle.done())
-
-    def result(self, handle: Any) -> JobResult:
+    def result(self, future: Any) -> JobResult:
         from submitit.core.utils import FailedJobError, UncompletedJobError
 
-        self._jobs.remove(handle)
+        self._jobs.remove(future)
         try:
-            result: JobResult = handle.result()
+            result: JobResult = future.result()
             return result
-        except FailedJobError as error:  # the worker lacks a package; a job's errors are results
-            last = str(error).strip().splitlines()[-1]
-            return JobResult("failed", line=f"the worker cannot do it: {last}", trace=str(error))
+        except FailedJobError as error:
+            return _cannot_begin(error)
         except UncompletedJobError:
             self._died = True
             raise WorkerDied(
-                f"job {handle.job_id} ended without a result ({handle.state}); it printed {handle.paths.stderr}"
+                f"job {future.job_id} ended without a result ({future.state}); it printed {future.paths.stderr}"
             ) from None
 
-    def cancel(self, handle: Any) -> None:
-        handle.cancel()
+    def cancel(self, future: Any) -> None:
+        future.cancel()
 
     def close(self, now: bool) -> None:
         for job in self._jobs if now else []:
@@ -350,5 +309,11 @@ class SlurmExecutor:
             shutil.rmtree(self._folder, ignore_errors=True)
 
 
-def _job_error_line(error: BaseException) -> str:
-    return " ".join(str(error).split()) or type(error).__name__
+LaunchExecutor = ProcessExecutor | RayExecutor | SlurmExecutor
+
+EXECUTORS: dict[str, tuple[type[LaunchExecutor], str | None]] = {
+    "processes": (ProcessExecutor, None),
+    "ray": (RayExecutor, "ray"),
+    "slurm": (SlurmExecutor, "submitit"),
+}
+"""Launcher -> its executor, and the package that it needs."""

@@ -7,25 +7,26 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, nullcontext, suppress
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.errors import BackendUnavailable, NeuprimError
-from neuprim.runs.launch.executors import (
-    LaunchExecutor,
-    ProcessExecutor,
-    RayExecutor,
-    SlurmExecutor,
-    WorkerDied,
-    divide_cores_among_jobs,
+from neuprim.runs.launch.executors import EXECUTORS, LaunchExecutor, WorkerDied, divide_cores_among_jobs
+from neuprim.runs.launch.jobs import (
+    JobResult,
+    JobStatus,
+    LaunchJob,
+    StatusListener,
+    WorkerTask,
+    interruptible_run,
+    perform_job,
+    read_status,
+    worker_environment,
 )
-from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob, StatusListener, perform_job, read_status
-from neuprim.runs.launch.worker import WorkerTask, interruptible_run, worker_environment
-
-if TYPE_CHECKING:
-    from neuprim.runs.fit import Event
 
 LAUNCH_FOLDER = "launch"
 """In a sweep's directory: statuses while it works, and the logs of workers that printed something."""
@@ -36,23 +37,11 @@ OnStatus = Callable[[int, JobStatus], None]
 OnResult = Callable[[int, JobResult], None]
 """Called with the number of a job and its result, before its last status."""
 
-_EXECUTORS: dict[str, Callable[[LauncherSettings, int, Path], LaunchExecutor]] = {
-    "processes": ProcessExecutor,
-    "ray": RayExecutor,
-    "slurm": SlurmExecutor,
-}
-_PACKAGES = {"ray": "ray", "slurm": "submitit"}
-"""Launcher -> the package that it needs."""
-
 _INTERVAL = 0.1
 """Seconds between two looks at what is done."""
 
 
 def ignore_status(number: int, status: JobStatus) -> None:
-    """Do nothing."""
-
-
-def ignore_job_result(number: int, result: JobResult) -> None:
     """Do nothing."""
 
 
@@ -65,7 +54,8 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
     """
     if settings.name == "processes":
         divide_cores_among_jobs(settings, jobs)
-    if (package := _PACKAGES.get(settings.name)) is None:
+    _, package = EXECUTORS.get(settings.name, (None, None))
+    if package is None:
         return
     try:
         importlib.import_module(package)
@@ -86,7 +76,7 @@ def launch_jobs(
     settings: LauncherSettings,
     folder: Path,
     on_status: OnStatus = ignore_status,
-    on_result: OnResult = ignore_job_result,
+    on_result: OnResult = lambda number, result: None,
     stop_at_failure: bool = False,
 ) -> list[JobResult | None]:
     """Do all jobs.
@@ -107,134 +97,126 @@ def launch_jobs(
         ConfigError: more workers than this machine has cores, or an option that the launcher refuses.
     """
     check_launcher(settings, len(jobs))
-    if settings.name == "inline":
-        return _launch_inline(jobs, settings, on_status, on_result, stop_at_failure)
     if not jobs:
         return []
+    if settings.name == "inline":
+        with use_launcher_threads_for_runs(settings):
+            return _launch_inline(jobs, on_status, on_result, stop_at_failure)
     try:
-        executor = _EXECUTORS[settings.name](settings, len(jobs), folder)
+        executor = EXECUTORS[settings.name][0](settings, len(jobs), folder)
     except NeuprimError:
         with suppress(OSError):  # there may be none
             folder.rmdir()
         raise
-    return _JobLoop(executor, jobs, folder, settings.retries, on_status, on_result, stop_at_failure).run()
+    folder, threads = folder.absolute(), executor.threads
+    variables = worker_environment(threads)
+    tasks = [
+        WorkerTask(job, threads, folder / f"{number}.json", folder / "stop", Path.cwd(), variables)
+        for number, job in enumerate(jobs)
+    ]
+    return _JobLoop(executor, tasks, settings.retries, on_status, on_result, stop_at_failure).run()
 
 
 def _launch_inline(
-    jobs: Sequence[LaunchJob],
-    settings: LauncherSettings,
-    on_status: OnStatus,
-    on_result: OnResult,
-    stop_at_failure: bool,
+    jobs: Sequence[LaunchJob], on_status: OnStatus, on_result: OnResult, stop_at_failure: bool
 ) -> list[JobResult | None]:
     """Do one job after the other in this process, up to the one that Ctrl-C or a failure ends."""
     results = list[JobResult | None]([None] * len(jobs))
-    with use_launcher_threads_for_runs(settings):
-        for number, job in enumerate(jobs):
-            listener = StatusListener()
-
-            def notify(event: Event, number: int = number, listener: StatusListener = listener) -> None:
-                listener(event)
-                on_status(number, listener.status)
-
-            on_status(number, JobStatus("starting"))
-            result = results[number] = perform_job(job, 0, notify)
-            on_result(number, result)
-            on_status(number, listener.status.end(result))
-            if result.state == "interrupted" or (stop_at_failure and result.state == "failed"):
-                break
+    for number, job in enumerate(jobs):
+        listener = StatusListener(on_status=partial(on_status, number))
+        on_status(number, listener.status)
+        result = results[number] = perform_job(job, 0, listener)
+        on_result(number, result)
+        on_status(number, listener.status.end(result))
+        if result.state == "interrupted" or (stop_at_failure and result.state == "failed"):
+            break
     return results
 
 
+@dataclass
 class _JobLoop:
     """Hand jobs to an executor, follow them, and collect their results."""
 
-    def __init__(
-        self,
-        executor: LaunchExecutor,
-        jobs: Sequence[LaunchJob],
-        folder: Path,
-        retries: int,
-        on_status: OnStatus,
-        on_result: OnResult,
-        stop_at_failure: bool,
-    ) -> None:
-        self._executor, self._retries, self._on_status, self._on_result = executor, retries, on_status, on_result
-        self._stop_at_failure = stop_at_failure
-        self._folder = folder.absolute()
-        self._stop = self._folder / "stop"
-        variables, threads = worker_environment(executor.threads), executor.threads
-        self._tasks = [
-            WorkerTask(job, threads, self._folder / f"{number}.json", self._stop, Path.cwd(), variables)
-            for number, job in enumerate(jobs)
-        ]
-        self._waiting = deque(enumerate(self._tasks))
-        self._running: dict[int, tuple[Any, WorkerTask]] = {}
-        self._results = list[JobResult | None]([None] * len(jobs))
-        self._statuses: dict[int, JobStatus] = {}
+    executor: LaunchExecutor
+    tasks: Sequence[WorkerTask]
+    retries: int
+    on_status: OnStatus
+    on_result: OnResult
+    stop_at_failure: bool
+
+    def __post_init__(self) -> None:
+        self.folder, self.stop = self.tasks[0].status.parent, self.tasks[0].stop
+        self.waiting = deque(enumerate(self.tasks))
+        self.running: dict[int, tuple[Any, WorkerTask]] = {}
+        self.results = list[JobResult | None]([None] * len(self.tasks))
+        self.statuses: dict[int, JobStatus] = {}
 
     def run(self) -> list[JobResult | None]:
-        self._folder.mkdir(parents=True, exist_ok=True)
-        self._stop.unlink(missing_ok=True)
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self.stop.unlink(missing_ok=True)
         finished = False
         try:
             with interruptible_run() as stopped:
-                while self._waiting or self._running:
-                    if stopped.is_set() and not self._stop.exists():
+                while self.waiting or self.running:
+                    if stopped.is_set() and not self.stop.exists():
                         self._stop_all()
-                    while self._waiting and len(self._running) < self._executor.workers:
-                        number, task = self._waiting.popleft()
-                        task.status.unlink(missing_ok=True)
-                        self._running[number] = self._executor.submit(task), task
-                        self._notify_status(number, JobStatus("starting", attempt=task.attempt))
-                    for number, (handle, task) in list(self._running.items()):
-                        if self._executor.done(handle):
-                            del self._running[number]
-                            self._finish_job(number, handle, task)
-                            continue
-                        status = read_status(task.status)
-                        if status and status.attempt >= task.attempt and status != self._statuses[number]:
-                            self._notify_status(number, status)
+                    self._step()
                     time.sleep(_INTERVAL)
             finished = True
         finally:
-            self._executor.close(not finished)
-            for file in (*(task.status for task in self._tasks), self._stop):
+            self.executor.close(not finished)
+            for file in (*(task.status for task in self.tasks), self.stop):
                 file.unlink(missing_ok=True)
-            for log in self._folder.glob("*.log"):
+            for log in self.folder.glob("*.log"):
                 if not log.stat().st_size:
                     log.unlink()
             with suppress(OSError):  # logs with something in them
-                self._folder.rmdir()
-        return self._results
+                self.folder.rmdir()
+        return self.results
+
+    def _step(self) -> None:
+        """Start what there is a worker for, and look at what is at work."""
+        while self.waiting and len(self.running) < self.executor.workers:
+            number, task = self.waiting.popleft()
+            task.status.unlink(missing_ok=True)
+            self.running[number] = self.executor.submit(task), task
+            self._notify(number, JobStatus("starting", attempt=task.attempt))
+        for number, (future, task) in list(self.running.items()):
+            if future.done():
+                del self.running[number]
+                self._finish_job(number, future, task)
+                continue
+            status = read_status(task.status)
+            if status and status.attempt >= task.attempt and status != self.statuses[number]:
+                self._notify(number, status)
 
     def _stop_all(self) -> None:
-        self._stop.touch()
-        self._waiting.clear()
-        for handle, task in self._running.values():
+        self.stop.touch()
+        self.waiting.clear()
+        for future, task in self.running.values():
             if not task.status.exists():  # it waits in the executor's queue
-                self._executor.cancel(handle)
+                self.executor.cancel(future)
 
-    def _finish_job(self, number: int, handle: Any, task: WorkerTask) -> None:
+    def _finish_job(self, number: int, future: Any, task: WorkerTask) -> None:
         try:
-            result = self._executor.result(handle)
+            result = self.executor.result(future)
         except WorkerDied as death:
             attempts = task.attempt + 1
-            if self._stop.exists():
+            if self.stop.exists():
                 result = JobResult("interrupted", attempts=attempts)
-            elif task.attempt < self._retries:
-                self._notify_status(number, JobStatus("waiting", "its worker died", attempt=attempts))
-                self._waiting.appendleft((number, task.retry()))
+            elif task.attempt < self.retries:
+                self._notify(number, JobStatus("waiting", "its worker died", attempt=attempts))
+                self.waiting.appendleft((number, replace(task, attempt=attempts)))
                 return
             else:
                 times = f", {attempts} times" if attempts > 1 else ""
                 result = JobResult("failed", line=f"its worker died{times}: {death}", attempts=attempts)
-        self._results[number] = result
-        if self._stop_at_failure and result.state == "failed" and not self._stop.exists():
+        self.results[number] = result
+        if self.stop_at_failure and result.state == "failed" and not self.stop.exists():
             self._stop_all()
-        self._on_result(number, result)
-        self._notify_status(number, (read_status(task.status) or JobStatus()).end(result))
+        self.on_result(number, result)
+        self._notify(number, (read_status(task.status) or JobStatus()).end(result))
 
-    def _notify_status(self, number: int, status: JobStatus) -> None:
-        self._statuses[number] = status
-        self._on_status(number, status)
+    def _notify(self, number: int, status: JobStatus) -> None:
+        self.statuses[number] = status
+        self.on_status(number, status)

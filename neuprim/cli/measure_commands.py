@@ -100,7 +100,6 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seeds", type=parse_count, default=1, metavar="N", help=seeds)
     out = "gets a run directory each"
     parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help=out)
-    parser.add_argument("--estimate", action="store_true", help="only say what would run, and for how long")
 
 
 def _bench_command(args: argparse.Namespace) -> int:
@@ -115,15 +114,9 @@ def _bench_command(args: argparse.Namespace) -> int:
     if args.data is None:
         print(*_list_paper_tables(chosen), sep="\n")
         return 0
-    scenes: dict[str, str] = {}
-    for text in args.scenes.split(",") if args.scenes else []:
-        name, _, folder = text.partition("=")
-        scenes[name.strip().lower()] = (folder or name).strip()
+    scenes = args.scenes.lower().split(",") if args.scenes else []
     rows = args.rows.split(",") if args.rows else []
     planned = plan_paper_runs(args.data, chosen, scenes, rows, args.budget, args.seeds, args.out, args.overrides)
-    print(*_describe_bench_plan(planned), sep="\n", flush=True)
-    if args.estimate:
-        return 0
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
@@ -151,34 +144,12 @@ def _list_paper_tables(chosen: Sequence[PaperTable]) -> Iterator[str]:
         plural = "s" * (len(table.numbers) > 1)
         yield f"table{plural} {numbers}: {table.title} (task=static scene={table.loader})"
         for row in table.rows:
-            yield f"  {row.name}: preset={row.preset}{f'; beside {row.beside[0]}' if row.beside[0] else ''}"
+            yield f"  {row.name}: preset={row.preset}{f'; beside {row.beside}' if row.beside else ''}"
             for scene, found in row.figures.items():
-                line = "  ".join(
-                    f"{kind} {_format_measure(getattr(found, kind.lower()), kind):>7}" for kind in _PAPER_MEASURES
-                )
-                yield f"    {scene:10} {line}{f'  {found.primitives:,} primitives' if found.primitives else ''}"
-    yield "neuprim bench paper --data DIR runs those whose data are folders of DIR; --estimate says first for how long"
-
-
-def _describe_bench_plan(planned: Sequence[PlannedRun]) -> Iterator[str]:
-    """What would run, and for how long: seconds of a budget, else steps at the pace of a row's first scene."""
-    from neuprim.runs.paper import measure_starting_pace
-
-    total, paces, longer = 0.0, dict[tuple[str, str], float](), ""
-    for one in planned:
-        train, key = one.config.train, (one.table.title, one.row.name)
-        if train.max_seconds is not None:
-            total += train.max_seconds
-            continue
-        assert train.iterations is not None, "a run without seconds has steps"
-        if key not in paces:
-            paces[key] = measure_starting_pace(one)
-            start = f"{1e3 * paces[key]:.0f} ms a step at the start"
-            yield f"{one.row.name}, {one.scene}: {start}, {train.iterations:,} steps"
-        total += paces[key] * train.iterations
-        if train.population.strategy == "gradient":
-            longer = "; longer where the population grows"
-    yield f"{len(planned)} runs, about {_format_seconds(total)} of training on this machine{longer}, and measuring"
+                line = "  ".join(f"{kind} {_format_measure(found[kind.lower()], kind):>7}" for kind in _PAPER_MEASURES)
+                count = found.get("primitives")
+                yield f"    {scene:10} {line}{f'  {count:,} primitives' if count else ''}"
+    yield "neuprim bench paper --data DIR runs those whose data are folders of DIR"
 
 
 def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Iterator[str]:
@@ -194,11 +165,8 @@ def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
     width, height = metrics["image_size"]
     yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{f', {own}' if own else ''}"
     for kind, ours, theirs, other in compare_run_with_paper(one, metrics):
-        beside = (
-            f"   {one.row.beside[0]} {_format_measure(other, kind)}"
-            if one.row.beside[0] and kind in _PAPER_MEASURES
-            else ""
-        )
+        named = one.row.beside if kind in _PAPER_MEASURES else ""
+        beside = f"   {named} {_format_measure(other, kind)}" if named else ""
         yield f"  {kind:10} {_format_measure(ours, kind):>9}   paper {_format_measure(theirs, kind)}{beside}"
 
 

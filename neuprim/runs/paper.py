@@ -7,7 +7,6 @@ run are those of its last checkpoint; the paper's are the best of a run on the t
 from __future__ import annotations
 
 import re
-import time
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import resources
@@ -19,20 +18,12 @@ import yaml
 from neuprim.config import RunConfig, compose
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.metrics import metric_from_json
-from neuprim.runs.fit import compile_run_kernels, prepare_training, use_one_torch_thread_for_run
 
 _OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 _UNITS = {"s": 1, "m": 60, "h": 3600}
 
-
-@dataclass(frozen=True)
-class PaperFigures:
-    """Numbers of one scene; None for one that is not there."""
-
-    psnr: float | None
-    ssim: float | None
-    lpips: float | None
-    primitives: int | None = None
+Figures = Mapping[str, float | None]
+"""psnr, ssim, lpips and primitives of one scene; None for one that is not there."""
 
 
 @dataclass(frozen=True)
@@ -43,13 +34,14 @@ class PaperRow:
         name: what chooses it.
         preset: of the static task, that stands for it.
         figures: by scene, the paper's.
-        beside: what the paper puts beside it, and that one's figures by scene; an empty name for nothing.
+        beside: what the paper puts beside it; "" for nothing. beside_figures: its figures by scene.
     """
 
     name: str
     preset: str
-    figures: Mapping[str, PaperFigures]
-    beside: tuple[str, Mapping[str, PaperFigures]]
+    figures: Mapping[str, Figures]
+    beside: str
+    beside_figures: Mapping[str, Figures]
 
 
 @dataclass(frozen=True)
@@ -90,15 +82,14 @@ def load_paper_run_tables() -> list[PaperTable]:
 def _parse_paper_run_table(entry: Mapping[str, Any]) -> PaperTable:
     scenes = tuple(entry["scenes"])
 
-    def figures(found: Mapping[str, Any]) -> dict[str, PaperFigures]:
-        columns = [found[kind] for kind in _OWN_NAMES] + [found.get("primitives", [None] * len(scenes))]
-        return {scene: PaperFigures(*values) for scene, *values in zip(scenes, *columns, strict=True)}
+    def figures(found: Mapping[str, Any]) -> dict[str, Figures]:
+        kinds = [kind for kind in (*_OWN_NAMES, "primitives") if kind in found]
+        return {scene: {kind: found[kind][i] for kind in kinds} for i, scene in enumerate(scenes)}
 
     rows = []
     for row in entry["rows"]:
-        other = row.get("beside")
-        beside = (other["name"], figures(other)) if other else ("", {})
-        rows.append(PaperRow(row["name"], row["preset"], figures(row), beside))
+        other = row.get("beside", {"name": ""})
+        rows.append(PaperRow(row["name"], row["preset"], figures(row), other["name"], figures(other)))
     images = dict(zip(scenes, entry.get("images", ()), strict="images" in entry))
     return PaperTable(entry["title"], tuple(entry["tables"]), entry["loader"], scenes, images, tuple(rows))
 
@@ -120,7 +111,7 @@ def paper_run_budget_overrides(budget: str) -> list[str]:
 def plan_paper_runs(
     data: Path,
     tables: Sequence[PaperTable],
-    scenes: Mapping[str, str],
+    scenes: Sequence[str],
     rows: Sequence[str],
     budget: str,
     seeds: int,
@@ -131,7 +122,7 @@ def plan_paper_runs(
 
     Args:
         data: holds a folder per scene, named like it in any case.
-        scenes: those to take, and the names of their folders; empty for all.
+        scenes: those to take; empty for all.
         rows: names of rows; empty for all.
         seeds: runs of each, with the seeds from 0.
         out: gets a run directory for each.
@@ -153,9 +144,9 @@ def plan_paper_runs(
     planned = []
     for table in tables:
         for scene in (s for s in table.scenes if not scenes or s in scenes):
-            folder = folders.get(scenes.get(scene, scene).casefold()) or folders.get(f"{scene}s")
+            folder = folders.get(scene) or folders.get(f"{scene}s")
             if folder is None and scenes:
-                raise ConfigError(f"--scenes {scene}: {data} has no folder {scenes[scene]}")
+                raise ConfigError(f"--scenes {scene}: {data} has no folder {scene}")
             if folder is None:
                 continue
             own = ["task=static", f"scene={table.loader}", f"scene.path='{folder}'"]
@@ -171,19 +162,6 @@ def plan_paper_runs(
     return planned
 
 
-def measure_starting_pace(planned: PlannedRun, steps: int = 8) -> float:
-    """Seconds that a step takes at the start of a run, on this machine; a population that grows makes later ones
-    slower."""
-    trainer = prepare_training(planned.config).trainer
-    compile_run_kernels(trainer)
-    with use_one_torch_thread_for_run():
-        trainer.train_step()
-        begin = time.perf_counter()
-        for _ in range(steps):
-            trainer.train_step()
-        return (time.perf_counter() - begin) / steps
-
-
 def compare_run_with_paper(
     planned: PlannedRun, metrics: Mapping[str, Any]
 ) -> Iterator[tuple[str, float | None, float | None, float | None]]:
@@ -191,8 +169,8 @@ def compare_run_with_paper(
 
     LPIPS of another network than the paper's tools', VGG, is left out.
     """
-    paper, beside = planned.row.figures[planned.scene], planned.row.beside[1].get(planned.scene)
+    paper, beside = planned.row.figures[planned.scene], planned.row.beside_figures[planned.scene]
     for kind, name in _OWN_NAMES.items():
         ours = metric_from_json(metrics, name) if kind != "lpips" or metrics.get("lpips_network") == "vgg" else None
-        yield kind.upper(), ours, getattr(paper, kind), None if beside is None else getattr(beside, kind)
-    yield "primitives", float(metrics["primitives"]), paper.primitives, None
+        yield kind.upper(), ours, paper[kind], beside.get(kind)
+    yield "primitives", float(metrics["primitives"]), paper.get("primitives"), None

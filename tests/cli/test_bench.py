@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from pathlib import Path
 
 import pytest
@@ -25,14 +24,14 @@ def test_the_tables_are_those_of_the_appendix() -> None:
     blender, mip, tanks, blending = load_paper_run_tables()
     assert [table.numbers for table in (blender, mip, tanks, blending)] == [(3, 4, 5), (6,), (7,), (7,)]
     least, middle, most = (row.figures for row in blender.rows)
-    assert (least["ship"].psnr, middle["mic"].ssim, most["drums"].lpips) == (24.23, 0.9866, 0.047)
-    assert middle["materials"].ssim is None, "0.0471 in the paper"
-    assert [row.beside[1]["chair"].psnr for row in blender.rows] == [22.91, 29.19, 35.83]
-    assert mip.rows[0].figures["stump"].primitives == 330_000
+    assert (least["ship"]["psnr"], middle["mic"]["ssim"], most["drums"]["lpips"]) == (24.23, 0.9866, 0.047)
+    assert middle["materials"]["ssim"] is None, "0.0471 in the paper"
+    assert [row.beside_figures["chair"]["psnr"] for row in blender.rows] == [22.91, 29.19, 35.83]
+    assert mip.rows[0].figures["stump"]["primitives"] == 330_000
     for table, ssim, lpips in ((mip, 0.7907, 0.2160), (tanks, 0.8478, 0.1597), (blending, 0.8921, 0.2644)):
         own = list(table.rows[0].figures.values())
-        assert math.isclose(sum(f.ssim or 0 for f in own) / len(own), ssim, abs_tol=6e-4)
-        assert math.isclose(sum(f.lpips or 0 for f in own) / len(own), lpips, abs_tol=6e-4)
+        assert math.isclose(sum(f["ssim"] or 0 for f in own) / len(own), ssim, abs_tol=6e-4)
+        assert math.isclose(sum(f["lpips"] or 0 for f in own) / len(own), lpips, abs_tol=6e-4)
     presets_of_rows = {row.preset for table in load_paper_run_tables() for row in table.rows}
     assert presets_of_rows == {name for name in list_task_presets(load_task("static")) if name.startswith("paper")}
 
@@ -60,7 +59,7 @@ def test_words() -> None:
 def data(tmp_path: Path) -> Path:
     folder = tmp_path / "data"
     write_blender(folder / "Chair")
-    write_blender(folder / "lego small")
+    write_blender(folder / "LEGO")
     for name in ("images", "images_2", "sparse"):
         (folder / "bonsai" / name).mkdir(parents=True)
     (folder / "garden").mkdir()
@@ -69,21 +68,15 @@ def data(tmp_path: Path) -> Path:
 
 def test_the_plan_is_the_protocol(data: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    planned = plan_paper_runs(data, load_paper_run_tables(), {}, [], "10m", 2, Path("out"), ["train.ssim_weight=0"])
+    planned = plan_paper_runs(data, load_paper_run_tables(), [], [], "10m", 2, Path("out"), ["train.ssim_weight=0"])
     assert [(p.scene, p.row.name, p.config.seed) for p in planned] == [
-        *(("chair", row, seed) for row in ("200", "5k", "nolimit") for seed in (0, 1)),
+        *((scene, row, seed) for scene in ("chair", "lego") for row in ("200", "5k", "nolimit") for seed in (0, 1)),
         *((scene, "real", seed) for scene in ("bonsai", "garden") for seed in (0, 1)),
     ]
     chair, bonsai, garden = planned[0].config, planned[-4].config, planned[-1].config
     assert (chair.preset, chair.model.primitives, chair.train.max_seconds) == ("paper_200", 200, 600)
     assert Path(chair.scene["path"]) == data / "Chair" and chair.output_dir == Path("out/chair-200-10m-seed0")
     assert (bonsai.preset, bonsai.scene["images"], garden.scene["images"]) == ("paper_real", "images_2", "images")
-    named = plan_paper_runs(
-        data, load_paper_run_tables()[:1], {"lego": "LEGO small"}, ["5k"], "full", 1, Path("out"), []
-    )
-    assert [(p.scene, Path(p.config.scene["path"]).name, p.config.train.max_seconds) for p in named] == [
-        ("lego", "lego small", None)
-    ]
 
 
 @pytest.mark.parametrize(
@@ -106,16 +99,12 @@ def test_what_cannot_be_is_said_in_one_line(
     assert out == "" and err.count("\n") == 1 and text.replace("DATA", str(data)) in err
 
 
-def test_it_estimates_runs_and_compares(
+def test_it_runs_and_compares(
     data: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    names = ["--data", str(data), "--scenes", "chair,lego=lego small", "--rows", "200", "--tables", "3"]
+    names = ["--data", str(data), "--scenes", "chair,lego", "--rows", "200", "--tables", "3"]
     words = ["bench", "paper", *names, *SMALL]
-    assert main([*words, "--estimate"]) == 0
-    out = capsys.readouterr().out
-    assert re.search(r"200, chair: \d+ ms a step at the start, 12 steps\n2 runs, about \d+ s of training", out)
-    assert not Path("outputs").exists()
     assert main(words) == 0
     out = capsys.readouterr().out
     metrics = read_metrics(Path("outputs/paper/lego-200-full-seed0"))

@@ -266,8 +266,6 @@ _PRUNING_ROWS = (
 
 
 def _print_pruning(made: Pruning, tolerance: float) -> None:
-    from neuprim.runs.open import describe_run_kept_shares
-
     before = made.judged_psnr[0]
     for number, stage in enumerate(made.stages, 1):
         less = f", {', '.join(stage.words)}" if stage.words else ""
@@ -282,8 +280,9 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
     print_columns([("", "before", "after"), *rows])
     for word in made.reduced:
         print(f"all primitives: {word}")
-    for line in describe_run_kept_shares(made.kept):
-        print(line)
+    for name, share in made.kept.items():
+        if share < 1:
+            print(f"{name}: {share:.0%} of its numbers are kept")
     print(f"fine-tuned for {made.steps:,} steps, {made.seconds:.0f} s in all")
 
 

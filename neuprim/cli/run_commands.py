@@ -210,8 +210,7 @@ def run_command_with_launcher(
     from neuprim.cli.progress import RunLaunchProgress
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
     from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
-    from neuprim.runs.launch_record import make_run_job
-    from neuprim.runs.sweep import run_sweep
+    from neuprim.runs.sweep import make_run_job, run_sweep
 
     with RunLaunchProgress(configs) as progress:
         if len(configs) > 1:

@@ -197,11 +197,6 @@ def prepare_training(
     else:
         events(Preparing("starting points"))
         trainer = make_run_trainer(job, dataset, loss, group)
-        wanted, found = config.model.primitives, trainer.model.count
-        if found < _starting_count_of_run(config):
-            grows = config.train.population.strategy == "relocate"
-            rest = "the rest is born where the error is largest" if grows else "there will be no more of them"
-            events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={wanted:,}: {rest}"))
     # every later command uses the near plane that the trainer chose
     config = replace(config, renderer=replace(config.renderer, near=trainer.renderer.near))
     split = "train, held out" if hold_out and make is None else "test"
@@ -223,14 +218,6 @@ def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iter
                 events(Evaluated(held_out))
             next_point = _next_run_curve_progress(trainer)
         yield report, held_out
-    wanted = trainer.settings.population.grow_to or 0
-    if trainer.settings.population.strategy == "relocate" and trainer.model.count < wanted:
-        events(
-            Note(
-                f"{trainer.model.count:,} primitives of model.primitives={wanted:,}: too few interventions, or places "
-                f"with an error, to split for the others; see train.population.every"
-            )
-        )
 
 
 def _next_run_curve_progress(trainer: Trainer) -> float:

@@ -36,7 +36,7 @@ from neuprim.inspect.window import Window, has_display, list_inspection_panels, 
 from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import INSPECTORS, PluginError
 from neuprim.runs.fit import Events, Note, ignore_run_event
-from neuprim.runs.open import PRUNED, StoredRun, describe_run_kept_shares, kept_shares, open_run
+from neuprim.runs.open import StoredRun, open_run
 
 FILMS = (".webp", ".gif", ".mp4")
 OUTPUTS = (".png", *FILMS, ".html", ".vdb")
@@ -196,9 +196,6 @@ class _RunFrames:
         on = f"{' x '.join(map(str, self.shape))} points from {low} to {high} {units}"
         clamp = "in 1/scene unit, each primitive clamped at 0 from below"
         events(Note(f"extinction of {self.model.count} primitives on {on}, {clamp}"))
-        if (run.directory / PRUNED).exists():
-            for line in describe_run_kept_shares(kept_shares(self.model)):
-                events(Note(line))
 
     def __len__(self) -> int:
         return len(self.pairs)

@@ -1,20 +1,31 @@
-"""Open a finished run again: its configuration, task, model, data and metrics, from disk alone."""
+"""A run's directory: lock it, open a finished run from it, and list what the end of a run writes.
+
+The lock keeps other processes out. Configuration, task, model, data and metrics come from disk alone.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+import os
+import re
+import socket
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+
+from filelock import FileLock, Timeout
 
 from neuprim.config import Job, RunConfig
 from neuprim.config.stored_run import refuse_untrusted_run_links, refuse_untrusted_settings
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.data import Dataset, View
-from neuprim.core.errors import DataError
+from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.extensions import TrainedModel
-from neuprim.core.io.files import cache_directory
+from neuprim.core.io.files import cache_directory, remove_leftovers
 from neuprim.core.io.plain import finite_json_number, load_json
 from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
@@ -32,6 +43,12 @@ COMPRESSED = "model.neuprim"
 
 PRUNED = "pruned.json"
 """In the directory of a pruned model: how it was pruned."""
+
+LOCK_FILE = ".lock"
+"""In the directory while it is locked; it names the process."""
+
+_RESULT_FILES = ("metrics.json", "report.html", "viewer.html")
+_RESULT_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst_\d{3,}\.png")
 
 Progress = Callable[[str, float], None]
 
@@ -183,6 +200,82 @@ def kept_shares(model: Primitives) -> dict[str, float]:
     return {group: value / sizes[group] for group, value in kept.items()}
 
 
-def describe_run_kept_shares(kept: dict[str, float]) -> list[str]:
-    """A line for every group of prunable units that is not whole."""
-    return [f"{name}: {share:.0%} of its numbers are kept" for name, share in kept.items() if share < 1]
+# ---------------------------------------------------------------- lock
+
+
+@contextmanager
+def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
+    """Lock a directory, so that one process at a time works in it. It is made if it is missing, and removed again if it
+    is left empty.
+
+    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``), which ends with its process. On
+    shared folders it works between machines where their file system has such locks: NFS from version 4 on, CephFS,
+    GPFS, Lustre mounted with ``flock``.
+
+    Args:
+        what: is in the directory, for the message.
+
+    Raises:
+        ConfigError: another process, or another thread, holds it.
+        OSError: the directory cannot be made or written.
+    """
+    new = not directory.exists()
+    directory.mkdir(parents=True, exist_ok=True)
+    file = directory / LOCK_FILE
+    lock = FileLock(file)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        raise ConfigError(
+            f"{directory}: {_describe_lock_holder(file)} is at work on this {what}; expected that to end first, or "
+            f"another output_dir"
+        ) from None
+    owner = {"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}
+    try:
+        with suppress(OSError):  # a note for others; on Windows a locked file cannot be written
+            file.write_text(json.dumps(owner), encoding="utf-8")
+        remove_leftovers(directory)
+        yield
+    finally:
+        with suppress(OSError):
+            # while it is locked: a process that opened it meanwhile sees that it is gone and makes a new one
+            file.unlink()
+        lock.release()
+        with suppress(OSError):  # not empty
+            if new:
+                directory.rmdir()
+
+
+def _describe_lock_holder(file: Path) -> str:
+    try:
+        data = load_json(file.read_text(encoding="utf-8"))
+        return f"process {int(data['pid'])} on {data['host']} (since {data['since']})"
+    except (OSError, ValueError, KeyError, TypeError):
+        return "another process"
+
+
+# ---------------------------------------------------------------- results
+
+
+def result_files(run_dir: Path) -> list[Path]:
+    """List the files that the end of a run wrote: metrics, pictures and report; not what other commands drew into
+    ``renders/``."""
+    pictures = (path for path in sorted((run_dir / "renders").glob("*")) if _RESULT_PICTURES.fullmatch(path.name))
+    return [*(path for name in _RESULT_FILES if (path := run_dir / name).is_file()), *pictures]
+
+
+def discard_results(run_dir: Path) -> None:
+    """Remove the results. A run that resumes does so before its model changes, so that a kill never leaves numbers of
+    another model."""
+    for path in result_files(run_dir):
+        path.unlink(missing_ok=True)
+
+
+def refuse_run_results(run_dir: Path, targets: Iterable[Path]) -> None:
+    """Raise ConfigError if a command would write over one of them."""
+    own = {path.resolve() for path in result_files(run_dir)}
+    for target in targets:
+        if target.resolve() in own:
+            raise ConfigError(
+                f"{target}: is a picture of the run's report; --force replaces it, --out PATH writes elsewhere"
+            )

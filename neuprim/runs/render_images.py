@@ -7,11 +7,12 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import torch
+from torch import Tensor
 
 from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
-from neuprim.core.channels import Channels, read_stored_channels
+from neuprim.core.channels import read_stored_channels
 from neuprim.core.conditions import condition_flag, count_condition_frames, read_conditions
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
@@ -21,14 +22,11 @@ from neuprim.core.io.animation import write_animation
 from neuprim.core.io.files import write_npy
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
-from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import call_task_facts, call_task_orbit
-from neuprim.runs.exr_layers import RunExrLayers
 from neuprim.runs.measure import render_light_sum
-from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device
-from neuprim.runs.render_config import parse_run_rendering
-from neuprim.runs.run_directory import refuse_run_results
+from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device, refuse_run_results
+from neuprim.runs.render_config import RunExrLayers, parse_run_rendering
 
 SPACES = WORLD, SCENE = ("world", "scene")
 """Whose coordinates a file of cameras has, after ``--space``."""
@@ -54,15 +52,13 @@ class RenderRequest:
         out: a file or folder; None for a folder in the run's ``frames``.
         frames: of an orbit.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: of an animation; None for what the file of cameras says, or what makes it last four seconds, at 5 to 30
-            frames per second.
+        fps: of an animation; None for what the cameras' file says, or what makes it last four seconds, at 5 to 30.
         environment: light from all around instead of the task's light.
         overrides: of a render configuration (:mod:`neuprim.runs.render_config`).
-        layers: of an OpenEXR file, names separated by commas (:mod:`neuprim.core.render.layer_frame`); None for all but
-            a layer per light.
+        layers: of an OpenEXR file, separated by commas; None for all but a layer per light.
         datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
-        space: "world": cameras of a file, lights, and what is written of cameras and depths are in the coordinates of
-            the data's files; "scene": in those of the model, for volumes their unit box.
+        space: of cameras of a file, lights, and what is written of cameras and depths: "world", the coordinates of the
+            data's files, or "scene", those of the model, for volumes their unit box.
         overwrite: replace pictures of the run's report.
     """
 
@@ -129,7 +125,7 @@ class _RenderSession:
         self.render_config = parse_run_rendering(request.overrides, run.config.renderer, run.model)
         self.background = torch.tensor([float(x) for x in run.header.get("background", [0.0] * channels)])
         self.channels = read_stored_channels(run.directory, run.header, self.task, channels)
-        self.lights = self._load_lights(request.environment)
+        self.lights = () if request.environment is None else self._load_lights(request.environment)
         self.views, self.fps = self._load_views()
         with run.plugins.attribute_errors():
             self.views, animated = set_run_view_conditions(self.views, self.task, request.conditions, notify)
@@ -142,28 +138,15 @@ class _RenderSession:
         for option, value in (("--layers", request.layers), ("--datatype", request.datatype)):
             if value is not None and self.format != "exr":
                 raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
-        self.layers: RunExrLayers | None = None
-        if self.format == "exr":
-            self.layers = RunExrLayers(
-                run.directory,
-                self.task,
-                self.channels,
-                self.render_config,
-                self.background,
-                request.layers,
-                request.datatype == "half",
-                self.lights,
-                self.world,
-            )
+        half, drawn = request.datatype == "half", (self.channels, self.render_config, self.background)
+        layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world)
+        self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")
-        self._passes = 0  # images rendered so far, one per view and light
-        self._visible = [False] * len(self.views)
+        self._passes, self._visible = 0, False  # images rendered so far, one per view and light; whether one shows it
 
-    def _load_lights(self, environment: EnvironmentFile | None) -> Sequence[Conditions]:
-        """Conditions of the lights that replace an environment; none without one."""
-        if environment is None:
-            return ()
+    def _load_lights(self, environment: EnvironmentFile) -> Sequence[Conditions]:
+        """Conditions of the lights that replace an environment."""
         with self.run.plugins.attribute_errors():
             illumination = self._illuminate(environment)
         lights = illumination.frames(environment.guesses)
@@ -237,24 +220,34 @@ class _RenderSession:
 
     def write_animation(self, path: Path) -> None:
         stack = [self.channels.display(self._render_pixels(view)) for view in self.views]
-        self._check_visible()
+        self._refuse_empty_images()
         write_animation(path, stack, self.fps or min(30.0, max(len(self.views) / 4.0, 5.0)))
 
     def write_images(self, paths: Sequence[Path]) -> None:
         for view, path in zip(self.views, paths, strict=True):
             if self.layers is None:
-                _write_run_image(path, self.format, self._render_pixels(view), self.channels, self.fps)
+                self._write_image(path, self._render_pixels(view))
             else:
                 with self.run.plugins.attribute_errors():
                     self.layers.write(path, self.model, view, self._count_pass)
         try:
-            self._check_visible()
+            self._refuse_empty_images()
         except DataError:
             for path in paths:
                 path.unlink()
             raise
 
-    def _render_pixels(self, view: View) -> torch.Tensor:
+    def _write_image(self, path: Path, pixels: Tensor) -> None:
+        """Write all channels as the data set has them in npy, or what its channels look like."""
+        shown = pixels if self.format == "npy" else self.channels.display(pixels)
+        if self.format == "npy":
+            write_npy(path, shown.contiguous().numpy())
+        elif self.format in ("png", "webp"):
+            (images.write_png if self.format == "png" else images.write_webp)(path, shown)
+        else:
+            write_animation(path, [shown], self.fps or 12.0)
+
+    def _render_pixels(self, view: View) -> Tensor:
         config = self.render_config
         with self.run.plugins.attribute_errors():
             if not self.lights:
@@ -263,54 +256,32 @@ class _RenderSession:
             image = render_light_sum(self.model, small, self.lights, config.settings, self.background, self._count_pass)
             return config.upsample(image, view.camera)
 
-    def _count_pass(self, alpha: torch.Tensor) -> None:
+    def _count_pass(self, alpha: Tensor) -> None:
         """Called after every image of a view under a light, with its alpha."""
         lights, count = max(len(self.lights), 1), len(self.views)
-        number = self._passes // lights
-        self._visible[number] |= bool((alpha > 0).any())
+        self._visible |= bool((alpha > 0).any())
         self._passes += 1
-        self.progress(f"view {number + 1} of {count}", self._passes / (lights * count))
+        self.progress(f"view {-(-self._passes // lights)} of {count}", self._passes / (lights * count))
 
-    def _check_visible(self) -> None:
-        """Warn of images that show nothing of the model; refuse a request of which all do.
-
-        Raises:
-            DataError: says where the model is, and where the first camera looks.
-        """
-        empty = [view for view, visible in zip(self.views, self._visible, strict=True) if not visible]
-        if not empty:
+    def _refuse_empty_images(self) -> None:
+        """Raise DataError, which says where the model is and where the first camera looks, if no image shows it."""
+        if self._visible:
             return
-        where = _describe_run_model_position(self.model, empty[0], self.world)
-        if len(empty) < len(self.views):
-            self.notify(f"warning: {len(empty)} of {len(self.views)} images are empty, first {empty[0].name}: {where}")
-            return
-        own = self.request.camera in SETS or self.request.space == SCENE
-        hint = "; a file's cameras are in the units of the run's data, or of the model with --space scene" * (not own)
-        raise DataError(f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}{hint}")
-
-
-def _describe_run_model_position(model: Primitives, view: View, world: World) -> str:
-    """Describe where the model is, and where a camera looks that does not see it."""
-    with torch.no_grad():
-        geometry, _ = model.lower_density(view.conditions)
-    if not geometry.count:
-        return "no primitive is there under these conditions"
-    means, reach = geometry.means.double().cpu(), geometry.scales.double().cpu().amax(1, keepdim=True)
-    low, high = world.world_box(torch.stack([(means - reach).min(0).values, (means + reach).max(0).values]).numpy())
-    camera = world.world_camera(view.camera)
-    points = low, high, camera.position.tolist(), camera.viewmat[2, :3].tolist()
-    start, end, at, towards = ("(" + ", ".join(f"{x:.7g}" for x in point) + ")" for point in points)
-    return f"the model is within {start} to {end}, and {view.name} at {at} looks towards {towards}"
-
-
-def _write_run_image(path: Path, format: str, pixels: torch.Tensor, channels: Channels, fps: float | None) -> None:
-    """Write one image: all channels as the data set has them in npy, or what its channels look like."""
-    if format == "npy":
-        write_npy(path, pixels.contiguous().numpy())
-    elif format in ("png", "webp"):
-        (images.write_png if format == "png" else images.write_webp)(path, channels.display(pixels))
-    else:
-        write_animation(path, [channels.display(pixels)], fps or 12.0)
+        view, where = self.views[0], "no primitive is there under these conditions"
+        with torch.no_grad():
+            geometry, _ = self.model.lower_density(view.conditions)
+        if geometry.count:
+            means, reach = geometry.means.double().cpu(), geometry.scales.double().cpu().amax(1, keepdim=True)
+            corners = torch.stack([(means - reach).min(0).values, (means + reach).max(0).values])
+            camera = self.world.world_camera(view.camera)
+            low, high = self.world.world_box(corners.numpy())
+            points = low, high, camera.position.tolist(), camera.viewmat[2, :3].tolist()
+            start, end, at, towards = ("(" + ", ".join(f"{x:.7g}" for x in point) + ")" for point in points)
+            where = f"the model is within {start} to {end}, and {view.name} at {at} looks towards {towards}"
+        raise DataError(
+            f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}; cameras of a file are "
+            f"in the units of the run's data, or of the model with --space scene"
+        )
 
 
 def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:

@@ -26,14 +26,18 @@ from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.finetune import count_run_finetune_steps, make_run_finetune_trainer
 from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_run_event, is_chunked, refuse_chunks
 from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.jobs import ENDED, JobStatus
-from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
-from neuprim.runs.open import make_run_scene_context, model_file, read_metrics
-from neuprim.runs.run_directory import lock_run_directory
-from neuprim.runs.training import BetweenSteps, do_nothing_between_run_steps, train_in_directory
+from neuprim.runs.open import lock_run_directory, make_run_scene_context, model_file, read_metrics
+from neuprim.runs.sweep import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
+from neuprim.runs.training import (
+    BetweenSteps,
+    count_run_finetune_steps,
+    do_nothing_between_run_steps,
+    make_run_finetune_trainer,
+    train_in_directory,
+)
 
 CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
 """In a run's directory: the record, and the runs of the chunks."""
@@ -183,15 +187,6 @@ def _override_chunk_config(
     return RunConfig.from_dict(tree)
 
 
-def read_chunk_record(folder: Path) -> LaunchRecord | None:
-    """What a run directory records of its chunks; None where it has none.
-
-    Raises:
-        DataError: the file is damaged, or of another version.
-    """
-    return read_launch_record(folder / CHUNKS_FILE, "the record of a run in chunks")
-
-
 def train_in_chunks(
     config: RunConfig,
     events: Events = ignore_run_event,
@@ -219,7 +214,7 @@ def train_in_chunks(
         return train_in_directory(replace(config, scene={**config.scene, "chunks": None}), events, between=between)
     plan = _plan_chunks(config, chunks)
     record = LaunchRecord(config.output_dir / CHUNKS_FILE, (), plan.runs, plan.steps if plan.seconds is None else None)
-    record = record.resume(read_chunk_record(config.output_dir) if config.resume else None, more=False)
+    record = record.resume(read_launch_record(record.file) if config.resume else None, more=False)
     record = _fit_chunks(plan, record, events, launcher)
 
     def make(job: Job, dataset: Dataset, loss: Loss) -> Trainer:

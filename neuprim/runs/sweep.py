@@ -1,39 +1,205 @@
-"""A sweep: runs that differ in some settings, launched together and compared.
+"""Runs that are launched together: those of a sweep, compared at the end, or the chunks of one run.
 
-``sweep.json`` records what was asked for and what became of each run while they work; ``sweep.csv`` and ``sweep.html``
-are written at the end.
+A record says what was asked for and what became of each run while they work: ``sweep.json`` or ``chunks.json``.
+``sweep.csv`` and ``sweep.html`` are written at the end.
 """
 
 from __future__ import annotations
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 from neuprim.config import RunConfig
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.config.overrides import drop_output_overrides, parse_overrides, swept_override_keys
 from neuprim.core.errors import ConfigError, DataError, cut_error_text
-from neuprim.core.io.files import write_text
+from neuprim.core.io.files import read_json_record, write_json, write_text
+from neuprim.core.validation import validate_settings, validate_value
 from neuprim.report.run_record import ReportedRun, read_reported_run
 from neuprim.report.sweep_page import SweepPageRun, write_sweep_page
-from neuprim.runs.launch.jobs import JobResult
-from neuprim.runs.launch.launcher import OnStatus, ignore_status
-from neuprim.runs.launch_record import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
-from neuprim.runs.run_directory import lock_run_directory
+from neuprim.runs.ground_truth import render_ground_truth_of_runs
+from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
+from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher, ignore_status, launch_jobs
+from neuprim.runs.open import lock_run_directory, model_file
 
 SWEEP_FILE = "sweep.json"
 """In a sweep's directory."""
 
+FIT_JOB = "neuprim.runs.run:fit_job"
+"""What the worker of a run does."""
 
-def read_sweep(folder: Path) -> LaunchRecord | None:
-    """Read the record in a sweep's directory; None where there is none.
+_FORMAT = 1
+
+
+# ---------------------------------------------------------------- record
+
+
+@dataclass(frozen=True)
+class LaunchedRun:
+    """One run.
+
+    Attributes:
+        name: of its folder.
+        words: what was asked for, without those of its place.
+        swept: key -> value, as typed, of those that differ between the runs.
+        state: waiting, done, failed or interrupted.
+        line: why it failed.
+        seconds: from its start to its end, measuring included.
+        attempts: how often it was started, as its worker died.
+    """
+
+    name: str
+    words: tuple[str, ...]
+    swept: Mapping[str, str] = field(default_factory=dict)
+    state: str = "waiting"
+    line: str = ""
+    seconds: float = 0.0
+    attempts: int = 0
+
+
+@dataclass(frozen=True)
+class LaunchRecord:
+    """Runs that are launched together.
+
+    Attributes:
+        file: of the record; its folder is that of the launch.
+        words: what was asked for, without those of its place.
+        joined_steps: of a run in chunks: steps of the joined model's training, once they are known.
+    """
+
+    file: Path
+    words: tuple[str, ...]
+    runs: tuple[LaunchedRun, ...]
+    joined_steps: int | None = None
+
+    def write(self) -> None:
+        """Raises OSError where it cannot be written; what was there is intact."""
+        runs = [{**asdict(run), "words": list(run.words), "seconds": round(run.seconds, 3)} for run in self.runs]
+        joined = {} if self.joined_steps is None else {"joined_steps": self.joined_steps}
+        write_json(self.file, {"format": _FORMAT, "words": list(self.words), "runs": runs, **joined})
+
+    def end_run(self, number: int, result: JobResult) -> LaunchRecord:
+        """The record after a run has ended."""
+        runs, (state, line) = list(self.runs), (result.state, result.line)
+        runs[number] = replace(runs[number], state=state, line=line, seconds=result.seconds, attempts=result.attempts)
+        return replace(self, runs=tuple(runs))
+
+    def resume(self, before: LaunchRecord | None, more: bool) -> LaunchRecord:
+        """Take the states of an earlier record, and append the runs that only that one has.
+
+        Args:
+            more: whether the two may have different runs.
+
+        Raises:
+            ConfigError: a run of the same name had other words, or there are other runs.
+        """
+        if before is None:
+            return self
+        old, names = {run.name: run for run in before.runs}, [run.name for run in self.runs]
+        if not more and list(old) != names:
+            raise ConfigError(
+                f"{self.file}: begun with {', '.join(old)}; the words now ask for {', '.join(names)}; expected the "
+                f"same words, or another output_dir"
+            )
+        for run in self.runs:
+            if run.name in old and old[run.name].words != run.words:
+                was = " ".join(old[run.name].words)
+                raise ConfigError(
+                    f"{self.file}: {run.name} was begun with {was}; expected the same words, or another output_dir"
+                )
+        own = tuple(old.get(run.name, run) for run in self.runs)
+        others = tuple(run for run in before.runs if run.name not in names)
+        return replace(self, runs=(*own, *others), joined_steps=before.joined_steps or self.joined_steps)
+
+
+def read_launch_record(file: Path) -> LaunchRecord | None:
+    """Read a record; None where there is none.
 
     Raises:
         DataError: the file is damaged, or of another version.
     """
-    return read_launch_record(folder / SWEEP_FILE, "the record of a sweep")
+
+    def parse(data: Mapping[str, Any]) -> LaunchRecord:
+        words = validate_value(data["words"], tuple[str, ...], "words")
+        runs = tuple(validate_settings(LaunchedRun, run, "runs") for run in data["runs"])
+        for run in runs:
+            if Path(run.name).name != run.name or run.name in ("", ".", ".."):
+                raise ValueError(f"name {run.name!r} is no folder's")
+        return LaunchRecord(file, words, runs, validate_value(data.get("joined_steps"), int | None, "joined_steps"))
+
+    return read_json_record(file, "a record of launched runs", "another output_dir=DIR begins anew", _FORMAT, parse)
+
+
+# ---------------------------------------------------------------- launch
+
+
+def make_run_job(config: RunConfig) -> LaunchJob:
+    """Make a run a job."""
+    return LaunchJob(config.output_dir.name, FIT_JOB, config.to_dict())
+
+
+def launch_missing_runs(
+    record: LaunchRecord, configs: Sequence[RunConfig], settings: LauncherSettings, on_status: OnStatus
+) -> tuple[LaunchRecord, list[JobResult | None]]:
+    """Launch the runs of a record that are not done, each in its own directory, their ground truth first.
+
+    The record is written at the first status, so that a launcher that is refused leaves nothing, and whenever a run
+    ends.
+
+    Args:
+        configs: of the record's first runs.
+        on_status: called with (place in ``configs``, status) whenever it is new; once for each run that is kept.
+
+    Returns:
+        the record, and a result for each configuration; None of those that Ctrl-C came before.
+
+    Raises:
+        NeuprimError: a launcher that cannot work here.
+        OSError: the record cannot be written.
+    """
+    results = list[JobResult | None]([None] * len(configs))
+    for number, (run, config) in enumerate(zip(record.runs, configs, strict=False)):
+        if run.state == "done" and _is_finished_run(config.output_dir):
+            results[number] = JobResult("done", str(config.output_dir))
+    todo = [number for number, result in enumerate(results) if result is None]
+    check_launcher(settings, len(todo))
+    for number, result in enumerate(results):
+        if result is not None:
+            on_status(number, JobStatus("done", "kept"))
+    begun = False
+
+    def hear(place: int, status: JobStatus) -> None:
+        nonlocal begun
+        if not begun:
+            begun = True
+            record.write()
+        on_status(todo[place], status)
+
+    def end(place: int, result: JobResult) -> None:
+        nonlocal record
+        results[todo[place]] = result
+        record = record.end_run(todo[place], result)
+        with suppress(OSError):  # a full disk must not end the other runs; the write at the end reports it
+            record.write()
+
+    chosen = [configs[number] for number in todo]
+    render_ground_truth_of_runs(chosen, settings, hear)
+    launch_jobs([make_run_job(config) for config in chosen], settings, record.file.parent / LAUNCH_FOLDER, hear, end)
+    record.write()
+    return record, results
+
+
+def _is_finished_run(run_dir: Path) -> bool:
+    """Whether a directory has all that the end of a run writes."""
+    return all(file.is_file() for file in (run_dir / "config.yaml", run_dir / "metrics.json", model_file(run_dir)))
+
+
+# ---------------------------------------------------------------- sweep
 
 
 def read_sweep_overrides(words: Sequence[str]) -> list[str]:
@@ -43,8 +209,9 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
         ConfigError: there is no sweep.
     """
     given = {a.key: a.value for a in parse_overrides(words)}
-    folder = Path(str(given["output_dir"])).expanduser() if given.get("output_dir") is not None else None
-    before = None if folder is None or given.get("resume") is not True else read_sweep(folder)
+    before = None
+    if given.get("output_dir") is not None and given.get("resume") is True:
+        before = read_launch_record(Path(str(given["output_dir"])).expanduser() / SWEEP_FILE)
     if before is None:
         raise ConfigError(
             f"{' '.join(words) or 'nothing'}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of "
@@ -53,27 +220,23 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
     for word in before.words:
         if "${" in word:  # a file must not read the environment; see neuprim.config.compose
             raise ConfigError(
-                f"{before.file}: {cut_error_text(word)} refers to something outside of the file; "
-                f"type the sweep's words again, "
-                f"with resume=true"
+                f"{before.file}: {cut_error_text(word)} refers to something outside of the file; type the sweep's "
+                f"words again, with resume=true"
             )
     return [*before.words, *words]
 
 
 def read_sweep_runs(record: LaunchRecord) -> list[SweepPageRun]:
     """Read the runs in a sweep's directory, in the record's order."""
-    found = [_read_finished_run(record.file.parent / run.name) for run in record.runs]
-    return [
-        SweepPageRun(run.name, run.swept, run.state, run.line, run.seconds, run.attempts, one)
-        for run, one in zip(record.runs, found, strict=True)
-    ]
-
-
-def _read_finished_run(directory: Path) -> ReportedRun | None:
-    try:
-        return read_reported_run(directory)
-    except DataError:  # no run yet, or one that was damaged: its state says that it is not done
-        return None
+    rows = []
+    for run in record.runs:
+        directory = record.file.parent / run.name
+        try:
+            found = read_reported_run(directory)
+        except DataError:  # it was damaged: its state says that it is not done
+            found = ReportedRun(directory, {}, [], [], [])
+        rows.append(SweepPageRun(run.name, run.swept, run.state, run.line, run.seconds, run.attempts, found))
+    return rows
 
 
 def write_sweep_csv(path: Path, runs: Sequence[SweepPageRun]) -> None:
@@ -85,11 +248,8 @@ def write_sweep_csv(path: Path, runs: Sequence[SweepPageRun]) -> None:
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow(["run", *keys, "state", "error", "attempts", "seconds", *metrics, "path"])
     for run in runs:
-        numbers = run.numbers
-        swept, values = (
-            (run.swept.get(key, "") for key in keys),
-            (_sweep_csv_number(numbers.get(name)) for name in metrics),
-        )
+        swept = [run.swept.get(key, "") for key in keys]
+        values = [_sweep_csv_number(run.numbers.get(name)) for name in metrics]
         writer.writerow([run.name, *swept, run.state, run.line, run.attempts, f"{run.seconds:.3f}", *values, run.name])
     write_text(path, buffer.getvalue())
 
@@ -112,14 +272,9 @@ def run_sweep(
     Args:
         configs: as :func:`~neuprim.config.compose_all` gives them, all in one directory.
         words: what the sweep was asked for.
-        on_status: called with (place in ``configs``, status) whenever it is new; once for each run that is kept.
 
-    Returns:
-        the record, and a result for each configuration; None of those that Ctrl-C came before.
-
-    Raises:
-        NeuprimError: another process is at work in the sweep's directory, or a launcher cannot work here.
-        OSError: the sweep's own files cannot be written.
+    Returns, raises and calls ``on_status`` as :func:`launch_missing_runs`; another process at work in the sweep's
+    directory is a ConfigError.
     """
     folder, keys = configs[0].output_dir.parent, set(swept_override_keys(words))
     runs = []
@@ -128,7 +283,7 @@ def run_sweep(
         swept = {a.key: a.text.partition("=")[2] for a in parse_overrides(own) if a.key in keys}
         runs.append(LaunchedRun(config.output_dir.name, own, swept))
     record = LaunchRecord(folder / SWEEP_FILE, tuple(drop_output_overrides(words)), tuple(runs))
-    record = record.resume(read_sweep(folder) if configs[0].resume else None, more=True)
+    record = record.resume(read_launch_record(record.file) if configs[0].resume else None, more=True)
     with lock_run_directory(folder, "sweep"):
         record, results = launch_missing_runs(record, configs, settings, on_status)
         rows = read_sweep_runs(record)

@@ -1,4 +1,7 @@
-"""Train in a directory: data, model and steps that go on where they were left."""
+"""Train in a directory, with steps that go on where they were left, and train a changed model further.
+
+Fine-tuning is the end of a run once more, at the rates of its end, with the primitives that there are.
+"""
 
 from __future__ import annotations
 
@@ -9,22 +12,25 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import torch
 
-from neuprim.config import RunConfig
+from neuprim.config import Job, RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError, RankError
 from neuprim.core.io.files import write_text
 from neuprim.core.io.plain import load_json
+from neuprim.core.model.primitives import Primitives
 from neuprim.core.notices import warn_once
 from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
+from neuprim.core.train.trainer_state import select_state_tensors
 from neuprim.plugins.provenance import check_resumed_provenance
 from neuprim.plugins.returns import call_task_facts
 from neuprim.runs.fit import (
@@ -33,15 +39,36 @@ from neuprim.runs.fit import (
     Note,
     TrainerFactory,
     compile_run_kernels,
+    drop_unused_run_rates,
     ignore_run_event,
+    make_run_loss,
     prepare_training,
     train_run_steps,
     use_one_torch_thread_for_run,
 )
-from neuprim.runs.launch.worker import interruptible_run
-from neuprim.runs.run_directory import discard_results
+from neuprim.runs.launch.jobs import interruptible_run
+from neuprim.runs.open import discard_results
 
 CURVE_FILE = "metrics.jsonl"
+
+BEGIN = 0.8
+"""Progress of the run that the first step stands for."""
+
+START, COOL = 3.0, 0.02
+"""The rates at the first step over those at the end of the run, and those at the last step over these at the first.
+With next to none at the end, numbers settle, which improves quality by itself (row "trained as long" of
+docs/tradeoffs.md) and decides where numbers are rounded."""
+
+LONG, LEAST_START = 2000, 1.0
+"""Steps from which on rates begin so high. Fewer steps begin lower, in proportion, but not below
+:data:`LEAST_START`: a few hundred steps at high rates leave a well trained volume worse than they found it."""
+
+VOXELS_EVERY = 8
+"""Largest number of steps between two uses of voxels, where a run learned from them. In a few hundred steps with uses
+as rare as in a run some frames are hardly met, and their extinction drifts; at every fourth step images get worse."""
+
+_PACE_WARMUP, _PACE_STEPS = 5, 20
+"""Steps before the pace is measured, and those that it is measured over."""
 
 BetweenSteps = Callable[[Fitted, threading.Event], None]
 """Called on the training's thread before its first step and after every one, with what is trained and the event that
@@ -209,3 +236,59 @@ def save_run_training(fitted: Fitted) -> None:
     }
     file = config.output_dir / "model.safetensors"
     checkpoint.save_model(file, trainer.model, config.task, extra, without_zeros=bool(trainer.zero_masks))
+
+
+# ---------------------------------------------------------------- fine-tuning
+
+
+def make_run_finetune_trainer(
+    job: Job,
+    dataset: Dataset,
+    model: Primitives,
+    steps: int,
+    begin: float = BEGIN,
+    voxels_every: int = VOXELS_EVERY,
+) -> Trainer:
+    """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
+
+    Schedules are those of a run from the progress ``begin`` on, except for the rates (:data:`START`, :data:`COOL`);
+    the population is fixed, and views keep their resolution. Gains of photographs' exposures go on from the run's
+    checkpoint, if there is one.
+    """
+    config, params = job.config, {name: value.detach().clone() for name, value in model.params.items()}
+    copy = Primitives(model.density, model.colour, params)
+    total = round(steps / (1 - begin))
+    usual = drop_unused_run_rates(config.train, job.task, copy)
+    final = COOL ** (1 / (1 - begin))  # a rate's factor is final ** progress
+    scale = max(START * min(steps / LONG, 1.0), LEAST_START) * usual.final_rate / final**begin
+    settings = replace(
+        usual,
+        iterations=total,
+        final_rate=final,
+        cooldown=0.0,
+        rates={spec.name: scale * usual.rates.get(spec.name, spec.lr) for spec in copy.specs},
+        max_seconds=None,
+        coarse=1,
+        warmup_steps=0,
+        voxels_every=min(usual.voxels_every, voxels_every),
+        population=replace(config.train.population, strategy="fixed", grow_from=1.0),
+    )
+    trainer = Trainer(copy, dataset, make_run_loss(job), settings, config.renderer, config.seed)
+    trainer.step = total - steps
+    saved = config.output_dir / "checkpoint.safetensors"
+    if trainer.exposures is not None and saved.exists():
+        trainer.exposures.load_state(select_state_tensors(checkpoint.read_tensors(saved, "checkpoint")[1], "exposure."))
+    return trainer
+
+
+def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
+    """How many steps of fine-tuning fit into some seconds, at the measured pace; none in 0 seconds."""
+    if seconds <= 0:
+        return 0
+    trainer = make_run_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)
+    for _ in range(_PACE_WARMUP):
+        trainer.train_step()
+    before = trainer.elapsed
+    for _ in range(_PACE_STEPS):
+        trainer.train_step()
+    return max(int(seconds * _PACE_STEPS / max(trainer.elapsed - before, 1e-9)), 1)

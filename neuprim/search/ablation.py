@@ -31,9 +31,8 @@ from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.runs.launch.launcher import use_launcher_threads_for_runs
-from neuprim.runs.open import load_dataset
+from neuprim.runs.open import load_dataset, lock_run_directory
 from neuprim.runs.render_config import RenderConfig
-from neuprim.runs.run_directory import lock_run_directory
 from neuprim.search.ablation_plan import (
     CENTRE,
     AblationPlan,

@@ -15,10 +15,10 @@ from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.finetune import count_run_finetune_steps
 from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, load_run
+from neuprim.runs.training import count_run_finetune_steps
 from neuprim.search.quantized_finetune import (
     Progress,
     QuantizedModel,

@@ -20,11 +20,10 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.evaluate import evaluate_fitted
-from neuprim.runs.finetune import count_run_finetune_steps, make_run_finetune_trainer
 from neuprim.runs.fit import Fitted, drop_unused_run_rates, make_run_loss, use_one_torch_thread_for_run
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import PRUNED, kept_shares, load_dataset, load_run, model_file, move_to_render_device
-from neuprim.runs.training import save_run_training
+from neuprim.runs.training import count_run_finetune_steps, make_run_finetune_trainer, save_run_training
 from neuprim.search.model_quality import SearchQuality, choose_trial_views, measure_trial_views
 from neuprim.search.pruning_cuts import (
     count_unpruned_numbers,

@@ -20,7 +20,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
-from neuprim.runs.finetune import make_run_finetune_trainer
+from neuprim.runs.training import make_run_finetune_trainer
 from neuprim.search.model_quality import SearchQuality
 from neuprim.search.pruning_cuts import mask_pruned_numbers
 

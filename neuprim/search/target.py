@@ -31,8 +31,7 @@ from neuprim.runs.fit import Events, Finishing, Preparing, compile_run_kernels, 
 from neuprim.runs.ground_truth import render_ground_truth_before_run
 from neuprim.runs.launch.launcher import use_launcher_threads_for_runs
 from neuprim.runs.measure import measure_quality
-from neuprim.runs.open import COMPRESSED, load_dataset, move_to_render_device
-from neuprim.runs.run_directory import lock_run_directory
+from neuprim.runs.open import COMPRESSED, load_dataset, lock_run_directory, move_to_render_device
 from neuprim.runs.training import train_in_directory
 from neuprim.search.model_quality import SearchQuality, choose_trial_views, measure_trial_views
 from neuprim.search.pruning import PruneRequest, prune_run

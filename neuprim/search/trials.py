@@ -26,8 +26,7 @@ from neuprim.core.validation import validate_settings
 from neuprim.runs.fit import Event, Events, Finishing, Note, Preparing, Step, ignore_run_event
 from neuprim.runs.launch.jobs import ENDED, JobResult, JobStatus, LaunchJob
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
-from neuprim.runs.open import load_dataset
-from neuprim.runs.run_directory import lock_run_directory
+from neuprim.runs.open import load_dataset, lock_run_directory
 from neuprim.runs.training import train_in_directory
 from neuprim.search.model_quality import choose_trial_views, measure_trial_views
 

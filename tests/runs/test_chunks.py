@@ -17,10 +17,11 @@ from neuprim.core import checkpoint
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.distributed.process_group import ProcessGroup
-from neuprim.runs import launch_record
+from neuprim.runs import sweep
 from neuprim.runs.fit import Event, Note, Preparing, Step, fit, ignore_run_event
 from neuprim.runs.open import load_run, read_metrics
-from neuprim.runs.run import ChunksMissing, read_chunk_record, run
+from neuprim.runs.run import CHUNKS_FILE, ChunksMissing, run
+from neuprim.runs.sweep import read_launch_record
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from tests.tasks.dynamic.sequences import blob
 
@@ -134,7 +135,7 @@ def test_what_is_done_is_kept(finished: Path, files: Path, tmp_path: Path) -> No
 def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
     files: Path, finished: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(launch_record, "FIT_JOB", f"{__name__}:{_fail_first.__name__}")
+    monkeypatch.setattr(sweep, "FIT_JOB", f"{__name__}:{_fail_first.__name__}")
     out, told = tmp_path / "run", list[Event]()
     with pytest.raises(
         ChunksMissing,
@@ -142,7 +143,7 @@ def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
     ):
         run(compose(words(files, out)), told.append)
     assert [event.text.partition("chunks/")[2] for event in told if isinstance(event, Note)] == ["frames_1-4: no luck"]
-    record = read_chunk_record(out)
+    record = read_launch_record(out / CHUNKS_FILE)
     assert record is not None and [(row.state, row.line) for row in record.runs] == [
         ("failed", "no luck"),
         ("done", ""),
@@ -169,7 +170,7 @@ def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: 
     ):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")
-    with pytest.raises(DataError, match=r"chunks.json: not the record of a run in chunks"):
+    with pytest.raises(DataError, match=r"chunks.json: not a record of launched runs"):
         run(compose(words(files, tmp_path / "copy", "resume=true")))
 
 

@@ -1,4 +1,4 @@
-"""What a training in memory says of the number of primitives that it was asked for."""
+"""Trainings in memory: how many primitives there are, and which views are measured."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from neuprim.config import compose
 from neuprim.core.errors import ConfigError
-from neuprim.runs.fit import Event, Note, prepare_training, train_to_end
+from neuprim.runs.fit import prepare_training, train_to_end
 from tests.core import tiny
 from tests.short_runs import words
 
@@ -18,27 +18,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tiny.write_blender(tmp_path_factory.mktemp("data") / "two")
 
 
-def trained(scene: Path, tmp_path: Path, *more: str) -> tuple[int, int, list[str]]:
-    """Primitives at the start, at the end, and what was noted."""
-    events: list[Event] = []
-    fitted = prepare_training(compose(words(scene, tmp_path / "out", 100, "train.eval_every=0", *more)), events.append)
-    first = fitted.model.count
-    train_to_end(fitted, events.append)
-    return first, fitted.model.count, [event.text for event in events if isinstance(event, Note)]
-
-
-def test_a_share_of_the_primitives_is_there_at_first_and_all_at_the_end(scene: Path, tmp_path: Path) -> None:
-    assert trained(scene, tmp_path, "train.population.grow_from=0.5", "train.population.every=10") == (20, 40, [])
-    assert trained(scene, tmp_path, "train.population.grow_from=1") == (40, 40, [])
-
-
-def test_a_count_that_is_not_reached_is_said(scene: Path, tmp_path: Path) -> None:
-    first, last, notes = trained(scene, tmp_path, "train.population.grow_from=0.2", "train.population.every=30")
-    assert (first, last) == (8, 32), "two interventions, and a primitive splits once in each"
-    assert notes == [
-        "32 primitives of model.primitives=40: too few interventions, or places with an error, to split for the "
-        "others; see train.population.every"
-    ]
+@pytest.mark.parametrize(("share", "first"), [(0.5, 20), (1, 40)])
+def test_a_share_of_the_primitives_is_there_at_first_and_all_at_the_end(
+    scene: Path, tmp_path: Path, share: float, first: int
+) -> None:
+    grown = [f"train.population.grow_from={share}", "train.population.every=10", "train.eval_every=0"]
+    fitted = prepare_training(compose(words(scene, tmp_path / "out", 100, *grown)))
+    assert fitted.model.count == first
+    train_to_end(fitted)
+    assert fitted.model.count == 40
 
 
 @pytest.mark.parametrize(

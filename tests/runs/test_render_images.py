@@ -10,7 +10,6 @@ import torch
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.fields import ConditionSpec
 from neuprim.runs.render_images import _run_views_of_camera_file, _view_file_names, set_run_view_conditions
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
@@ -53,13 +52,6 @@ def test_lengths_that_differ_and_what_is_missing_are_refused() -> None:
         set_run_view_conditions(VIEWS, BOTH, {"time": "0:1:48", "light": "orbit:4:40:60"})
     with pytest.raises(ConfigError, match="view v0 has no time, which task 'relight' needs; give --time"):
         set_run_view_conditions(VIEWS, BOTH, {"light": "1,2,3"})
-
-
-def test_ten_thousand_frames_have_names_in_order() -> None:
-    spec = ConditionSpec("time", (), "s", (0.0, 1.0), lambda text: [torch.tensor(float(text))])
-    views, _ = set_run_view_conditions(VIEWS[:1], replace(DYNAMIC, conditions=(spec,)), {"time": "0:1:10001"})
-    names = [v.name for v in views]
-    assert names[0] == "v0_00000" and names == sorted(names)
 
 
 def test_a_files_times_are_the_frames_where_the_task_has_a_time() -> None:

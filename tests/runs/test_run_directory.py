@@ -12,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from neuprim.core.errors import ConfigError
-from neuprim.runs.run_directory import LOCK_FILE, lock_run_directory
+from neuprim.runs.open import LOCK_FILE, lock_run_directory
 from tests.runs.launching import wait_for
 from tests.systems import posix
 
 HOLD = (
-    "import sys, time; from pathlib import Path; from neuprim.runs.run_directory import lock_run_directory\nwith "
+    "import sys, time; from pathlib import Path; from neuprim.runs.open import lock_run_directory\nwith "
     "lock_run_directory(Path(sys.argv[1])): time.sleep(600)"
 )
 

@@ -12,8 +12,8 @@ import pytest
 
 from neuprim.cli import main
 from neuprim.core import checkpoint
-from neuprim.runs.run_directory import lock_run_directory
-from neuprim.runs.sweep import read_sweep
+from neuprim.runs.open import lock_run_directory
+from neuprim.runs.sweep import read_launch_record
 from tests.core import tiny
 from tests.short_runs import words
 
@@ -106,8 +106,10 @@ def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(
     out = tmp_path / "sweep"
     with lock_run_directory(out / "seed-2"):
         assert main(typed(scene, out, "train.iterations=1", "resume=true")) == 2
-    assert [(row.state, "is at work on this run" in row.line) for row in read_sweep(out).runs] == [("done", False),
-        ("failed", True), ("done", False)]  # type: ignore[union-attr]  # fmt: skip
+    record = read_launch_record(out / "sweep.json")
+    assert record is not None
+    refused = [(row.state, "is at work on this run" in row.line) for row in record.runs]
+    assert refused == [("done", False), ("failed", True), ("done", False)]
     assert "neuprim: error:" in capsys.readouterr().err
 
 

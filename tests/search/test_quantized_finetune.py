@@ -13,8 +13,8 @@ from neuprim.core.compression import Quantizers, bit_table, canonical_model, fit
 from neuprim.core.compression.quantizers import ColumnQuantizer
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
-from neuprim.runs.finetune import COOL, LEAST_START, LONG, START, make_run_finetune_trainer
 from neuprim.runs.open import load_dataset, load_run
+from neuprim.runs.training import COOL, LEAST_START, LONG, START, make_run_finetune_trainer
 from neuprim.search.model_quality import SearchQuality
 from neuprim.search.quantized_finetune import (
     QuantizationSearch,
@@ -137,7 +137,7 @@ def test_training_that_spoils_the_model_is_not_stored(
 ) -> None:
     model = load_run(run_dir).model
     plain = search_fewest_bits(data, model, 0.2, 0, ignore)
-    monkeypatch.setattr("neuprim.runs.finetune.LEAST_START", 300.0)
+    monkeypatch.setattr("neuprim.runs.training.LEAST_START", 300.0)
     found = search_fewest_bits(data, model, 0.2, 20, ignore)
     assert equal(found.model, plain.model) and found.notes == plain.notes and found.steps == 20
     fewer = finetune_for_table(data, model, bit_table(1, [], model.specs), 20, ignore)

@@ -24,7 +24,7 @@ from neuprim.core.errors import ConfigError
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from neuprim.runs.paper import PaperTable, PlannedRun
+    from neuprim.runs.paper import PlannedRun
     from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 
 
@@ -91,7 +91,7 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
     numbers = "numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)"
     parser.add_argument("--tables", default="3-7", metavar="N", help=numbers)
     parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
-    scenes = "some of them, e.g. chair,lego; chair=FOLDER where the folder has another name"
+    scenes = "some of them, e.g. chair,lego"
     parser.add_argument("--scenes", metavar="NAME", help=scenes)
     parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
     budget = "training time of a run, e.g. 10m; full: 100,000 steps (default)"
@@ -110,7 +110,7 @@ def _bench_command(args: argparse.Namespace) -> int:
     from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
 
     wanted = parse_table_numbers(args.tables)
-    chosen = [table for table in load_paper_run_tables() if wanted & set(table.numbers)]
+    chosen = [table for table in load_paper_run_tables() if wanted & set(table["tables"])]
     if args.data is None:
         print(*_list_paper_tables(chosen), sep="\n")
         return 0
@@ -138,16 +138,19 @@ def parse_table_numbers(text: str) -> set[int]:
     return found
 
 
-def _list_paper_tables(chosen: Sequence[PaperTable]) -> Iterator[str]:
+def _list_paper_tables(chosen: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    from neuprim.runs.paper import find_paper_figure
+
     for table in chosen:
-        numbers = ", ".join(map(str, table.numbers))
-        plural = "s" * (len(table.numbers) > 1)
-        yield f"table{plural} {numbers}: {table.title} (task=static scene={table.loader})"
-        for row in table.rows:
-            yield f"  {row.name}: preset={row.preset}{f'; beside {row.beside}' if row.beside else ''}"
-            for scene, found in row.figures.items():
-                line = "  ".join(f"{kind} {_format_measure(found[kind.lower()], kind):>7}" for kind in _PAPER_MEASURES)
-                count = found.get("primitives")
+        numbers, plural = ", ".join(map(str, table["tables"])), "s" * (len(table["tables"]) > 1)
+        yield f"table{plural} {numbers}: {table['title']} (task=static scene={table['loader']})"
+        for row in table["rows"]:
+            beside = f"; beside {row['beside']['name']}" if "beside" in row else ""
+            yield f"  {row['name']}: preset={row['preset']}{beside}"
+            for scene in table["scenes"]:
+                found = {kind: find_paper_figure(table, row, scene, kind.lower()) for kind in _PAPER_MEASURES}
+                line = "  ".join(f"{kind} {_format_measure(value, kind):>7}" for kind, value in found.items())
+                count = find_paper_figure(table, row, scene, "primitives")
                 yield f"    {scene:10} {line}{f'  {count:,} primitives' if count else ''}"
     yield "neuprim bench paper --data DIR runs those whose data are folders of DIR"
 
@@ -157,7 +160,7 @@ def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
 
     steps, seconds = metrics["iterations"], _format_seconds(metrics["train_seconds"])
     yield (
-        f"{one.scene}, {one.row.name}: preset={one.row.preset}, seed {one.config.seed}, "
+        f"{one.scene}, {one.row['name']}: preset={one.row['preset']}, seed {one.config.seed}, "
         f"{metrics['checkpoint']} checkpoint after {steps:,} steps in {seconds}"
     )
     protocol = ("scene=", "scene.path=", "preset=", "seed=", "output_dir=", "task=")
@@ -165,8 +168,8 @@ def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
     width, height = metrics["image_size"]
     yield f"  images of {width}x{height}, down-sampling {metrics['downsampling']}{f', {own}' if own else ''}"
     for kind, ours, theirs, other in compare_run_with_paper(one, metrics):
-        named = one.row.beside if kind in _PAPER_MEASURES else ""
-        beside = f"   {named} {_format_measure(other, kind)}" if named else ""
+        named = "beside" in one.row and kind in _PAPER_MEASURES
+        beside = f"   {one.row['beside']['name']} {_format_measure(other, kind)}" if named else ""
         yield f"  {kind:10} {_format_measure(ours, kind):>9}   paper {_format_measure(theirs, kind)}{beside}"
 
 
@@ -176,7 +179,7 @@ def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, An
 
     rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
     for one, metrics in results:
-        rows.setdefault((one.table.title, one.row.name), []).append((one, metrics))
+        rows.setdefault((one.table["title"], one.row["name"]), []).append((one, metrics))
     for (title, name), own in rows.items():
         scenes, seeds = len({one.scene for one, _ in own}), len({one.config.seed for one, _ in own})
         count = f"{scenes} scenes, {seeds} seed{'s' * (seeds > 1)}"

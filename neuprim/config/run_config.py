@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from functools import reduce
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -101,6 +102,18 @@ class RunConfig:
             group, _, key = name.partition(".")
             del tree[group][key]
         return tree
+
+    def override(self, values: Mapping[str, Any]) -> RunConfig:
+        """Return the configuration with other settings, by dotted key, and with its record of what is not a default."""
+        tree = self.to_dict()
+        for key, value in values.items():
+            *path, name = key.split(".")
+            group = reduce(lambda node, part: node[part], path, tree)
+            default = tree["non_default"].pop(key, (group.get(name), None))[0]
+            group[name] = value
+            if value != default:
+                tree["non_default"][key] = [default, value]
+        return dataclasses.replace(RunConfig.from_dict(tree), source=self.source)
 
     def to_yaml(self) -> str:
         """Return the resolved configuration as YAML, which :meth:`from_yaml` reads back unchanged."""

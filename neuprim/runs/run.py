@@ -6,8 +6,6 @@ budget. ``chunks.json`` records what became of each chunk, so that nothing is do
 
 from __future__ import annotations
 
-import copy
-from collections import Counter
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -120,16 +118,6 @@ class ChunkPlan:
     seconds: float | None
 
 
-def _load_chunks(config: RunConfig, events: Events) -> Chunks | None:
-    """How the scene of a configuration is fitted in chunks; None for in one. Raises NeuprimError."""
-    job = Job.of(config)
-    load = job.scene.spec.chunks
-    assert load is not None, "the caller asked for chunks"
-    context = make_run_scene_context(config, lambda text, fraction: events(Preparing(text, fraction)))
-    with attribute_errors(job.plugins.scene, "chunks"):
-        return load(config.to_dict(), context)
-
-
 def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
     """The runs of the chunks, with their shares of primitives and budget; each has as many interventions into its
     population as the whole run.
@@ -158,7 +146,8 @@ def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
         if train.max_seconds is not None:
             settings["train.max_seconds"] = share * train.max_seconds
         words = tuple(quote_override(key, value) for key, value in settings.items())
-        configs.append(_override_chunk_config(config, settings, words, config.output_dir / CHUNKS_FOLDER / part.name))
+        folder, typed = config.output_dir / CHUNKS_FOLDER, [*drop_output_overrides(config.overrides), *words]
+        configs.append(replace(config.override(settings), output_dir=folder / part.name, overrides=typed))
         runs.append(LaunchedRun(part.name, words))
     steps = None if train.iterations is None else round(JOINT_SHARE * train.iterations)
     seconds = None if train.max_seconds is None else JOINT_SHARE * train.max_seconds
@@ -169,22 +158,6 @@ def _divide_primitives_among_chunks(total: int, shares: list[float]) -> list[int
     """Whole numbers close to these shares of ``total`` that add up to it."""
     ends = [round(total * sum(shares[: n + 1]) / sum(shares)) for n in range(len(shares))]
     return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
-
-
-def _override_chunk_config(
-    config: RunConfig, settings: Mapping[str, Any], words: tuple[str, ...], directory: Path
-) -> RunConfig:
-    """A configuration with other settings, by dotted key, as if these words had been typed."""
-    tree = copy.deepcopy(config.to_dict())
-    for key, value in settings.items():
-        *path, name = key.split(".")
-        node = tree
-        for group in path:
-            node = node[group]
-        tree["non_default"][key] = [node.get(name), value]
-        node[name] = value
-    tree["output_dir"], tree["overrides"] = str(directory), [*drop_output_overrides(config.overrides), *words]
-    return RunConfig.from_dict(tree)
 
 
 def train_in_chunks(
@@ -207,8 +180,16 @@ def train_in_chunks(
         NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run
         was begun with.
     """
-    render_ground_truth_before_run(config, launcher, lambda text, fraction: events(Preparing(text, fraction)))
-    chunks = _load_chunks(config, events)
+
+    def progress(text: str, fraction: float) -> None:
+        events(Preparing(text, fraction))
+
+    render_ground_truth_before_run(config, launcher, progress)
+    whole = Job.of(config)
+    assert whole.scene.spec.chunks is not None, "the caller asked for chunks"
+    context = make_run_scene_context(config, progress)
+    with attribute_errors(whole.plugins.scene, "chunks"):
+        chunks = whole.scene.spec.chunks(config.to_dict(), context)
     if chunks is None:
         events(Note(f"scene.chunks={config.scene['chunks']}: fitted as one run"))
         return train_in_directory(replace(config, scene={**config.scene, "chunks": None}), events, between=between)
@@ -245,11 +226,9 @@ def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher:
         before, statuses[number] = statuses[number], status
         if status.state == "failed" != before.state:
             events(Note(f"{plan.configs[number].output_dir}: {status.text}"))
-        states = Counter(s.state if s.state in (*ENDED, "waiting") else "at work" for s in statuses)
-        order = ("done", "at work", "waiting", "failed", "interrupted")
-        text = ", ".join(f"{states[state]} {state}" for state in order if states[state])
+        done = sum(s.state == "done" for s in statuses)
         progress = sum(1.0 if s.state in ENDED else s.progress for s in statuses) / count
-        events(Preparing(f"fitting {count} chunks ({text})", progress))
+        events(Preparing(f"fitting {count} chunks ({done} done)", progress))
 
     record, results = launch_missing_runs(record, plan.configs, launcher, on_status)
     for result in results:

@@ -32,7 +32,7 @@ from neuprim.search.size_forecast import (
 )
 from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
 from neuprim.search.trial_runner import VIEWS, TrialRunner
-from neuprim.search.trials import get_trial_setting, override_trial_settings
+from neuprim.search.trials import get_trial_setting
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
 """A full run is good enough within these dB above the target, if at most this factor above the predicted size."""
@@ -80,7 +80,7 @@ def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -
         sizes: dict[SettingValue, int] = {}
         for value in offered:
             with suppress(ConfigError):  # not with the other settings
-                sizes[value] = count_numbers(override_trial_settings(config, {key: value}))
+                sizes[value] = count_numbers(config.override({key: value}))
         if fewer := sorted((value for value in sizes if sizes[value] < whole), key=lambda value: sizes[value]):
             found.append((sizes[fewer[0]], key, (*fewer, now)))
     return {key: values for _, key, values in sorted(found, key=lambda one: one[0])}

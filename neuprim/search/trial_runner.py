@@ -17,7 +17,7 @@ from neuprim.runs.fit import Events, Note, Preparing
 from neuprim.runs.launch.executors import count_parallel_jobs
 from neuprim.search.size_forecast import forecast_time
 from neuprim.search.target_record import Attempt, TargetRecord
-from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, override_trial_settings, run_trial
+from neuprim.search.trials import Outcome, Trial, TrialFailed, launch_trials, run_trial
 
 TARGET_FOLDER = "target"  # folder of the trainings, in the run directory
 VIEWS = 16  # held-out views to evaluate, at most
@@ -78,9 +78,7 @@ class TrialRunner:
             "train.population.every": every,
         }
         folder = self.config.output_dir / TARGET_FOLDER / attempt.folder
-        return replace(
-            override_trial_settings(self.config, values), output_dir=folder, resume=attempt.purpose == "full"
-        )
+        return replace(self.config.override(values), output_dir=folder, resume=attempt.purpose == "full")
 
     def is_finished(self, attempt: Attempt) -> bool:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)

@@ -11,7 +11,6 @@ import json
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import reduce
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -228,16 +227,3 @@ def get_trial_setting(config: RunConfig, key: str) -> Any:
     for part in key.split("."):
         node = node.get(part) if isinstance(node, Mapping) else None
     return node
-
-
-def override_trial_settings(config: RunConfig, values: Mapping[str, Any]) -> RunConfig:
-    """Return the configuration with other settings, and with its record of what is not a default."""
-    tree = config.to_dict()
-    for key, value in values.items():
-        *path, name = key.split(".")
-        group = reduce(lambda node, part: node[part], path, tree)
-        default = tree["non_default"].pop(key, (group.get(name), None))[0]
-        group[name] = value
-        if value != default:
-            tree["non_default"][key] = [default, value]
-    return replace(RunConfig.from_dict(tree), source=config.source)

@@ -15,13 +15,7 @@ from neuprim.core.metrics import metric_from_json
 from neuprim.report import report_page as elements
 from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 from neuprim.report.pictures import color_bar, error_map
-from neuprim.report.report_page import (
-    escape,
-    format_decimal,
-    format_report_count,
-    report_note,
-    section,
-)
+from neuprim.report.report_page import escape, format_decimal, format_report_count, report_note, section
 
 _SLOWEST = 12.0  # multiples of the reference's time beyond which points are off the charts
 _DIFFERENCE = 0.1  # error at the bright end of the colour bar

@@ -150,13 +150,9 @@ def _launch_ground_truth_frames(
     text = f"rendering the ground truth: {total:,} frames"
 
     def on_status(number: int, status: JobStatus) -> None:
-        if status.state == "waiting":
-            note = f"{names[number]}: its worker died; what it had not finished is made again"
-        elif status.text.startswith(WAIT_MESSAGE):
-            note = status.text
-        else:
-            return
-        if note not in noted:
+        died, waits = status.state == "waiting", status.text.startswith(WAIT_MESSAGE)
+        note = f"{names[number]}: its worker died" if died else status.text
+        if (died or waits) and note not in noted:
             noted.add(note)
             events(Note(note))
 

@@ -137,8 +137,10 @@ def _load_run_inspector(name: str) -> Inspector:
     return replace(inspector, name=name, layers=layers)
 
 
-def _output_paths(out: Path, count: int) -> list[Path]:
+def _output_paths(out: Path | None, count: int) -> list[Path]:
     """List the files to write: numbered ones for several frames, or one film or page of all."""
+    if out is None:
+        return []
     suffix = out.suffix.lower()
     if count == 1 or suffix not in (".png", ".vdb"):
         return [out]
@@ -173,8 +175,8 @@ class _RunFrames:
         self.model, self.device, self.world = run.model, computing_device(run.settings), run.world
         self.truth: DensityTruth | None = None
         self.channels = run.channels
-        self.up = request.up or str(run.scene.get("up", "z"))
-        self.up = self.up if self.up in ("x", "y", "z") else "z"
+        up = request.up or run.scene.get("up")
+        self.up = up if up in ("x", "y", "z") else "z"
         self.request, self.name = request, run.directory.resolve().name
         wanted = read_inspected_conditions(run.task.conditions, request.conditions, lambda text: events(Note(text)))
         pairs: list[tuple[Conditions, int]] = [(conditions, -1) for conditions in wanted]
@@ -183,9 +185,14 @@ class _RunFrames:
             events(Note(words))
             pairs = pair_inspected_frames(wanted, self.truth)
         self.pairs = pairs
-        for path in [] if request.out is None else _output_paths(request.out, len(pairs)):
+        for path in _output_paths(request.out, len(pairs)):
             refuse_existing(path, request.overwrite)
-        box = self.world.scene_box(request.box) if request.box is not None else self._default_box()
+        if request.box is not None:
+            box = self.world.scene_box(request.box)
+        elif self.truth is not None:
+            box = np.asarray(self.truth.bounds.numpy())
+        else:
+            box = find_inspection_box(self.model, wanted)
         if request.grid**3 > POINTS_LIMIT:
             raise ConfigError(f"--grid {request.grid}: expected at most {round(POINTS_LIMIT ** (1 / 3))}")
         self.matrix, self.shape = box_lattice(box, request.grid)
@@ -199,11 +206,6 @@ class _RunFrames:
 
     def __len__(self) -> int:
         return len(self.pairs)
-
-    def _default_box(self) -> np.ndarray:
-        if self.truth is not None:
-            return np.asarray(self.truth.bounds.numpy())
-        return find_inspection_box(self.model, [conditions for conditions, _ in self.pairs])
 
     def _compare_frame(self, index: int, events: Events) -> dict[str, float] | None:
         """Return the frame's errors against the truth, on the truth's own points."""

@@ -121,10 +121,9 @@ def measure_views(
         check_pixels("test", view, pixels, dataset.channels)
         truth = pixels.over(background)
         start = time.perf_counter()
-        if render_view is None:
-            rendered = render_image(model, view, settings, background)
-        else:
-            rendered = render_view(model, view, background)
+        rendered = (
+            render_view(model, view, background) if render_view else render_image(model, view, settings, background)
+        )
         seconds = time.perf_counter() - start
         empty = bool((rendered == background).all())
         if pixels.mask is not None:

@@ -242,12 +242,7 @@ def save_run_training(fitted: Fitted) -> None:
 
 
 def make_run_finetune_trainer(
-    job: Job,
-    dataset: Dataset,
-    model: Primitives,
-    steps: int,
-    begin: float = BEGIN,
-    voxels_every: int = VOXELS_EVERY,
+    job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
     """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 

@@ -1,19 +1,210 @@
-"""Which frames a film has: cameras, times and lights together."""
+"""Which frames a film has, and views as layers of one file: linear light that adds up, numbers that are as they were
+drawn, and a header that says what is what."""
 
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
+import numpy as np
+import OpenEXR
 import pytest
 import torch
+from torch import Tensor
 
 from neuprim.core.cameras.pinhole import CameraViews
+from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
+from neuprim.core.io.images import srgb_to_linear
+from neuprim.core.model.fields import Constant
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.layer_frame import LayerSpec
+from neuprim.plugins.returns import ReturnError
+from neuprim.runs.measure import render_light_sum
+from neuprim.runs.render_config import RenderConfig, RunExrLayers
 from neuprim.runs.render_images import _run_views_of_camera_file, _view_file_names, set_run_view_conditions
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
+from neuprim.tasks.relight.colour import LightNetwork
 from tests import scenes
+from tests.lit_models import light
+from tests.lit_models import model as lit
+from tests.pretend_card import CARD, pretended
+from tests.timed_models import model as timed
+
+CAMERA = scenes.camera(20, 16, distance=2.6)
+REFERENCE = RenderSettings(backend="reference")
+BLUE = torch.tensor([0.1, 0.2, 0.7])
+
+
+def volume() -> Primitives:
+    return timed("window", count=16, dtype=torch.float32)
+
+
+VIEW = View("a view", CAMERA, {"time": torch.tensor(0.4)})
+
+
+def layers(space: str = "linear", **changes: Any) -> RunExrLayers:
+    return replace(
+        RunExrLayers(Path("runs/fire"), DYNAMIC, Channels(color_space=space), RenderConfig(), BLUE), **changes
+    )
+
+
+def written(path: Path, how: RunExrLayers, model: Primitives, view: View) -> tuple[dict[str, Tensor], dict[str, Any]]:
+    how.write(path, model, view)
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return {name: torch.from_numpy(np.array(c.pixels)) for name, c in file.channels().items()}, dict(file.header())
+
+
+def rgb(found: dict[str, Tensor], prefix: str = "") -> Tensor:
+    return torch.stack([found[prefix + c] for c in "RGB"], -1)
+
+
+def drawn(model: Primitives, view: View, background: Tensor | None = None) -> Any:
+    with torch.no_grad():
+        return render(model, view.camera, view.conditions, replace(REFERENCE, depth=True), background)
+
+
+def test_every_layer_of_a_volume_is_the_references(tmp_path: Path) -> None:
+    found, _ = written(tmp_path / "a.exr", layers(), volume(), VIEW)
+    expected = drawn(volume(), VIEW)
+    sums = {f"{name}.{c}" for name in ("emission", "absorption") for c in "RGB"}
+    assert set(found) == {*"RGBA", "depth.Z", "density.Y", *sums}
+    assert all(plane.dtype == torch.float32 for plane in found.values())
+    assert (rgb(found) - expected.rgb).abs().max() < 1e-5 and (found["A"] - expected.alpha).abs().max() < 1e-5
+    assert (found["depth.Z"] - expected.depth).abs().max() < 1e-3
+    assert (rgb(found, "emission.") - rgb(found, "absorption.") - rgb(found)).abs().max() < 1e-6
+    assert found["density.Y"].max() > 0.3 and rgb(found).max() > 0.1
+
+
+def test_a_model_in_srgb_values_is_written_as_linear_light(tmp_path: Path) -> None:
+    found, header = written(tmp_path / "a.exr", layers("srgb"), volume(), VIEW)
+    expected = drawn(volume(), VIEW)
+    assert set(found) == {*"RGBA", "depth.Z", "density.Y"}, "sums of sRGB values are no light"
+    alpha = expected.alpha[..., None]
+    assert (rgb(found) - alpha * srgb_to_linear(expected.rgb / alpha.clamp_min(1e-30))).abs().max() < 1e-5
+    assert header["neuprim:colorSpace"] == "linear light, of a model whose colours are sRGB values"
+    assert np.allclose(header["neuprim:background"], srgb_to_linear(BLUE), atol=1e-6)
+    with pytest.raises(ConfigError, match=r"--layers emission: .* sRGB values, which do not add up"):
+        layers("srgb", names="emission")
+
+
+@pytest.mark.parametrize("space", ["linear", "srgb"])
+def test_beauty_without_alpha_lies_over_the_background(tmp_path: Path, space: str) -> None:
+    found, header = written(tmp_path / "a.exr", layers(space, names="beauty,depth"), volume(), VIEW)
+    expected = drawn(volume(), VIEW, BLUE).rgb
+    assert set(found) == {*"RGB", "depth.Z"} and "over the background" in header["neuprim:layer:beauty"]
+    assert (rgb(found) - (expected if space == "linear" else srgb_to_linear(expected))).abs().max() < 1e-5
+
+
+def test_half_is_for_light_and_alpha(tmp_path: Path) -> None:
+    found, _ = written(tmp_path / "a.exr", layers(half=True), volume(), VIEW)
+    assert {name for name, plane in found.items() if plane.dtype == torch.float32} == {"depth.Z", "density.Y"}
+    full, _ = written(tmp_path / "b.exr", layers(), volume(), VIEW)
+    assert all(torch.equal(plane.float(), full[n].to(plane.dtype).float()) for n, plane in found.items())
+
+
+def test_the_header_says_camera_conditions_and_meaning(tmp_path: Path) -> None:
+    _, header = written(tmp_path / "a.exr", layers(), volume(), VIEW)
+    points = torch.tensor([[0.2, -0.1, 0.3]], dtype=torch.float64)
+    row = np.append(points[0].numpy(), 1.0) @ header["worldToNDC"]
+    assert np.abs(row[:2] / row[3] * (20, 16) - CAMERA.project(points)[0][0].numpy()).max() < 1e-4
+    assert header["neuprim:condition:time"] == pytest.approx(0.4) and header["neuprim:near"] == pytest.approx(
+        REFERENCE.near
+    )
+    assert (header["neuprim:run"], header["neuprim:task"], header["neuprim:view"]) == ("fire", "dynamic", "a view")
+    assert header["software"].startswith("neuprim ") and "camera z" in header["neuprim:layer:depth"]
+    assert np.allclose(header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329))
+
+
+def test_lights_apart_add_up_to_the_beauty(tmp_path: Path) -> None:
+    model = lit(LightNetwork(3), torch.float32)
+    lights = [light(*where, strength=s) for *where, s in ((2, -1, 3, 1.0), (-2, 0, 1, 0.5), (0, 2, 2, 2.0))]
+    how = replace(layers(), task=RELIGHT, lights=lights, names="beauty,alpha,unshadowed,lights")
+    found, header = written(tmp_path / "a.exr", how, model, replace(VIEW, conditions={}))
+    apart = [rgb(found, f"light_{i:03d}.") for i in range(3)]
+    assert (sum(apart) - rgb(found)).abs().max() < 1e-5 and min(image.max() for image in apart) > 0.05  # type: ignore[arg-type]
+    for image, one in zip(apart, lights, strict=True):
+        assert (image - drawn(model, replace(VIEW, conditions=one)).rgb).abs().max() < 1e-5
+    assert (
+        np.array_equal(header["neuprim:light_001:light"], np.float32([-2, 0, 1]))
+        and "neuprim:condition:light" not in header
+    )
+    whole = render_light_sum(model, replace(VIEW, conditions={}), lights, RenderSettings(), BLUE)
+    over, _ = written(tmp_path / "b.exr", replace(how, names="beauty"), model, replace(VIEW, conditions={}))
+    assert (rgb(over) - whole).abs().max() < 1e-5
+    with pytest.raises(ConfigError, match="--layers lights: 129 lights; expected at most 128"):
+        replace(how, lights=lights * 43)
+
+
+def test_a_layer_that_the_model_lacks_is_left_out_or_refused_by_name(tmp_path: Path) -> None:
+    model = lit(LightNetwork(3, visibility="none"), torch.float32)
+    how, view = replace(layers(), task=RELIGHT), replace(VIEW, conditions=light())
+    assert set(written(tmp_path / "a.exr", how, model, view)[0]) == {*"RGBA", "depth.Z", "density.Y"}
+    with pytest.raises(ConfigError, match="--layers visibility: this run's model has none"):
+        replace(how, names="visibility").write(tmp_path / "b.exr", model, view)
+    assert not (tmp_path / "b.exr").exists()
+
+
+def test_a_lower_resolution_keeps_means_at_silhouettes(tmp_path: Path) -> None:
+    found, _ = written(tmp_path / "a.exr", layers(point=RenderConfig(resolution=0.5)), volume(), VIEW)
+    assert found["depth.Z"].shape == (16, 20)
+    seen = found["depth.Z"][found["A"] > 0]
+    small = drawn(volume(), replace(VIEW, camera=CAMERA.resized(10, 8))).depth
+    assert seen.min() > small[small > 0].min() - 1e-4, "no mean with the 0 beside it"
+
+
+def test_layers_of_others_in_any_channels(tmp_path: Path) -> None:
+    own = (
+        LayerSpec("twice", "twice the light", lambda f: f.composite(Constant(2 * f.lowered.colour.flat))),
+        LayerSpec("where", "mean position", lambda f: f.drawn.rgb[..., :2], ("X", "Y")),
+    )
+    bands = Channels(("450nm", "550nm", "NIR"), "linear")
+    how = layers(channels=bands, task=replace(DYNAMIC, layers=own))
+    found, header = written(tmp_path / "a.exr", how, volume(), VIEW)
+    others = {*(f"twice.{c}" for c in bands.names), "where.X", "where.Y"}
+    assert set(found) == {*bands.names, "A", "depth.Z", "density.Y", *others}
+    assert (found["twice.NIR"] - 2 * found["NIR"]).abs().max() < 1e-6 and "chromaticities" not in header
+
+
+@pytest.mark.parametrize(
+    ("draw", "message"),
+    [
+        (lambda f: f.drawn.alpha, r"twice: found torch.float32 of shape \(16, 20\); expected .* \(16, 20, 3\)"),
+        (lambda f: f.drawn.rgb / 0, "twice: found .* NaN or infinite values"),
+        (lambda f: 3, "twice: found a int; expected floats"),
+    ],
+)
+def test_wrong_layers_of_others_are_refused(tmp_path: Path, draw: Any, message: str) -> None:
+    task = replace(DYNAMIC, layers=(LayerSpec("twice", "wrong", draw),))
+    with pytest.raises(ReturnError, match=message):
+        layers(task=task).write(tmp_path / "b.exr", volume(), VIEW)
+
+
+@pytest.mark.parametrize("shadows", ["pixel", "volume"])
+def test_a_model_on_a_card_makes_the_same_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shadows: str) -> None:
+    """Nothing is taken from two devices at once."""
+    if shadows == "volume":
+        how, model, view = layers(), volume(), VIEW
+    else:
+        how, model = replace(layers(), task=RELIGHT), lit(LightNetwork(3, visibility=shadows), torch.float32)
+        view = replace(VIEW, conditions=light(1.5, -2.0, 2.0))
+    expected, _ = written(tmp_path / "a.exr", how, model, view)
+    with pretended(monkeypatch):
+        there = model.to(CARD)
+        assert there.device == CARD
+        how.write(tmp_path / "b.exr", there, view)
+    with OpenEXR.File(str(tmp_path / "b.exr"), separate_channels=True) as file:
+        found = {name: torch.from_numpy(np.array(c.pixels)) for name, c in file.channels().items()}
+    assert found.keys() == expected.keys()
+    for name, plane in found.items():
+        assert (plane - expected[name]).abs().max() < 1e-4, name
+
+
+# ---------------------------------------------------------------- frames
 
 BOTH = replace(RELIGHT, conditions=(*DYNAMIC.conditions, *RELIGHT.conditions))
 VIEWS = [View(f"v{i}", scenes.camera(8 + i, 8), {"light_intensity": torch.ones(3)}) for i in range(4)]

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import math
+import os
 import signal
 import subprocess
 import sys
@@ -17,15 +19,19 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from neuprim.config import RunConfig
-from neuprim.core import checkpoint
+from neuprim.cli import main
+from neuprim.config import RunConfig, compose
+from neuprim.core import checkpoint, notices
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.io.files import write_text
 from neuprim.core.notices import NeuprimWarning
-from neuprim.runs.fit import measure_run_curve_point
+from neuprim.runs.fit import measure_run_curve_point, prepare_training, train_to_end
 from neuprim.runs.measure import evaluate_run, measure_views
-from neuprim.runs.open import read_metrics
+from neuprim.runs.open import read_metrics, result_files
 from neuprim.runs.render_images import RenderRequest, render_run
+from neuprim.runs.run import run
+from neuprim.runs.training import add_run_curve_line, cut_run_curve
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.lpips_weights import weights, written
@@ -240,12 +246,6 @@ def test_render_orbit_test_and_file(whole: Path, tmp_path: Path) -> None:
 # ---------------------------------------------------------------- stops
 
 
-def start(overrides: list[str]) -> subprocess.Popen[bytes]:
-    return subprocess.Popen(
-        [sys.executable, "-m", "neuprim", "run", *overrides], stdout=subprocess.PIPE, stderr=subprocess.PIPE
-    )
-
-
 def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) -> None:
     """Until the checkpoint on disk has reached ``step``. Every state of the file that can be seen meanwhile is
     whole."""
@@ -265,7 +265,8 @@ def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) ->
 def test_ctrl_c_leaves_a_checkpoint_that_goes_on(scene: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped"
     overrides = words(scene, out, STEPS, "train.checkpoint_every_seconds=0")
-    process = start(overrides)
+    command = [sys.executable, "-m", "neuprim", "run", *overrides]
+    process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_for_step(process, out, 30)
         process.send_signal(signal.SIGINT)
@@ -281,29 +282,146 @@ def test_ctrl_c_leaves_a_checkpoint_that_goes_on(scene: Path, whole: Path, tmp_p
     assert_same_run(whole, out)
 
 
-def test_resuming_with_other_settings_is_refused(scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    fit(words(scene, out, 10))
-    before = (out / "checkpoint.safetensors").read_bytes()
-    with pytest.raises(ConfigError, match=r"^model\.neurons=5: the run to resume was begun with model\.neurons="):
-        fit([*words(scene, out, 20), "resume=true", "model.neurons=5"])
-    assert (out / "checkpoint.safetensors").read_bytes() == before
+def test_what_cannot_go_on_leaves_an_earlier_run_alone(scene: Path, tmp_path: Path) -> None:
+    """With other settings, without its data, or from a checkpoint of another task."""
+    out = fit(words(scene, tmp_path / "run", 5))
 
+    def refused(error: type[Exception], message: str, *overrides: str) -> None:
+        before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
+        with pytest.raises(error, match=message):
+            fit([*words(scene, out, 10, "resume=true"), *overrides])
+        assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
-def test_bad_data_leaves_an_earlier_run_alone(scene: Path, tmp_path: Path) -> None:
-    out = tmp_path / "run"
-    fit(words(scene, out, 5))
-    before = {p: p.read_bytes() for p in out.rglob("*") if p.is_file()}
-    with pytest.raises(DataError, match="nowhere"):
-        fit([*words(tmp_path / "nowhere", out, 10), "resume=true"])
-    assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
-
-
-def test_a_checkpoint_of_another_task_is_refused(scene: Path, tmp_path: Path) -> None:
-    out = fit(words(scene, tmp_path / "run", 20))
+    refused(ConfigError, r"^model\.neurons=5: the run to resume was begun with model\.neurons=", "model.neurons=5")
+    refused(DataError, "nowhere", f"scene.path={tmp_path / 'nowhere'}")
     header, tensors = checkpoint.read_tensors(out / "checkpoint.safetensors", "checkpoint")
     checkpoint.write_tensors(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
-    before = (out / "checkpoint.safetensors").read_bytes()
-    with pytest.raises(CheckpointError, match=r"checkpoint\.safetensors.*'dynamic'.*'static'"):
-        fit(words(scene, out, 40, "resume=true"))
-    assert (out / "checkpoint.safetensors").read_bytes() == before
+    refused(CheckpointError, r"checkpoint\.safetensors.*'dynamic'.*'static'")
+
+
+# ---------------------------------------------------------------- results
+
+
+class Stop(Exception):
+    pass
+
+
+def test_a_resumed_run_has_no_results_until_its_own(scene: Path, tmp_path: Path) -> None:
+    out = fit(words(scene, tmp_path / "run", 6))
+    (out / "renders" / "mine.png").touch()
+    assert {"metrics.json", "report.html", "orbit.webp", "worst_000.png"} <= {path.name for path in result_files(out)}
+
+    def killed(*_: Any) -> None:
+        raise Stop
+
+    with pytest.raises(Stop):
+        run(compose([f"output_dir={out}", "resume=true", "train.iterations=9"]), between=killed)
+    assert not result_files(out) and (out / "model.safetensors").exists() and (out / "renders" / "mine.png").exists()
+    run(compose([f"output_dir={out}", "resume=true"]))
+    assert read_metrics(out)["iterations"] == 9
+
+
+def test_a_picture_of_the_report_is_replaced_only_where_that_is_said(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = fit(words(scene, tmp_path / "run", 3))
+    film = out / "renders" / "orbit.webp"
+    before = film.read_bytes()
+    words_of_film = ["render", str(out), "--camera", "orbit", "--frames", "2"]
+    over = ["--out", str(out / "renders" / ".." / "renders" / "orbit.webp")]
+    assert main([*words_of_film, *over]) == 2
+    assert "orbit.webp: is a picture of the run's report; --force replaces it, --out PATH" in capsys.readouterr().err
+    assert main([*words_of_film, "--format", "webp"]) == 0 and (out / "frames" / "orbit.webp").exists()
+    assert film.read_bytes() == before
+    assert main([*words_of_film, *over, "--force"]) == 0
+    assert film.read_bytes() != before
+    picture = next(path for path in result_files(out) if path.name.startswith("test_000"))
+    assert main(["render", str(out), "--camera", "orbit", "--frames", "1", "--out", str(picture)]) == 2
+
+
+def test_a_full_disk_costs_a_checkpoint_and_not_the_training(
+    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(notices, "_said", set())
+    failing, save_file = {3, 4}, checkpoint.save_file
+    calls = 0
+
+    def full(*given: Any, **more: Any) -> None:
+        nonlocal calls
+        calls += 1
+        if calls in failing:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        save_file(*given, **more)
+
+    monkeypatch.setattr(checkpoint, "save_file", full)
+    said = ["train.checkpoint_every_seconds=0"]
+    with pytest.warns(
+        NeuprimWarning,
+        match=r"checkpoint\.safetensors: could not write .*No space left.*; training goes on from step 2 to the next",
+    ):
+        out = fit(words(scene, tmp_path / "run", 6, *said))
+    assert read_metrics(out)["iterations"] == 6
+    failing = set(range(10**3))
+    monkeypatch.setattr(notices, "_said", set())
+    calls = 0
+    with (
+        pytest.warns(NeuprimWarning),
+        pytest.raises(CheckpointError, match=r"last/checkpoint\.safetensors: could not write"),
+    ):
+        fit(words(scene, tmp_path / "last", 3, *said))
+
+
+def test_a_full_disk_names_the_file_and_keeps_lines_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    cut_run_curve(tmp_path / "metrics.jsonl", 0)
+    add_run_curve_line(tmp_path / "metrics.jsonl", '{"step": 1}\n')
+    assert (tmp_path / "metrics.jsonl").read_text() == '{"step": 1}\n', "at once"
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left") as refused:
+        write_text(tmp_path / "report.html", "x")
+    assert refused.value.filename == str(tmp_path / "report.html") and not list(tmp_path.glob(".*"))
+
+
+# ---------------------------------------------------------------- in memory
+
+
+@pytest.mark.parametrize(("share", "first"), [(0.5, 20), (1, 40)])
+def test_a_share_of_the_primitives_is_there_at_first_and_all_at_the_end(
+    scene: Path, tmp_path: Path, share: float, first: int
+) -> None:
+    grown = [f"train.population.grow_from={share}", "train.population.every=10", "train.eval_every=0"]
+    fitted = prepare_training(compose(words(scene, tmp_path / "out", 100, *grown)))
+    assert fitted.model.count == first
+    train_to_end(fitted)
+    assert fitted.model.count == 40
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["train.population.grow_from=0"], r"train\.population\.grow_from.*0.*expected a share of model\.primitives"),
+        (
+            ["train.population.grow_from=0.5", "train.population.strategy=fixed"],
+            r"grow_from=0\.5: fixed does not grow that way; expected train",
+        ),
+    ],
+)
+def test_shares_that_cannot_be(scene: Path, tmp_path: Path, more: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        compose(words(scene, tmp_path / "out", 100, *more))
+
+
+def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None:
+    """Its films are of test cameras, whose views nobody has then."""
+    scene = "task=dynamic scene=smoke_fire scene.size=16 scene.timesteps=6 scene.cameras=6 scene.resolution=16"
+    asked = [*scene.split(), "model.primitives=20"]
+    config = compose([*asked, "train.iterations=2", "train.max_seconds=null", f"output_dir={tmp_path / 'out'}"])
+    fitted = train_to_end(prepare_training(config, hold_out=3))
+    metrics = fitted.metrics()
+    assert metrics["split"] == "train, held out" and "per_frame" not in metrics
+    assert len(metrics["per_view"]) == len(fitted.dataset.test) == 8
+    assert not {view["name"] for view in metrics["per_view"]} & {
+        fitted.dataset.train.view(i).name for i in range(len(fitted.dataset.train))
+    }

@@ -14,9 +14,8 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from neuprim.cli.command import Command, Parser
-from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line
+from neuprim.core.errors import ConfigError, NeuprimError, nearest, one_line, warnings_as_lines
 from neuprim.core.io.trust import trusting
-from neuprim.core.notices import warnings_as_lines
 from neuprim.version import __version__
 
 __all__ = ["COMMANDS", "main"]

@@ -12,7 +12,7 @@ from typing import Annotated, Any
 import yaml
 
 from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.io.plain import parse_yaml_file
+from neuprim.core.io.json_reader import parse_yaml_file
 from neuprim.core.render import backends
 from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population

@@ -16,9 +16,8 @@ from neuprim.config.outputs import DEFAULT_TASK, config_output_directory, config
 from neuprim.config.run_config import RunConfig, flatten
 from neuprim.config.setting_checks import CHOICES
 from neuprim.config.task_files import read_task_config
-from neuprim.core.errors import ConfigError, cut_error_text
+from neuprim.core.errors import ConfigError, cut_error_text, warn_once
 from neuprim.core.io.trust import ENVIRONMENT, FLAG, trusted
-from neuprim.core.notices import warn_once
 from neuprim.core.validation import format_setting_value
 from neuprim.plugins.provenance import PluginVersion
 from neuprim.plugins.registry import BUILT_IN, TASKS, split_plugin_name

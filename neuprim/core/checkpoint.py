@@ -20,7 +20,7 @@ from torch import Tensor
 from neuprim.core import compression
 from neuprim.core.errors import CheckpointError, cut_error_text, nearest
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.plain import finite_json_number, load_json
+from neuprim.core.io.json_reader import finite_json_number, load_json
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import dense_primitive_parameters, sparse_primitive_parameters

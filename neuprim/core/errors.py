@@ -1,6 +1,8 @@
-"""Errors a user can act on.
+"""Errors a user can act on, and warnings.
 
-The command line prints these as one line and exits with status 2; anything else is a bug and keeps its traceback.
+The command line prints an error as one line and exits with status 2; anything else is a bug and keeps its traceback.
+A warning does not stop a command; it is one line, said once per process. It is a Python warning, so that notebooks and
+programs can filter it; the command line shows it on standard error.
 """
 
 from __future__ import annotations
@@ -8,7 +10,10 @@ from __future__ import annotations
 import difflib
 import errno
 import sys
-from collections.abc import Iterable
+import warnings
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from typing import Any
 
 DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
@@ -95,3 +100,35 @@ def one_line(error: BaseException) -> str | None:
     if torch is not None and isinstance(error, torch.OutOfMemoryError):
         return _FULL_GPU
     return None
+
+
+class NeuprimWarning(UserWarning):
+    """Something that a user should know and that stops nothing; its text is the whole message."""
+
+
+_said: set[str] = set()
+
+
+def warn_once(text: str) -> None:
+    """Warns, unless this process has done so with the same words."""
+    if text not in _said:
+        _said.add(text)
+        warnings.warn(text, NeuprimWarning, stacklevel=3)
+
+
+@contextmanager
+def warnings_as_lines() -> Iterator[None]:
+    """Inside, our warnings are lines ``neuprim: warning: ...`` on standard error; other packages' stay as they are."""
+    previous = warnings.showwarning
+
+    def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:
+        if issubclass(category, NeuprimWarning):
+            print(f"neuprim: warning: {' '.join(str(message).split())}", file=sys.stderr)
+        else:
+            previous(message, category, *place, **more)
+
+    warnings.showwarning = show
+    try:
+        yield
+    finally:
+        warnings.showwarning = previous

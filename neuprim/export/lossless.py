@@ -27,7 +27,7 @@ import numpy as np
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.json_reader import load_json
 from neuprim.core.io.ply import read_ply, write_ply
 from neuprim.core.task import API_VERSION
 

@@ -13,8 +13,7 @@ from typing import Annotated, Any, TypeVar
 from packaging.utils import canonicalize_name
 from packaging.version import InvalidVersion, Version
 
-from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.notices import warn_once
+from neuprim.core.errors import CheckpointError, ConfigError, warn_once
 from neuprim.core.validation import Accepts, validate_settings
 from neuprim.plugins.registry import (
     BUILT_IN,

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from packaging.utils import canonicalize_name
 
-from neuprim.core.errors import ConfigError, NeuprimError, nearest
-from neuprim.core.notices import warn_once
+from neuprim.core.errors import ConfigError, NeuprimError, nearest, warn_once
 
 if TYPE_CHECKING:  # these modules import torch, which listing does not need
     from neuprim.core.extensions import Exporter, Inspector, LossExtension, SceneExtension

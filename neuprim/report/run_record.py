@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.json_reader import load_json
 
 
 @dataclass(frozen=True)

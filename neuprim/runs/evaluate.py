@@ -12,8 +12,8 @@ from neuprim.core.cameras import Camera
 from neuprim.core.data import Clip, View
 from neuprim.core.errors import CheckpointError, FormError
 from neuprim.core.io import images
-from neuprim.core.io.animation import FrameSpool, write_animation
 from neuprim.core.io.files import write_json
+from neuprim.core.io.images import FrameSpool, write_animation
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.returns import call_task_clips, call_task_orbit

@@ -15,8 +15,8 @@ from torch import Tensor
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.extensions import Inspector
 from neuprim.core.io import images
-from neuprim.core.io.animation import write_animation
 from neuprim.core.io.files import refuse_existing
+from neuprim.core.io.images import write_animation
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.density_grid import POINTS_LIMIT, box_lattice, density_grid

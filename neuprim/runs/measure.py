@@ -27,12 +27,12 @@ from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import check_dataset_views, check_pixels
 from neuprim.core.data.ray_points import GIVE_POINTS
+from neuprim.core.errors import warn_once
 from neuprim.core.io import images
 from neuprim.core.metrics import mean_metrics, metric_to_json, psnr, psnr_gain, ssim, ssim_3dgs
 from neuprim.core.metrics.lpips import Lpips
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.notices import warn_once
 from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_mask, call_task_metrics

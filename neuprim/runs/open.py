@@ -26,7 +26,7 @@ from neuprim.core.data import Dataset, View
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.extensions import TrainedModel
 from neuprim.core.io.files import cache_directory, remove_leftovers
-from neuprim.core.io.plain import finite_json_number, load_json
+from neuprim.core.io.json_reader import finite_json_number, load_json
 from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit

@@ -18,8 +18,8 @@ from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io import images
-from neuprim.core.io.animation import write_animation
 from neuprim.core.io.files import write_npy
+from neuprim.core.io.images import write_animation
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec

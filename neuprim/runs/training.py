@@ -22,11 +22,10 @@ from neuprim.config import Job, RunConfig
 from neuprim.core import checkpoint
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
-from neuprim.core.errors import CheckpointError, RankError
+from neuprim.core.errors import CheckpointError, RankError, warn_once
 from neuprim.core.io.files import write_text
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.json_reader import load_json
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.notices import warn_once
 from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer

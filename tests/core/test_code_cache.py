@@ -8,10 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.core import notices
-from neuprim.core.compute.code_cache import code_cache, folder_weakness
-from neuprim.core.compute.kernels import cache_directory
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core import errors
+from neuprim.core.compute.kernels import cache_directory, code_cache, folder_weakness
+from neuprim.core.errors import NeuprimWarning
 from tests.systems import posix
 
 
@@ -31,7 +30,7 @@ def test_a_folder_that_others_may_write_is_not(tmp_path: Path, mode: int, monkey
     place = tmp_path / "shared"
     place.mkdir()
     place.chmod(mode)
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
     with pytest.warns(NeuprimWarning, match=r"shared: others may write it; compiled code is not taken from there"):
         private = code_cache(place)
     assert private != place and stat.S_IMODE(private.stat().st_mode) == 0o700

@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.operation import apply_kernel_operation
+from neuprim.core.compute.threads import apply_kernel_operation
 
 
 class _Cubed(torch.autograd.Function):

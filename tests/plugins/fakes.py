@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from neuprim.core import notices
+from neuprim.core import errors
 from neuprim.plugins import registry
 
 TOY = """
@@ -95,7 +95,7 @@ def uninstall(root: Path, distribution: str) -> None:
 def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """An empty directory on ``sys.path``; what was imported from it is forgotten afterwards, and no warning was given
     before."""
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
     root = tmp_path / "site"
     root.mkdir()
     monkeypatch.syspath_prepend(str(root))

@@ -14,9 +14,8 @@ import yaml
 import neuprim
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
-from neuprim.core import checkpoint, notices
-from neuprim.core.errors import CheckpointError, ConfigError
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core import checkpoint, errors
+from neuprim.core.errors import CheckpointError, ConfigError, NeuprimWarning
 from neuprim.plugins import provenance
 from neuprim.plugins.new_task import write_plugin_package
 from neuprim.plugins.provenance import PluginVersion, Provenance
@@ -277,9 +276,9 @@ def test_warnings_are_said_once_and_can_be_silenced(site: Path, capsys: pytest.C
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         for text in ("a", "b", "a"):
-            notices.warn_once(text)
+            errors.warn_once(text)
     assert [str(w.message) for w in caught] == ["a", "b"]
-    with pytest.warns(UserWarning, match="a stranger's") as others, notices.warnings_as_lines():
-        notices.warn_once("two\nlines")
+    with pytest.warns(UserWarning, match="a stranger's") as others, errors.warnings_as_lines():
+        errors.warn_once("two\nlines")
         warnings.warn("a stranger's", UserWarning, stacklevel=1)
     assert len(others) == 1 and capsys.readouterr().err == "neuprim: warning: two lines\n"

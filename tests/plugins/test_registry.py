@@ -13,8 +13,7 @@ import pytest
 from neuprim import __version__
 from neuprim.cli import main
 from neuprim.config import Job, RunConfig, compose, compose_all
-from neuprim.core.errors import ConfigError
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core.errors import ConfigError, NeuprimWarning
 from neuprim.plugins.registry import (
     EXPORTERS,
     INSPECTORS,

@@ -21,11 +21,10 @@ from torch import Tensor
 
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
-from neuprim.core import checkpoint, notices
+from neuprim.core import checkpoint, errors
 from neuprim.core.data import Clip, Dataset
-from neuprim.core.errors import CheckpointError, ConfigError, DataError
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimWarning
 from neuprim.core.io.files import write_text
-from neuprim.core.notices import NeuprimWarning
 from neuprim.runs.fit import measure_run_curve_point, prepare_training, train_to_end
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics, result_files
@@ -342,7 +341,7 @@ def test_a_picture_of_the_report_is_replaced_only_where_that_is_said(
 def test_a_full_disk_costs_a_checkpoint_and_not_the_training(
     scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
     failing, save_file = {3, 4}, checkpoint.save_file
     calls = 0
 
@@ -362,7 +361,7 @@ def test_a_full_disk_costs_a_checkpoint_and_not_the_training(
         out = fit(words(scene, tmp_path / "run", 6, *said))
     assert read_metrics(out)["iterations"] == 6
     failing = set(range(10**3))
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
     calls = 0
     with (
         pytest.warns(NeuprimWarning),

@@ -1,7 +1,6 @@
 """Quantized models in ``.neuprim`` files: ``codec`` turns models into sections, ``file`` reads and writes the
 container."""
 
-from neuprim.core.compression.bits import DEFAULT_LEVEL, LEVELS, BitTable, bit_table
 from neuprim.core.compression.codec import (
     Quantizers,
     StoredSize,
@@ -14,6 +13,7 @@ from neuprim.core.compression.codec import (
     storage_order,
 )
 from neuprim.core.compression.file import CONFIG, is_compressed, read_compressed, read_model_header, write_compressed
+from neuprim.core.compression.quantizers import DEFAULT_LEVEL, LEVELS, BitTable, bit_table
 from neuprim.core.compression.sections import TEXT, CompressedSection
 
 __all__ = [

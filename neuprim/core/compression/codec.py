@@ -10,10 +10,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.compression.bits import BitTable
 from neuprim.core.compression.quantizers import (
     MAX_BITS,
     MIN_BITS,
+    BitTable,
     ColumnQuantizer,
     RotationQuantizer,
     columns_of_step,

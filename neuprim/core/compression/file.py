@@ -36,7 +36,7 @@ from neuprim.core.compression.sections import (
 )
 from neuprim.core.errors import CheckpointError
 from neuprim.core.io.files import atomic_path
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.json_reader import load_json
 
 MAGIC = b"\x89NEUPRIM"
 VERSION = 1

@@ -2,15 +2,21 @@
 
 numba's cache notices edits of a kernel's own file, but not of others whose functions it inlined or whose constants it
 froze; and site-packages may be read-only. So code lives in the user's cache folder, under a hash of every source that
-can end up in it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, where set, wins.
+can end up in it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, where set, wins. Whoever may write into such a folder
+or replace it decides what this user's processes execute: it is used only if this user owns it and nobody else may do
+either; otherwise code is kept in a folder of this process alone.
 """
 
 from __future__ import annotations
 
+import atexit
 import functools
 import hashlib
 import os
 import re
+import shutil
+import stat
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -24,7 +30,7 @@ from numba.core.imputils import impl_ret_borrowed
 from numba.extending import intrinsic, overload
 from numba.np.arrayobj import make_array
 
-from neuprim.core.compute.code_cache import code_cache
+from neuprim.core.errors import warn_once
 from neuprim.core.io import files
 from neuprim.version import __version__
 
@@ -257,3 +263,62 @@ borrow_arrays: Any = intrinsic(_borrow_kernel_arrays)
 release_array: Any = intrinsic(_release_kernel_array)
 copy16: Any = intrinsic(_llvm_copy16)
 compress16: Any = intrinsic(_llvm_compress16)
+
+
+def code_cache(folder: Path) -> Path:
+    """The folder, made where it is missing, or a private one with a warning if others may write it."""
+    folder = folder.absolute()
+    try:
+        made = not folder.exists()
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        if made:
+            folder.chmod(0o700)  # whatever the umask is
+        why = folder_weakness(folder)
+    except OSError as error:
+        why = f"cannot be used ({error.strerror or error})"
+    if not why:
+        return folder
+    warn_once(
+        f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. "
+        "Expected a folder of yours alone"
+    )
+    return _private_code_folder()
+
+
+def folder_weakness(folder: Path) -> str:
+    """Return who else may change what a folder holds, in words; empty where nobody may, and on Windows."""
+    if not hasattr(os, "getuid"):
+        return ""
+    own = os.getuid()
+    whole = folder.resolve()
+    for place in (whole, *whole.parents):
+        there = place.stat()
+        if there.st_uid != own and (place == whole or there.st_uid != 0):
+            return f"belongs to user {there.st_uid}" if place == whole else f"{place} belongs to user {there.st_uid}"
+        shared = there.st_mode & stat.S_IWOTH or (
+            there.st_mode & stat.S_IWGRP and not _is_own_cache_group(there.st_gid, own)
+        )
+        if shared and (
+            place == whole or not there.st_mode & stat.S_ISVTX
+        ):  # others' entries of a sticky folder stay where they are
+            return "others may write it" if place == whole else f"others may write {place}"
+    return ""
+
+
+def _is_own_cache_group(number: int, user: int) -> bool:
+    """Whether a group is the user's own, as many systems make one of the same name for each, with nobody else in it."""
+    import grp
+    import pwd
+
+    try:
+        group, entry = grp.getgrgid(number), pwd.getpwuid(user)
+    except KeyError:
+        return False
+    return entry.pw_gid == number and group.gr_name == entry.pw_name and not set(group.gr_mem) - {entry.pw_name}
+
+
+@functools.cache
+def _private_code_folder() -> Path:
+    folder = tempfile.mkdtemp(prefix="neuprim-code-")  # only this user enters it
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    return Path(folder)

@@ -1,4 +1,7 @@
-"""Run a nogil kernel over a range on all cores; chunks never share output, so results do not depend on the threads."""
+"""Run a nogil kernel over a range on all cores, and autograd operations without bookkeeping where nothing needs it.
+
+Chunks never share output, so results do not depend on the threads.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,9 @@ from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
+
+import torch
+from torch import Tensor
 
 _limit: ContextVar[int] = ContextVar("threads", default=0)
 _pools: dict[int, ThreadPoolExecutor] = {}
@@ -98,3 +104,25 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
     for future in futures:
         future.result()
     return results
+
+
+class _ForwardKernelContext:
+    """Takes what a forward pass saves for a backward pass that will not come."""
+
+    def save_for_backward(self, *tensors: Tensor) -> None:
+        pass
+
+    def set_materialize_grads(self, value: bool) -> None:
+        pass
+
+
+def kernel_needs_grad(*arguments: Any) -> bool:
+    """Whether somebody asks for a gradient with respect to one of them."""
+    return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in arguments)
+
+
+def apply_kernel_operation(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
+    """``operation.apply(*arguments)``, or its forward pass alone where no gradient is asked for."""
+    if kernel_needs_grad(*arguments):
+        return operation.apply(*arguments)
+    return operation.forward(_ForwardKernelContext(), *arguments)

@@ -17,7 +17,7 @@ import torch
 import warp as wp  # kernels import it from here, where it is started
 from torch import Tensor
 
-from neuprim.core.compute.code_cache import code_cache
+from neuprim.core.compute.kernels import code_cache
 from neuprim.core.io import files
 
 BLOCK = 256  # threads of a block where a kernel asks for nothing else

@@ -17,10 +17,9 @@ from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.distortion import Distortion, resample_image, undistortion_grid
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.images import ImageInfo, read_image, read_mask_image, srgb_to_linear
 from neuprim.core.model.fields import Conditions
-from neuprim.core.notices import warn_once
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
-from neuprim.core.notices import warn_once
+from neuprim.core.errors import warn_once
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:

@@ -35,10 +35,9 @@ from neuprim.core.data.posed_images import (
     split_every_nth,
     unique_view_names,
 )
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.images import image_info
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.notices import warn_once
 
 _POSES = ("transform_matrix", "R_opt", "T_opt")
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
 from neuprim.core.errors import ConfigError, DataError, NeuprimError
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.json_reader import load_json
 
 if TYPE_CHECKING:
     import numpy as np

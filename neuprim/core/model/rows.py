@@ -11,8 +11,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel, strict
-from neuprim.core.compute.operation import apply_kernel_operation, kernel_needs_grad
-from neuprim.core.compute.threads import parallel_for
+from neuprim.core.compute.threads import apply_kernel_operation, kernel_needs_grad, parallel_for
 
 _FEW = 4096  # below, without a gradient, torch is done before a kernel would have begun with the last tensor
 

@@ -15,11 +15,10 @@ from torch import Tensor
 
 from neuprim.core.cameras.projections import AnyCamera, RayCamera
 from neuprim.core.compute import device as hardware
-from neuprim.core.errors import BackendUnavailable, ConfigError
+from neuprim.core.errors import BackendUnavailable, ConfigError, warn_once
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.forms import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
-from neuprim.core.notices import warn_once
 from neuprim.core.render.draw import Draw
 from neuprim.core.settings import RenderSettings
 

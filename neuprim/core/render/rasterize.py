@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.operation import apply_kernel_operation, kernel_needs_grad
+from neuprim.core.compute.threads import apply_kernel_operation, kernel_needs_grad
 from neuprim.core.model.fields import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth

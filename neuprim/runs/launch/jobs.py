@@ -26,7 +26,7 @@ from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from neuprim.core.errors import ConfigError, one_line
-from neuprim.core.io.plain import load_json
+from neuprim.core.io.json_reader import load_json
 from neuprim.core.validation import validate_settings
 
 if TYPE_CHECKING:

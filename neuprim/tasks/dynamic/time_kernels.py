@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
-from neuprim.core.compute.operation import apply_kernel_operation
+from neuprim.core.compute.threads import apply_kernel_operation
 from neuprim.core.model.edge import edge_weight
 from neuprim.core.model.rows import cosine_gain_backward
 

@@ -48,10 +48,9 @@ from neuprim.core.data.transforms_json import (
     read_image_splits,
     split_named_images,
 )
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.images import ImageInfo, image_info
 from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.notices import warn_once
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import nonempty_text, validate_settings
 from neuprim.scenes.room import RoomSettings, generate_room

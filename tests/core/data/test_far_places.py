@@ -13,8 +13,8 @@ from neuprim.core.cameras.world import World
 from neuprim.core.data import PointCloud, camera_extent
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.scene_frame import choose_dataset_world, dataset_focus_point
+from neuprim.core.errors import NeuprimWarning
 from neuprim.core.io.ply import write_ply
-from neuprim.core.notices import NeuprimWarning
 
 
 def ring(offset: tuple[float, ...], radius: float = 4.0) -> list[Camera]:

@@ -8,15 +8,15 @@ from pathlib import Path
 import pytest
 
 from neuprim.config import Job, compose
-from neuprim.core import notices
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core import errors
+from neuprim.core.errors import NeuprimWarning
 from neuprim.runs.open import load_dataset
 from tests.core import tiny
 
 
 @pytest.mark.parametrize("named", ["../secret.png", "{place}/secret.png", "link.png"])
 def test_one_line_names_the_first_and_their_number(tmp_path: Path, named: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
     folder = tiny.write_blender(tmp_path / "data")
     secret = tmp_path / "secret.png"
     (folder / "train" / "r_0.png").rename(secret)

@@ -10,7 +10,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.errors import DataError
-from neuprim.core.io.animation import FrameSpool, write_animation
+from neuprim.core.io.images import FrameSpool, write_animation
 
 
 @pytest.mark.parametrize("count", [1, 3])

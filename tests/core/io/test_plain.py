@@ -10,8 +10,7 @@ import yaml
 
 from neuprim.core.checkpoint import read_header, write_tensors
 from neuprim.core.errors import CheckpointError, cut_error_text, one_line
-from neuprim.core.io.json_reader import JsonReader
-from neuprim.core.io.plain import finite_json_number, load_json, parse_yaml_file
+from neuprim.core.io.json_reader import JsonReader, finite_json_number, load_json, parse_yaml_file
 
 HUGE = ["1e400", "-1e999", "NaN", "Infinity", "9" * 400, "9" * 100_000, "-" + "1" * 30, str(2**64)]
 

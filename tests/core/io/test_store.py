@@ -15,7 +15,7 @@ import pytest
 
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError
 from neuprim.core.io import store as stores
-from neuprim.core.io.plain import read_npz_arrays
+from neuprim.core.io.json_reader import read_npz_arrays
 from neuprim.core.io.store import Store, open_store
 
 Make = Callable[[], Store]

@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core import checkpoint
-from neuprim.core.compression.bits import LEVELS
 from neuprim.core.compression.codec import canonical_model, fake_quantize, fit_quantizers
+from neuprim.core.compression.quantizers import LEVELS
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render

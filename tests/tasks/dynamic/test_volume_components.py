@@ -56,7 +56,7 @@ def captured(folder: Path, tmp_path: Path, **changes: Any) -> Capture:
 # ---------------------------------------------------------------- optics follow the data
 
 
-@pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
+@pytest.mark.filterwarnings("ignore::neuprim.core.errors.NeuprimWarning")
 @pytest.mark.parametrize(("peak", "times"), [(PEAK, 64), (1.17, 1), (0.8, 1), (90.0, 1 / 64)])
 def test_extinction_is_for_the_peak_of_the_sequence(peak: float, times: float, tmp_path: Path) -> None:
     values = np.repeat(ball((8, 8, 8), 6, peak), 8, 1)
@@ -158,7 +158,7 @@ def test_no_primitive_goes_beyond_the_largest_extinction(files: Path, tmp_path: 
     assert found is not None and float(found.max()) <= largest * (1 + 1e-5) and float(found[:40].min()) > 0.9 * largest
 
 
-@pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
+@pytest.mark.filterwarnings("ignore::neuprim.core.errors.NeuprimWarning")
 def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
     out = run(composed(files, tmp_path / "run", "train.iterations=240", "train.voxels_every=2"))
     report = export_run(out, "vdb", tmp_path / "frames")
@@ -180,7 +180,7 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
     assert header["exact"] is False and len(header["extents"]) == 3
 
 
-@pytest.mark.filterwarnings("ignore::neuprim.core.notices.NeuprimWarning")
+@pytest.mark.filterwarnings("ignore::neuprim.core.errors.NeuprimWarning")
 def test_a_density_that_nothing_taught_is_refused(files: Path, tmp_path: Path) -> None:
     out = run(composed(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"))
     assert open_run(out).model.density.components(open_run(out).model.params) == {}

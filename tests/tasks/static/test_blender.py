@@ -13,9 +13,8 @@ import torch
 from PIL import Image
 
 from neuprim.core.data.image_views import ImageViews
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, NeuprimWarning
 from neuprim.core.io.exr import write_exr
-from neuprim.core.notices import NeuprimWarning
 from neuprim.tasks.static.datasets import load_blender as load
 
 W, H, ANGLE = 48, 36, 0.9

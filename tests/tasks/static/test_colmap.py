@@ -13,7 +13,7 @@ from PIL import Image
 
 from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.colmap import check_binary_colmap_model
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core.errors import NeuprimWarning
 from neuprim.tasks.static.datasets import load_colmap as load
 
 W, H = 64, 50

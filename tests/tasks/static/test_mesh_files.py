@@ -16,9 +16,8 @@ import pytest
 import trimesh
 from PIL import Image
 
-from neuprim.core import notices
-from neuprim.core.errors import DataError
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core import errors
+from neuprim.core.errors import DataError, NeuprimWarning
 from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images
 from neuprim.tasks.static.mesh import gltf as gltf_reader
 from neuprim.tasks.static.mesh import surface as materials
@@ -29,7 +28,7 @@ SMALL: dict[str, Any] = {"size": 16, "train_views": 1, "test_views": 1, "supersa
 
 @pytest.fixture(autouse=True)
 def every_note(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
 
 
 def refusal(path: Path, **settings: Any) -> str:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from neuprim.core import notices
+from neuprim.core import errors
 from neuprim.core.errors import DataError
 from neuprim.scenes.shading import encode_scene_srgb, scene_daylight_radiance
 from neuprim.tasks.static import mesh as generator
@@ -26,7 +26,7 @@ DOWN = [[0.0, 0.0, -1.0]]
 
 @pytest.fixture(autouse=True)
 def every_note(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(notices, "_said", set())
+    monkeypatch.setattr(errors, "_said", set())
 
 
 def parts_of(path: Path) -> list[SurfacePart]:

@@ -15,7 +15,7 @@ from PIL import Image
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data.distortion import RadialDistortion, undistortion_grid
-from neuprim.core.notices import NeuprimWarning
+from neuprim.core.errors import NeuprimWarning
 from neuprim.tasks.static.datasets import load_nerfstudio as load
 
 W, H = 64, 50

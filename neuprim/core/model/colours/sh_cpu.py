@@ -9,8 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute.kernels import exact_kernel, strict
-from neuprim.core.compute.operation import apply_kernel_operation
-from neuprim.core.compute.threads import parallel_for
+from neuprim.core.compute.threads import apply_kernel_operation, parallel_for
 from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
 
 _CHUNK = 8192  # primitives per unit of work: a quarter of a millisecond, beside what waking a thread takes

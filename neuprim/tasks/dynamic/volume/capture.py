@@ -23,12 +23,11 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.compute import device as hardware
 from neuprim.core.data.dataset import DatasetImages
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
-from neuprim.core.notices import warn_once
 from neuprim.core.volumes.density_truth import DensityGridPlacement, GridExtent
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics, build_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium

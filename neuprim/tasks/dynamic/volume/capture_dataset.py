@@ -18,12 +18,11 @@ from torch import Tensor
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.data.dataset import PointSamples, PointSupervision
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io import images
-from neuprim.core.io.plain import read_npz_arrays
+from neuprim.core.io.json_reader import read_npz_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
-from neuprim.core.notices import warn_once
 from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 

@@ -19,11 +19,10 @@ import numpy as np
 import torch
 
 from neuprim.core.data import Dataset, DataSource
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.store import Store, open_store
 from neuprim.core.io.vdb import VdbFrame, list_vdb_files
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.notices import warn_once
 from neuprim.core.task import Chunk, Chunks, SceneContext
 from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fields, validate_settings, validate_value
 from neuprim.core.volumes.density_truth import GridExtent

@@ -12,8 +12,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 
-from neuprim.core.errors import DataError
-from neuprim.core.notices import warn_once
+from neuprim.core.errors import DataError, warn_once
 from neuprim.tasks.static.mesh.gltf_document import (
     DRACO,
     GltfDocument,

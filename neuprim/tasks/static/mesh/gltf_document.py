@@ -12,9 +12,8 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from neuprim.core.errors import DataError
-from neuprim.core.io.plain import load_json
-from neuprim.core.notices import warn_once
+from neuprim.core.errors import DataError, warn_once
+from neuprim.core.io.json_reader import load_json
 from neuprim.tasks.static.mesh.model import MeshFolder
 
 _GLB, _JSON, _BIN = 0x46546C67, 0x4E4F534A, 0x004E4942

@@ -16,8 +16,7 @@ from urllib.parse import unquote
 import numpy as np
 from numpy.typing import NDArray
 
-from neuprim.core.errors import DataError, nearest
-from neuprim.core.notices import warn_once
+from neuprim.core.errors import DataError, nearest, warn_once
 
 SUFFIXES = (".glb", ".gltf", ".obj", ".ply", ".stl")
 _SUFFIX_LIST = ", ".join(SUFFIXES[:-1]) + " or " + SUFFIXES[-1]

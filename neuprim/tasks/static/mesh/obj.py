@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.core.notices import warn_once
 from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
     MAX_PARTS,

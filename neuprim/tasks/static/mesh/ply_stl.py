@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.ply import PlyElement, read_ply_elements
-from neuprim.core.notices import warn_once
 from neuprim.tasks.static.mesh.model import (
     MAX_FACES,
     MAX_PARTS,

@@ -14,10 +14,9 @@ import trimesh
 from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import MAX_PIXELS
 from neuprim.core.io.images import srgb_to_linear
-from neuprim.core.notices import warn_once
 from neuprim.scenes.raycast import LIFT, Engine, Hits, Scene
 from neuprim.scenes.shading import shading_dot
 from neuprim.scenes.shapes import Solid, parse_solid_srgb, solid_corner_normals, uniform_colour

@@ -219,12 +219,6 @@ def test_what_cannot_be_is_said_in_one_line(
     assert capsys.readouterr().err.splitlines()[-1] == f"neuprim: error: {said}"
 
 
-def test_scenes_without_time_have_no_such_setting(capsys: pytest.CaptureFixture[str]) -> None:
-    for scene in (["task=static", "scene=solids"], ["task=dynamic", "scene=multiview", "scene.path=."]):
-        assert main(["run", *scene, "scene.chunks=2", "--cfg"]) == 2
-        assert "scene.chunks: no such setting of scene" in capsys.readouterr().err
-
-
 def test_what_trains_one_model_at_once_says_so(files: Path, tmp_path: Path) -> None:
     config = compose(words(files, tmp_path / "run"))
     with pytest.raises(ConfigError, match=r"scene.chunks=2: this trains one model at once"):

@@ -169,47 +169,47 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(
     assert [f.name for f in tmp_path.iterdir()] == ["cache"]
 
 
-@posix
-@pytest.mark.parametrize("back", [True, False])
-def test_a_shared_folder_that_vanishes(
-    files: Path,
-    tmp_path: Path,
-    alone: dict[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    back: bool,
-) -> None:
-    """Renamed away in the middle of a frame, and back or not."""
-    monkeypatch.setattr(stores, "POLL_INTERVAL", 0.05)
-    monkeypatch.setattr(stores, "MAX_WAIT", 30.0 if back else 0.5)
-    cache, away, genuine = tmp_path / "cache", tmp_path / "away", capture.write_exr
-    gone: list[threading.Timer] = []
+def vanishing(monkeypatch: pytest.MonkeyPatch, cache: Path, away: Path, back: bool) -> None:
+    """The cache is renamed away in the middle of a frame, and back or not."""
+    genuine, gone = capture.write_exr, list[threading.Timer]()
 
     def write(path: Path, *args: Any, **more: Any) -> None:
         if "frame_00003" in str(path) and path.name == "cam_02.exr" and not gone:
             cache.rename(away)
-            gone.append(threading.Timer(0.4, away.rename, (cache,)))
-            if back:
-                gone[0].start()
+            gone.append(threading.Timer(0.4 if back else 1e6, away.rename, (cache,)))
+            gone[0].daemon = True
+            gone[0].start()
         genuine(path, *args, **more)
 
     monkeypatch.setattr(capture, "write_exr", write)
+    monkeypatch.setattr(stores, "POLL_INTERVAL", 0.05)
+    monkeypatch.setattr(stores, "MAX_WAIT", 30.0 if back else 0.5)
+
+
+@posix
+def test_a_shared_folder_that_vanishes_and_comes_back(
+    files: Path, tmp_path: Path, alone: dict[str, str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    vanishing(monkeypatch, tmp_path / "cache", tmp_path / "away", back=True)
     heard: list[Event] = []
-    if back:
-        made(config(files, tmp_path), heard=heard)
-        assert contents(tmp_path) == alone
-    else:
-        assert main(["truth", *words(files, tmp_path)]) == 2
-        place = cache / "volumes" / next((away / "volumes").iterdir()).name
-        line = capsys.readouterr().err.splitlines()[-1]
-        assert line.startswith(
-            f"neuprim: error: {place}: gone for 0 s while it was in use; expected the folder there again"
-        )
-        assert not cache.exists(), "nothing is written in its place"
-        assert sorted(f.name for f in (away / "volumes" / place.name).glob("frame*")) == ["frame_00001", "frame_00002"]
-        return
+    made(config(files, tmp_path), heard=heard)
+    assert contents(tmp_path) == alone
     said = [event.text for event in heard if isinstance(event, Note)]
     assert said and said[0].startswith("waiting for ") and said[0].endswith(", which is gone")
+
+
+@posix
+def test_a_shared_folder_that_vanishes_for_good(
+    files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cache, away = tmp_path / "cache", tmp_path / "away"
+    vanishing(monkeypatch, cache, away, back=False)
+    assert main(["truth", *words(files, tmp_path)]) == 2
+    (place,) = (away / "volumes").iterdir()
+    line = capsys.readouterr().err.splitlines()[-1]
+    gone = f"neuprim: error: {cache / 'volumes' / place.name}: gone for 0 s while it was in use"
+    assert line.startswith(gone) and not cache.exists(), "nothing is written in its place"
+    assert sorted(f.name for f in place.glob("frame*")) == ["frame_00001", "frame_00002"]
 
 
 def test_jobs_get_smaller_towards_the_end() -> None:

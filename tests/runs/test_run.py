@@ -397,21 +397,6 @@ def test_a_share_of_the_primitives_is_there_at_first_and_all_at_the_end(
     assert fitted.model.count == 40
 
 
-@pytest.mark.parametrize(
-    ("more", "message"),
-    [
-        (["train.population.grow_from=0"], r"train\.population\.grow_from.*0.*expected a share of model\.primitives"),
-        (
-            ["train.population.grow_from=0.5", "train.population.strategy=fixed"],
-            r"grow_from=0\.5: fixed does not grow that way; expected train",
-        ),
-    ],
-)
-def test_shares_that_cannot_be(scene: Path, tmp_path: Path, more: list[str], message: str) -> None:
-    with pytest.raises(ConfigError, match=message):
-        compose(words(scene, tmp_path / "out", 100, *more))
-
-
 def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None:
     """Its films are of test cameras, whose views nobody has then."""
     scene = "task=dynamic scene=smoke_fire scene.size=16 scene.timesteps=6 scene.cameras=6 scene.resolution=16"

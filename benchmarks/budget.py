@@ -25,8 +25,7 @@ from pathlib import Path
 
 from shared.arguments import make_parser, require_folders
 from shared.forms import SCENES
-from shared.records import RESULTS, read_trials
-from shared.tables import DOCS, Run, Table, between_markers, spread
+from shared.tables import DOCS, RESULTS, Run, Table, between_markers, read_trials, spread
 from shared.trials import Trial, run_all
 
 from neuprim.report.charts import LARGE, Chart, ChartPoints, write_png_charts

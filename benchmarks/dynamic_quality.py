@@ -30,8 +30,18 @@ from typing import Any
 
 import torch
 from shared.arguments import make_parser
-from shared.records import RESULTS, read_record
-from shared.tables import DOCS, Run, Table, between_markers, format_range, group_runs, make_table, spread_of
+from shared.tables import (
+    DOCS,
+    RESULTS,
+    Run,
+    Table,
+    between_markers,
+    format_range,
+    group_runs,
+    make_table,
+    read_record,
+    spread_of,
+)
 from shared.trials import Trial, run_all
 from torch import Tensor
 

@@ -16,10 +16,8 @@ from typing import Any
 import torch
 from render import make_passes
 from shared.arguments import make_parser
-from shared.records import RESULTS, update_record
-from shared.scenes import lower, random_scene, view
-from shared.tables import PERFORMANCE, Table, between_markers
-from shared.timing import fastest
+from shared.scenes import fastest, lower, random_scene, view
+from shared.tables import PERFORMANCE, RESULTS, Table, between_markers, update_record
 
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.model.edge import EDGES, NORMS

@@ -21,8 +21,7 @@ from typing import Any
 
 from shared.arguments import make_parser, require_folders
 from shared.forms import SCENES
-from shared.records import RESULTS, read_trials
-from shared.tables import DOCS, ROOT, Run, Table, between_markers, make_table
+from shared.tables import DOCS, RESULTS, ROOT, Run, Table, between_markers, make_table, read_trials
 from shared.trials import Trial, measure_paces, run_all
 
 from neuprim.config import compose

@@ -28,8 +28,17 @@ from typing import Any
 
 from shared.arguments import make_parser, require_folders
 from shared.forms import AS_RECORDED, PAPER, SCENES, Form
-from shared.records import RESULTS, read_record
-from shared.tables import DOCS, Run, between_markers, format_range, group_runs, make_table, spread_of
+from shared.tables import (
+    DOCS,
+    RESULTS,
+    Run,
+    between_markers,
+    format_range,
+    group_runs,
+    make_table,
+    read_record,
+    spread_of,
+)
 from shared.trials import Trial, measure_paces, run_all
 
 RECORD = RESULTS / "expressivity.json"

@@ -18,8 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.arguments import make_parser, require_folders
-from shared.records import RESULTS, read_record, update_record
-from shared.tables import DOCS, ROOT, between_markers, make_table
+from shared.tables import DOCS, RESULTS, ROOT, between_markers, make_table, read_record, update_record
 
 from neuprim.config.command_settings import parse_duration_setting
 from neuprim.core.compute.threads import cpu_name

@@ -29,9 +29,8 @@ import torch
 from shared.arguments import make_parser, require_folders
 from shared.forms import SCENES
 from shared.parity import NAMES, measure_parity
-from shared.records import RESULTS, Record, read_record, update_record
 from shared.scenes import lower, random_scene, view
-from shared.tables import DOCS, Columns, Run, between_markers, make_table
+from shared.tables import DOCS, RESULTS, Columns, Record, Run, between_markers, make_table, read_record, update_record
 from shared.trials import Trial, begin
 
 from neuprim.core.cameras import Camera

@@ -30,8 +30,7 @@ from typing import Any
 import warp
 from shared.arguments import make_parser
 from shared.cubins import compile_kernel, read_resources
-from shared.records import RESULTS, read_record
-from shared.tables import DOCS, Table, between_markers, make_table
+from shared.tables import DOCS, RESULTS, Table, between_markers, make_table, read_record
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model.colours import sh_warp

@@ -20,8 +20,18 @@ from pathlib import Path
 from typing import Any
 
 from shared.arguments import make_parser, require_folders
-from shared.records import RESULTS, read_trials
-from shared.tables import DOCS, Run, Table, between_markers, format_range, group_runs, make_table, spread_of
+from shared.tables import (
+    DOCS,
+    RESULTS,
+    Run,
+    Table,
+    between_markers,
+    format_range,
+    group_runs,
+    make_table,
+    read_trials,
+    spread_of,
+)
 from shared.trials import Trial, run_all
 
 RECORD = RESULTS / "photographs.json"

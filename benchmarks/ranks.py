@@ -23,8 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from shared.arguments import make_parser
-from shared.records import RESULTS, Record, read_record, update_record
-from shared.tables import DOCS, between_markers, make_table, spread
+from shared.tables import DOCS, RESULTS, Record, between_markers, make_table, read_record, spread, update_record
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count, cpu_name

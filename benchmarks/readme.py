@@ -11,8 +11,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from shared.records import RESULTS, read_trials
-from shared.tables import README, Run, Table, between_markers, spread
+from shared.tables import README, RESULTS, Run, Table, between_markers, read_trials, spread
 
 
 def psnr_cell(runs: Sequence[Run], key: str, **facts: Any) -> str:

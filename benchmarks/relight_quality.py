@@ -21,8 +21,7 @@ from __future__ import annotations
 from typing import Any
 
 from shared.arguments import make_parser
-from shared.records import RESULTS, read_record
-from shared.tables import DOCS, Run, Table, between_markers, group_runs, spread_of
+from shared.tables import DOCS, RESULTS, Run, Table, between_markers, group_runs, read_record, spread_of
 from shared.trials import Trial, begin, measure_paces, run_all
 
 from neuprim.core.compute.threads import cpu_name

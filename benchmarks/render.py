@@ -25,10 +25,8 @@ import numpy as np
 import torch
 from numba import njit
 from shared.arguments import make_parser
-from shared.records import RESULTS, update_record
-from shared.scenes import lower, random_scene, view
-from shared.tables import PERFORMANCE, ROOT, Table, between_markers, make_table
-from shared.timing import fastest
+from shared.scenes import fastest, lower, random_scene, view
+from shared.tables import PERFORMANCE, RESULTS, ROOT, Table, between_markers, make_table, update_record
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.threads import cpu_name

@@ -20,10 +20,8 @@ from typing import Any
 
 import torch
 from shared.arguments import make_parser
-from shared.records import RESULTS, update_record
-from shared.scenes import lower, random_scene, view
-from shared.tables import DOCS, PERFORMANCE, Run, Table, between_markers, make_table
-from shared.timing import fastest
+from shared.scenes import fastest, lower, random_scene, view
+from shared.tables import DOCS, PERFORMANCE, RESULTS, Run, Table, between_markers, make_table, update_record
 
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.model.primitives import LoweredPrimitives

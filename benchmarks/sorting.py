@@ -1,15 +1,11 @@
-"""What the order of compositing costs and gains: sort=entry and samples=2 against sort=center, and both orders against
-the joint volume.
+"""What sort=entry and samples=2 cost against sort=center.
 
-    python benchmarks/sorting.py [--scene 2000x400] [--run RUN_DIR] [--view 0] [--size 128] [--steps 64] [--rounds 7]
-    [--threads 0] [--record]
+    python benchmarks/sorting.py [--scene 2000x400] [--run RUN_DIR] [--view 0] [--rounds 7] [--threads 0] [--record]
 
 Draws a random scene of overlapping primitives (benchmarks/render.py) and, with --run, the model of a finished run from
-one of its test views. Errors are those of an image ``size`` pixels wide against the marched sum of densities
-(benchmarks/shared/unsorted_volume.py): "order" keeps every primitive's opacity, so that only the order differs; "field"
-is the sum of the densities as they are, clamped at zero, so that it also counts the renderer's clamps and cuts. Times
-are ratios to sort=center at the full size, the fastest of ``rounds``, taken in turns in one process; the backward
-column is the backward pass alone. --record writes the table to benchmarks/results/sorting.json and docs/performance.md.
+one of its test views. Times are ratios to sort=center, the fastest of ``rounds``, taken in turns in one process; the
+backward column is the backward pass alone. --record writes the table to benchmarks/results/sorting.json and
+docs/performance.md.
 """
 
 from __future__ import annotations
@@ -22,11 +18,8 @@ from typing import Any
 
 import torch
 from shared.arguments import make_parser
-from shared.records import RESULTS, update_record
-from shared.scenes import lower, random_scene, view
-from shared.tables import PERFORMANCE, between_markers, make_table
-from shared.timing import fastest
-from shared.unsorted_volume import measure_sorting_errors
+from shared.scenes import fastest, lower, random_scene, view
+from shared.tables import PERFORMANCE, RESULTS, between_markers, make_table, update_record
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
@@ -70,18 +63,12 @@ def measure_times(scene: Scene, settings: RenderSettings, rounds: int) -> dict[s
     return {"forward": fastest(forward, rounds), "backward": fastest(backward, rounds)}
 
 
-def error_cell(key: str) -> Callable[[dict[str, Any]], str]:
-    return lambda row: f"{row[key]['psnr']:.2f} dB, {row[key]['mean_abs']:.5f}" if key in row else ""
-
-
 def main() -> None:
     parser = make_parser(__doc__, "--rounds", "--threads", "--record")
     parser.set_defaults(rounds=7)
     parser.add_argument("--scene", default="2000x400", help="PRIMITIVESxSIZE of the random scene")
     parser.add_argument("--run", type=Path, help="a finished run's directory")
     parser.add_argument("--view", type=int, default=0, help="which of the run's test views")
-    parser.add_argument("--size", type=int, default=128, help="width of the images whose errors are measured")
-    parser.add_argument("--steps", type=int, default=64, help="even divisions per ray, beside the ends of all chords")
     args = parser.parse_args()
     count, size = (int(x) for x in args.scene.split("x"))
     settings = RenderSettings(threads=args.threads)
@@ -90,30 +77,18 @@ def main() -> None:
         scenes |= dict([open_scene(args.run, args.view)])
     rows: list[dict[str, Any]] = []
     for name, scene in scenes.items():
-        lowered, camera, background = scene
-        small = camera.resized(args.size, max(1, round(camera.height * args.size / camera.width)))
-        errors = {
-            key: measure_sorting_errors(lowered, small, settings, background, args.steps, what)
-            for key, what in (("order", "opacity"), ("field", "density"))
-        }
         times = measure_times(scene, settings, args.rounds)
-        for i, (variant, words) in enumerate(VARIANTS.items()):
-            row: dict[str, Any] = {"scene": name, "variant": variant, **{k: v[i] / v[0] for k, v in times.items()}}
-            for key, found in errors.items() if "samples" not in words else ():
-                error = found[words.get("sort", settings.sort)]
-                row[key] = {"psnr": error.psnr, "mean_abs": error.mean_abs}
-            rows.append(row)
+        for i, variant in enumerate(VARIANTS):
+            rows.append({"scene": name, "variant": variant, **{k: v[i] / v[0] for k, v in times.items()}})
     columns = {
         "scene": lambda row: row["scene"],
         "drawn with": lambda row: row["variant"],
-        "order: PSNR, mean abs": error_cell("order"),
-        "field: PSNR, mean abs": error_cell("field"),
         "forward": lambda row: f"{row['forward']:.2f}",
         "backward": lambda row: f"{row['backward']:.2f}",
     }
     table = make_table(columns, rows)
     if args.record:
-        update_record(RESULTS / "sorting.json", size=args.size, steps=args.steps, rows=rows)
+        update_record(RESULTS / "sorting.json", rows=rows)
         between_markers(PERFORMANCE, "sorting", str(table))
 
 

@@ -18,8 +18,7 @@ from typing import Any
 
 from shared.arguments import make_parser
 from shared.forms import Form
-from shared.records import RESULTS, read_record
-from shared.tables import DOCS, between_markers, group_runs, make_table, spread_of
+from shared.tables import DOCS, RESULTS, between_markers, group_runs, make_table, read_record, spread_of
 from shared.trials import Trial, run_all
 
 RECORD = RESULTS / "static_quality.json"

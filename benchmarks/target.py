@@ -30,8 +30,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.arguments import make_parser, require_folders
-from shared.records import RESULTS, read_record, update_record
-from shared.tables import DOCS, Run, Table, between_markers, make_table
+from shared.tables import DOCS, RESULTS, Run, Table, between_markers, make_table, read_record, update_record
 
 from neuprim.config import Job, compose, load_config_task
 from neuprim.config.command_settings import SearchTarget

@@ -32,8 +32,7 @@ from typing import Any
 
 import torch
 from shared.arguments import make_parser
-from shared.records import RESULTS, read_record, update_record
-from shared.tables import DOCS, ROOT, Run, Table, between_markers, make_table
+from shared.tables import DOCS, RESULTS, ROOT, Run, Table, between_markers, make_table, read_record, update_record
 from torch import Tensor
 
 from neuprim.config import compose

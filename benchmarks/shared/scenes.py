@@ -1,8 +1,10 @@
-"""A random scene for renderers, and a camera that sees it."""
+"""A random scene for renderers, a camera that sees it, and times that can be compared."""
 
 from __future__ import annotations
 
 import math
+import time
+from collections.abc import Callable
 
 import torch
 
@@ -47,3 +49,16 @@ def view(size: int, distance: float = 1.7, fov: float = 40.0) -> Camera:
     matrix[:3, :3], matrix[2, 3] = Rx @ Ry, distance
     f = 0.5 * size / math.tan(math.radians(fov) / 2)
     return Camera(matrix, f, f, size / 2, size / 2, size, size)
+
+
+def fastest(pairs: list[Callable[[], None]], rounds: int) -> list[float]:
+    """Fastest of ``rounds`` runs of each, taken in turns so that all meet the same noise; one run each beforehand."""
+    for run in pairs:
+        run()
+    times = [math.inf] * len(pairs)
+    for _ in range(rounds):
+        for i, run in enumerate(pairs):
+            start = time.perf_counter()
+            run()
+            times[i] = min(times[i], time.perf_counter() - start)
+    return times

@@ -1,7 +1,8 @@
-"""Tables of README and docs, put between their markers so that no number is typed by hand."""
+"""Records of measurements in benchmarks/results, and the tables of README and docs that are made from them."""
 
 from __future__ import annotations
 
+import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
@@ -11,9 +12,31 @@ ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
 PERFORMANCE = DOCS / "performance.md"
+RESULTS = ROOT / "benchmarks" / "results"
 
+Record = dict[str, Any]
 Run = Mapping[str, Any]
 Columns = Mapping[str, Callable[[Any], object]]
+
+
+def read_record(path: Path) -> Record:
+    """The content of a record; empty if there is no file."""
+    found: Record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    return found
+
+
+def read_trials(path: Path) -> list[Record]:
+    """The trainings of a record."""
+    found: list[Record] = read_record(path).get("trials", [])
+    return found
+
+
+def update_record(path: Path, **entries: Any) -> Record:
+    """Replace entries of a record, keep the others, and return it."""
+    whole = read_record(path) | entries
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps(whole, indent=1) + "\n")
+    return whole
 
 
 def between_markers(page: Path, name: str, text: str) -> None:

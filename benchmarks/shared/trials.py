@@ -17,7 +17,7 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Events, Fitted, compile_run_kernels, prepare_training, train_to_end
 from neuprim.runs.launch.jobs import JobResult, LaunchJob
 from neuprim.runs.launch.launcher import launch_jobs
-from shared.records import read_trials, update_record
+from shared.tables import read_trials, update_record
 
 _TURN, _DRAWS = 16, 500
 

@@ -34,7 +34,7 @@ def between(page: str, name: str) -> str:
 
 
 def record_of(script: ModuleType) -> Any:
-    return importlib.import_module("shared.records").read_record(script.RECORD)
+    return importlib.import_module("shared.tables").read_record(script.RECORD)
 
 
 def titled(script: ModuleType, tables: dict[str, Any]) -> str:

@@ -1,4 +1,4 @@
-"""cos, sinc and B_p of a phase in turns, and the exponential, as polynomials (benchmarks/fit_polynomials.py).
+"""cos, sinc and B_p of a phase in turns, and the exponential, as polynomials (tools/fit_polynomials.py).
 
 Phases in turns reduce exactly to half a turn: ``r = u - rint(u)``. B_p replaces sinc for a soft edge of exponent p
 (:mod:`neuprim.core.model.edge`). Rates v are turns over half a chord: B_p(2 pi v). There is one polynomial up to half a

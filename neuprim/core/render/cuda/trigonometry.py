@@ -1,7 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """cos and B_p of a phase in turns: polynomials up to half a turn, recursion beyond (:mod:`neuprim.core.model.edge`).
 
-B_p' = -z B_(p+1)/(2p + 3): the backward pass needs one more member. Coefficients: benchmarks/fit_polynomials.py.
+B_p' = -z B_(p+1)/(2p + 3): the backward pass needs one more member. Coefficients: tools/fit_polynomials.py.
 """
 
 from __future__ import annotations

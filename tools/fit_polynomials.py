@@ -1,7 +1,7 @@
 """Fit the even polynomials in turns that the kernels use for cos, sinc, the profiles of soft edges, and their
 derivatives; print float32 errors.
 
-    python benchmarks/fit_polynomials.py
+    python tools/fit_polynomials.py
 
 Lawson-weighted least squares on Chebyshev nodes in z = r^2, |r| up to 1/2 or 3/2 turn: close to minimax, reproducible,
 no tables.

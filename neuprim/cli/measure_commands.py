@@ -219,7 +219,7 @@ BENCH_COMMAND = Command(
 
 _TRADEOFF_USAGE = """\
 neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME]
-                       [--seeds N] [--lpips FILE]"""
+                       [--lpips FILE]"""
 _TRADEOFF_FORMS = """\
 neuprim tradeoff RUN_DIR measures the settings of rendering on a finished run.
 neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
@@ -246,7 +246,6 @@ def _add_tradeoff_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=knobs)
     budget = "about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)"
     parser.add_argument("--budget", metavar="TIME", help=budget)
-    parser.add_argument("--seeds", type=parse_count, metavar="N", help="trainings of every model (default: 1)")
     lpips = "measure LPIPS with these weights of your own, a file or a folder"
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=lpips)
 
@@ -273,8 +272,6 @@ def _render_tradeoff_command(args: argparse.Namespace) -> int:
 
     run_dir = Path(args.run_dir)
     check_run_dir_argument(run_dir)
-    if args.seeds is not None:
-        raise ConfigError("--seeds: of models that are trained (neuprim tradeoff task=NAME ...); a run has one")
     budget = parse_duration_setting(args.budget or "5m", f"--budget {args.budget}")
     request = TradeoffRequest(args.words, budget, args.views, args.repeats, args.knobs, args.lpips)
     folder = run_dir / TRADEOFF_FOLDER
@@ -307,7 +304,7 @@ def _train_tradeoff_command(args: argparse.Namespace) -> int:
     request = TradeoffRequest(words, budget, args.views, args.repeats, args.knobs, args.lpips)
     try:
         with DrawProgress() as progress:
-            folder, record = run_ablation(request, args.seeds or 1, launcher, progress.print_note, progress.show)
+            folder, record = run_ablation(request, launcher, progress.print_note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
     _print_fronts(folder, record, [format_ablation_run_command(point.words) for point in record.points])
@@ -338,7 +335,7 @@ def _build_printed_front_table(title: str, record: TradeoffRecord, numbers: Sequ
 
     trained = bool(record.points[0].run_dir)
     table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
-    names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "exact", "bytes", *(["ms/step"] if trained else [])]
+    names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "bytes", *(["ms/step"] if trained else [])]
     for name in names:
         table.add_column(name, justify="right", no_wrap=True)
     first = "centre" if trained else "ref."
@@ -350,11 +347,10 @@ def _build_printed_front_table(title: str, record: TradeoffRecord, numbers: Sequ
 def _format_printed_point(point: TradeoffPoint) -> tuple[str, ...]:
     q = point.quality
     about = "" if point.spread is None else f" ± {point.spread:.3f}"
-    seeds = "" if point.seed_spread is None else f" ± {point.seed_spread:.2f}"
     times = ("–", "–", "–")
     if point.ms:
         times = (f"{point.ratio:.3f}{about}", f"{point.time:.2f}", f"{1e3 / point.time:.1f}")
-    quality = (f"{q['psnr']:.2f}{seeds}", f"{q['ssim']:.4f}", f"{q['psnr_exact']:.1f}")
+    quality = (f"{q['psnr']:.2f}", f"{q['ssim']:.4f}")
     return (*times, *quality, f"{point.bytes:,}", *([f"{point.ms_per_step:.1f}"] if point.run_dir else []))
 
 

@@ -92,27 +92,27 @@ class _TradeoffPage:
         sized = [i for i, size in enumerate(bytes_of) if self.trained or i == 0 or size < bytes_of[0]]
         dots = [Dot(bytes_of[i], self.quality(i), 0.0, self._mark("size", i), i == 0) for i in sized]
         return [
-            self._time_chart("PSNR against time", "psnr", True),
+            self._time_chart(),
             front_chart("PSNR against size", "bytes of the model file", "PSNR, dB", dots),
         ]
 
-    def _time_chart(self, title: str, quality: str, joined: bool) -> Chart:
+    def _time_chart(self) -> Chart:
         dots = []
         for i, point in enumerate(self.points):
             ratio, spread = float(point.get("time_ratio", math.nan)), float(point.get("time_ratio_spread") or 0.0)
-            dots.append(Dot(ratio, self.quality(i, quality), spread, self._mark("speed", i), i == 0))
+            dots.append(Dot(ratio, self.quality(i), spread, self._mark("speed", i), i == 0))
         axis = f"time of a frame, as a multiple of that of {self.reference}"
-        return front_chart(title, axis, "PSNR, dB", dots, joined=joined, most=math.inf if self.trained else _SLOWEST)
+        most = math.inf if self.trained else _SLOWEST
+        return front_chart("PSNR against time", axis, "PSNR, dB", dots, most=most)
 
     def _mark(self, front: str, number: int) -> str | None:
         return str(self.front[front].index(number) + 1) if number in self.front[front] else None
 
     def charts(self) -> str:
-        charts = [*self.fronts(), self._time_chart("PSNR against the exact image", "psnr_exact", False)]
         text = f"Ringed: {self.reference}. Orange and numbered: the front. Bars: half of the interquartile range."
         if self.trained:
             text += " Trainings with another seed differ by some hundredths to tenths of a decibel."
-        panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in charts], "charts")
+        panels = elements.chart_panels([(f"{escape(chart.title)}, dB", chart) for chart in self.fronts()], "charts")
         return section("Fronts", panels + report_note(text))
 
     def cards(self, front: str, title: str, text: str) -> str:
@@ -150,7 +150,6 @@ class _TradeoffPage:
             "PSNR": lambda i, p: format_decimal(self.quality(i), 3),
             "change": lambda i, p: self.change(i),
             "SSIM": lambda i, p: format_decimal(self.quality(i, "ssim"), 4),
-            "against exact, dB": lambda i, p: format_decimal(self.quality(i, "psnr_exact"), 1),
             "time": lambda i, p: format_decimal(p.get("time_ratio"), 3),
             "±": lambda i, p: format_decimal(p.get("time_ratio_spread"), 3),
             "ms": lambda i, p: format_decimal(p.get("ms_per_frame"), 2),
@@ -180,19 +179,16 @@ class _TradeoffPage:
         return section("Not measured", elements.number_table(("knob", "point", "why"), rows, "")) if rows else ""
 
     def facts(self) -> str:
-        r, same, exact = self.record, self.record["same"], self.record.get("exact", {})
+        r, same = self.record, self.record["same"]
         pairs = [
             ("views", ", ".join(same["views"])),
             ("image size", "×".join(map(str, same["image_size"]))),
-            ("exact images", exact.get("drawn_by")),
             ("backend", r["backend"]),
         ]
-        if not exact.get("float64", True):
-            pairs.append(("exact images against float64, dB", format_decimal(exact["psnr_against_float64"], 0)))
         if self.trained:
             budget = f"{r['budget_seconds']:g} s, of which {r['spent_seconds']:.0f} were used"
             words = " ".join(r["words"]) or "none"
-            pairs += [("overrides of the centre", words), ("budget", budget), ("seeds", r["seeds"])]
+            pairs += [("overrides of the centre", words), ("budget", budget)]
         pairs += [*same["machine"].items(), *same["versions"].items()]
         pairs += [(f"{name} not measured", why) for name, why in r.get("not_measured", {}).items()]
         return section("Where the numbers come from", elements.fact_list(pairs))

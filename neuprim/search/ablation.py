@@ -6,7 +6,6 @@ All models train for the same time. The same request continues an earlier set.
 
 from __future__ import annotations
 
-import math
 import shlex
 import statistics
 import time
@@ -67,8 +66,6 @@ _PACES, _TRAINING = 0.2, 0.5
 _SINGLES, _TIMES, _COMBINED = 0.58, 0.64, 0.88
 """Shares of the rest by which single changes are trained and timed, and combinations trained."""
 
-_EXACT = 0.004  # share of the budget for one model's exact images
-
 _MAX_COMBINATIONS = 12
 
 
@@ -79,7 +76,6 @@ def format_ablation_run_command(overrides: Sequence[str]) -> str:
 
 def run_ablation(
     request: TradeoffRequest,
-    seeds: int = 1,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
@@ -90,13 +86,12 @@ def run_ablation(
 
     Args:
         request: its overrides are those of ``neuprim run``, and ``output_dir`` among them is the folder of the set.
-        seeds: trainings of every model.
         launcher: where models are trained; they are measured here.
 
     Raises:
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
-    models = _compose_ablation_set(request.words, seeds, launcher)
+    models = _compose_ablation_set(request.words, launcher)
     folder, centre, task = models.folder, models.centre, load_config_task(models.centre)
     with use_one_torch_thread_for_run(), use_launcher_threads_for_runs(launcher), ExitStack() as stack:
         stack.enter_context(find_config_plugins(centre).attribute_errors())
@@ -124,19 +119,18 @@ def run_ablation(
 
 @dataclass(frozen=True)
 class _AblationSet:
-    """A set of models: its folder, the centre's overrides and configuration, trainings of each, and where they run."""
+    """A set of models: its folder, the centre's overrides and configuration, and where they are trained."""
 
     folder: Path
     words: list[str]
     centre: RunConfig
-    seeds: int
     launcher: LauncherSettings
 
     def identity(self) -> dict[str, Any]:
         """Return what must be equal to continue a set; JSON-able."""
         own = (*NOT_TRAINED_WITH, "made_by")
         settings = {name: value for name, value in self.centre.to_dict().items() if name not in own}
-        return {"centre": settings, "seeds": self.seeds}
+        return {"centre": settings}
 
 
 class _AblationSession(TradeoffSession):
@@ -152,7 +146,7 @@ class _AblationSession(TradeoffSession):
         plan: AblationPlan | None,
     ) -> None:
         super().__init__(models.folder, request, record, progress)
-        self.words, self.centre, self.seeds, self.launcher = models.words, models.centre, models.seeds, models.launcher
+        self.words, self.centre, self.launcher = models.words, models.centre, models.launcher
         self._loaded, self._plan, self._planned_at, self._compiling = loaded, plan, 0.0, 0.0
         spent = record.facts.get("spent_seconds", 0.0)
         self.begun -= float(spent) if isinstance(spent, int | float) else 0.0
@@ -188,7 +182,6 @@ class _AblationSession(TradeoffSession):
             **describe_tradeoff_setup(self.point_setup(0)[0]),
             "preset": self.centre.preset,
             "words": list(self.words),
-            "seeds": self.seeds,
             "budget_seconds": self.request.budget,
             "length": self.plan.describe(),
         }
@@ -214,7 +207,7 @@ class _AblationSession(TradeoffSession):
             else:
                 self.record.leave_out(variant.knob, variant.label, reason)
         if self._plan is None:
-            lengths = [variant.length for variant in kept for _ in range(self.seeds)]
+            lengths = [variant.length for variant in kept]
             seconds = _TRAINING * (self.request.budget - self.spent) * self._workers
             self._plan = plan_training_lengths(self.centre, self._step_times.seconds, seconds, lengths)
         self._plan.paces.update(paces)
@@ -248,14 +241,11 @@ class _AblationSession(TradeoffSession):
         """Train and measure what is missing and fits; the centre and begun trainings always do."""
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
-        seeds = self.seeds
-        several = max(self._workers // seeds, 1)
-        for first in range(0, len(todo), several):
+        for first in range(0, len(todo), self._workers):
             batch: list[Variant] = []
-            for variant in todo[first : first + several]:
-                begun = (self._run_dir(variant, 0) / "checkpoint.safetensors").exists()
-                rounds = math.ceil((len(batch) + 1) * seeds / self._workers)
-                if not begun and variant.name != CENTRE and rounds * self.plan.seconds > self.seconds_left(part):
+            for variant in todo[first : first + self._workers]:
+                begun = (self._run_dir(variant) / "checkpoint.safetensors").exists()
+                if not begun and variant.name != CENTRE and self.plan.seconds > self.seconds_left(part):
                     self.record.leave_out(variant.knob, variant.label, self.no_time)
                     continue
                 self.record.left_out = [one for one in self.record.left_out if one.words != variant.label]
@@ -263,28 +253,25 @@ class _AblationSession(TradeoffSession):
             if not batch:
                 continue
             text = f"training {first + 1} of {len(todo)}, {', '.join(variant.name for variant in batch)}"
-            trials = [self._trial(variant, seed) for variant in batch for seed in range(seeds)]
+            trials = [self._trial(variant) for variant in batch]
             show = lambda fraction, text=text: self.progress(text, fraction)  # noqa: E731
             results = launch_trials(trials, self.launcher, self.folder, show)
-            for i, variant in enumerate(batch):
-                own = results[i * seeds : (i + 1) * seeds]
-                failed = next((result for result in own if result.state == "failed"), None)
-                if failed is None:
-                    self._measure_model(variant, [result.value for result in own])
+            for variant, result in zip(batch, results, strict=True):
+                if result.state != "failed":
+                    self._measure_model(variant, result.value)
                 elif variant.name == CENTRE:
-                    raise TrialFailed(failed.line)
+                    raise TrialFailed(result.line)
                 else:
-                    self.record.leave_out(variant.knob, variant.label, failed.line)
+                    self.record.leave_out(variant.knob, variant.label, result.line)
 
-    def _trial(self, variant: Variant, seed: int) -> Trial:
+    def _trial(self, variant: Variant) -> Trial:
         words = self.plan.overrides(variant, self.words, self.centre)
         quiet = [] if any(a.key == "train.eval_every" for a in parse_overrides(words)) else ["train.eval_every=0"]
-        place = quote_override("output_dir", str(self._run_dir(variant, seed)))
-        own = [*quiet, quote_override("seed", self.centre.seed + seed), place]
+        own = [*quiet, quote_override("output_dir", str(self._run_dir(variant)))]
         return Trial(compose(merge_variant_overrides(words, own), check_output=False), views=self.request.views)
 
-    def _run_dir(self, variant: Variant, seed: int) -> Path:
-        return self.folder / TRIALS / (variant.folder + (f"_seed-{self.centre.seed + seed}" if seed else ""))
+    def _run_dir(self, variant: Variant) -> Path:
+        return self.folder / TRIALS / variant.folder
 
     # ------------------------------------------------------------ measuring
 
@@ -298,22 +285,20 @@ class _AblationSession(TradeoffSession):
         setup = self._setup(self.record.points[number].run_dir)
         return setup, setup.reference
 
-    def _measure_model(self, variant: Variant, outcomes: Sequence[Outcome]) -> None:
-        first, run_dir = outcomes[0], self._run_dir(variant, 0).relative_to(self.folder).as_posix()
+    def _measure_model(self, variant: Variant, outcome: Outcome) -> None:
+        run_dir = self._run_dir(variant).relative_to(self.folder).as_posix()
         setup = self._setup(run_dir)
-        point = measure_point(setup, variant.knob, setup.reference, self.render_exact(setup, _EXACT))
-        means = {name: statistics.fmean(getattr(one, name) for one in outcomes) for name in ("psnr", "ssim")}
+        point = measure_point(setup, variant.knob, setup.reference)
         trained = replace(
             point,
             words=tuple(self.plan.overrides(variant, self.words, self.centre)),
-            quality={**point.quality, **means},
+            quality={**point.quality, "psnr": outcome.psnr, "ssim": outcome.ssim},
             turned=variant.turned,
             length=variant.length,
-            primitives=first.primitives,
-            parameters_per_primitive=first.parameters_per_primitive,
-            steps=first.steps,
-            seconds=first.seconds,
-            seeds=tuple(one.psnr for one in outcomes),
+            primitives=outcome.primitives,
+            parameters_per_primitive=outcome.parameters_per_primitive,
+            steps=outcome.steps,
+            seconds=outcome.seconds,
             run_dir=run_dir,
         )
         self.record.points.append(trained)
@@ -328,7 +313,7 @@ class _AblationSession(TradeoffSession):
         """Return combinations of earlier sessions, and as many new ones as there is time for."""
         points = self.record.points
         allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
-        rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds * self.seeds, 1e-9)
+        rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds, 1e-9)
         most = min(int(self._workers * rounds), _MAX_COMBINATIONS - len(allowed))
         for variant in (Variant(COMBINED, way) for way in combine_ablation_changes(points, most)):
             reason = self._find_pace(variant, self.plan.paces)
@@ -342,7 +327,7 @@ class _AblationSession(TradeoffSession):
 # ---------------------------------------------------------------- the folder
 
 
-def _compose_ablation_set(overrides: Sequence[str], seeds: int, launcher: LauncherSettings) -> _AblationSet:
+def _compose_ablation_set(overrides: Sequence[str], launcher: LauncherSettings) -> _AblationSet:
     typed = parse_overrides(overrides)
     words = [a.text for a in typed if a.key not in ("output_dir", "resume", "budget")]
     places = [a.value for a in typed if a.key == "output_dir" and a.value is not None]
@@ -350,7 +335,7 @@ def _compose_ablation_set(overrides: Sequence[str], seeds: int, launcher: Launch
     folder = Path(str(places[-1])).expanduser() if places else ROOT / f"tradeoff-{centre.task}-{centre.scene_name}"
     if folder.exists() and not folder.is_dir():
         raise ConfigError(f"output_dir={folder}: is a file; expected a directory")
-    return _AblationSet(folder, words, centre, seeds, launcher)
+    return _AblationSet(folder, words, centre, launcher)
 
 
 def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) -> None:
@@ -373,7 +358,7 @@ def _resume_ablation_set(
     record = TradeoffRecord(dict(identity))
     if before is None:
         return record
-    record.facts = {name: before.facts[name] for name in ("spent_seconds", "exact") if name in before.facts}
+    record.facts = {"spent_seconds": before.facts.get("spent_seconds", 0.0)}
     if changed := before.changes(identity):
         what = " and ".join(changed)
         tell(f"{folder / TRADEOFF_FILE}: measured with another {what}; models are kept, and measured anew")

@@ -1,33 +1,55 @@
-"""Write a run's model as a quantized file, ``neuprim compress``, and measure what that costs."""
+"""Write a run's model as a quantized file, ``neuprim compress``: the coarsest quantization that images allow."""
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import NamedTuple
 
-from neuprim.config import Job
+from neuprim.config import Job, RunConfig
 from neuprim.core.checkpoint import load_model_checkpoint, read_header_extra, save_compressed
-from neuprim.core.compression import DEFAULT_LEVEL, BitTable, Quantizers, bit_table
+from neuprim.core.compression import (
+    DEFAULT_LEVEL,
+    BitTable,
+    Quantizers,
+    bit_table,
+    canonical_model,
+    fake_quantize,
+    fit_quantizers,
+    fit_quantizers_to_error,
+)
+from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.task import TaskSpec
+from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, load_run
-from neuprim.runs.training import count_run_finetune_steps
-from neuprim.search.quantized_finetune import (
-    Progress,
-    QuantizedModel,
-    TrainingData,
-    finetune_for_table,
-    search_fewest_bits,
-)
+from neuprim.runs.training import count_run_finetune_steps, make_run_finetune_trainer
+from neuprim.search.model_quality import SearchQuality
+from neuprim.search.pruning_cuts import mask_pruned_numbers
+
+Progress = Callable[[str, float], None]
 
 DEFAULT_TOLERANCE = 0.1  # dB that training views may lose
+
+_SENSITIVITY_VIEWS = 48  # training views for the effects of numbers; sums over all primitives need few
+_FIRST_LOSS = 2.0  # tolerances that a model may lose at once before training, to begin with
+_ROUND_STEPS, _MAX_ROUNDS = 500, 3  # least steps of a round, and most rounds; each shows how much training recovers
+
+_SLOPE, _AIM = 0.7, 0.95
+"""dB that a trained model loses for one more dB at once; share of the tolerance that the next round aims at."""
+
+_MAX_TRIES = 16
+
+_FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the model's squared error
 
 
 @dataclass(frozen=True)
@@ -163,3 +185,153 @@ def _search_quantized_model(
         return finetune_for_table(data, model, table, steps, progress)
     tolerance = DEFAULT_TOLERANCE if request.tolerance is None else request.tolerance
     return search_fewest_bits(data, model, tolerance, steps, progress)
+
+
+# ---------------------------------------------------------------- quantization
+
+
+class TrainingData(NamedTuple):
+    """What fine-tuning trains with."""
+
+    config: RunConfig
+    task: TaskSpec
+    dataset: Dataset
+
+
+class QuantizedModel(NamedTuple):
+    """A canonical model, its quantizers, the steps that it was trained for, and notes for the user."""
+
+    model: Primitives
+    quantizers: Quantizers
+    steps: int
+    notes: tuple[str, ...] = ()
+
+
+def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
+    """Return a canonical model as a file would hold it."""
+    params = {name: value.detach() for name, value in fake_quantize(model.params, quantizers).items()}
+    return Primitives(model.density, model.colour, params)
+
+
+class QuantizationSearch:
+    """Quantize by one number: the squared error that rounding may add, as a share of the model's own."""
+
+    def __init__(self, model: Primitives, dataset: Dataset, quality: SearchQuality) -> None:
+        self.model = canonical_model(model)
+        effects = sensitivity(self.model, dataset, quality.others[:_SENSITIVITY_VIEWS], quality.settings)
+        if quality.draws:
+            inside = inner_sensitivity(self.model, quality.draws, threads=quality.settings.threads)
+            effects = effects.combine(inside, quality.inside_weight(self.model))
+        columns = sum(spec.size for spec in self.model.specs)
+        self._effects = effects.columns
+        self._error = 10 ** (-quality.image_quality(self.model) / 10) / max(columns, 1)
+
+    def with_model(self, trained: Primitives) -> QuantizationSearch:
+        """Return the same search for the model after training."""
+        other = copy(self)
+        other.model = trained
+        return other
+
+    def fit(self, share: float) -> Quantizers:
+        return fit_quantizers_to_error(self.model, self._effects, share * self._error)
+
+    def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
+        """Return the coarsest accepted quantizers, or the finest possible, and their share of the error."""
+        fine, _ = self._bisect(accept, start)
+        return self.fit(fine), fine
+
+    def find_finest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
+        """Return the finest accepted quantizers, or the coarsest possible, and their share of the error."""
+        _, coarse = self._bisect(lambda quantizers: not accept(quantizers), start)
+        return self.fit(coarse), coarse
+
+    def _bisect(self, is_fine: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
+        """Return two close shares, of which the first is fine enough and the second is not; or both limits."""
+        fine, coarse, share = 0.0, 0.0, start
+        for _ in range(_MAX_TRIES):
+            if is_fine(self.fit(share)):
+                fine = share
+            else:
+                coarse = share
+            if coarse == _FINEST or fine == _COARSEST or (fine and coarse and coarse < 1.08 * fine):
+                break
+            if fine and coarse:
+                share = math.sqrt(fine * coarse)
+            else:
+                share = min(2.0 * fine, _COARSEST) if fine else max(share / 2.0, _FINEST)
+        return fine or _FINEST, coarse or _COARSEST
+
+
+def finetune_for_table(
+    data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
+) -> QuantizedModel:
+    """Train a model for the bits of a table; returns it untrained where training views are better so."""
+    whole = canonical_model(model)
+    quantizers, quality = fit_quantizers(whole, table), SearchQuality.of_run(data.config, data.dataset)
+    before = quality(dequantize(whole, quantizers))
+    progress("training for few bits", 0.0)
+    trained = _finetune(data, whole, quantizers, steps)
+    after = quality(dequantize(trained, quantizers))
+    if after > before:
+        return QuantizedModel(trained, quantizers, steps)
+    note = (
+        f"{steps:,} steps for few bits brought nothing ({after - before:+.3f} dB on training views); stored untrained"
+    )
+    return QuantizedModel(whole, quantizers, steps, (note,))
+
+
+def search_fewest_bits(
+    data: TrainingData, model: Primitives, tolerance: float, steps: int, progress: Progress
+) -> QuantizedModel:
+    """Return the model in the fewest bits with which training views lose at most ``tolerance`` dB, trained for them.
+
+    Args:
+        steps: of training; 0 for none.
+    """
+    quality = SearchQuality.of_run(data.config, data.dataset)
+    base = quality(model)
+    progress("measuring the effect of numbers", 0.0)
+    untrained = QuantizationSearch(model, data.dataset, quality)
+    search, at_once = untrained, _FIRST_LOSS * tolerance
+    best: tuple[Primitives, Quantizers, float] | None = None
+    rounds = min(max(steps // _ROUND_STEPS, 1), _MAX_ROUNDS) if steps else 0
+    for number in range(rounds):
+        share = _tolerated_error_share(at_once)
+        quantizers = search.fit(share)
+        own = steps * (number + 1) // rounds - steps * number // rounds
+        progress("training for few bits", number / rounds)
+        search = search.with_model(_finetune(data, search.model, quantizers, own))
+        lost = base - quality(dequantize(search.model, quantizers))
+        if lost <= tolerance and (best is None or share > best[2]):
+            best = search.model, quantizers, share
+        at_once = max(at_once + (_AIM * tolerance - lost) / _SLOPE, 0.25 * at_once)
+    if best is None:  # of the trained and the untrained model the one that can be stored more coarsely
+        progress("looking for the coarsest numbers", 1.0)
+        for one in [untrained, search] if rounds else [untrained]:
+
+            def accept(quantizers: Quantizers, model: Primitives = one.model) -> bool:
+                return base - quality(dequantize(model, quantizers)) <= tolerance
+
+            found = one.model, *one.find_coarsest(accept, _tolerated_error_share(tolerance))
+            best = found if best is None or found[2] > best[2] else best
+    assert best is not None
+    whole, quantizers, share = best
+    note = f"rounding may add {share:.1%} to the squared error; the last bit of every number is worth the same"
+    return QuantizedModel(whole, quantizers, steps, (note,))
+
+
+def _tolerated_error_share(decibels: float) -> float:
+    """Return the added share of the squared error that loses so many dB."""
+    return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
+
+
+def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
+    """Train a canonical model, rendering every image from quantized numbers."""
+    trainer = make_run_finetune_trainer(Job(data.config, data.task), data.dataset, model, steps)
+    trainer.zero_masks = mask_pruned_numbers(trainer.model)
+    on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}
+    trainer.fake_quantize = lambda params: fake_quantize(params, on_device)
+    for _ in range(steps):
+        trainer.train_step()
+    params = {name: value.detach().cpu() for name, value in trainer.model.params.items()}
+    return Primitives(model.density, model.colour, params)

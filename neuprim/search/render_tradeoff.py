@@ -10,7 +10,7 @@ import math
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, replace
-from functools import cached_property, partial
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +21,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.runs.fit import use_one_torch_thread_for_run
 from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
-from neuprim.search.pareto import ParetoStep, combine_pareto_steps
 from neuprim.search.tradeoff_measuring import (
-    ExactTradeoffImages,
     Progress,
     Tell,
     TradeoffRequest,
@@ -40,14 +38,15 @@ from neuprim.search.tradeoff_record import (
     REFERENCE,
     TRADEOFF_FILE,
     TRADEOFF_FOLDER,
+    ParetoStep,
     TradeoffPoint,
     TradeoffRecord,
+    combine_pareto_steps,
     read_tradeoff_record,
 )
 
-_EXACT, _IMAGES, _TIMES, _COMBINED = 0.2, 0.45, 0.65, 0.85
-"""Shares of the budget by which exact images, images and times of single changes, and combinations should be done."""
-
+_IMAGES, _TIMES, _COMBINED = 0.45, 0.65, 0.85
+"""Shares of the budget by which images and times of single changes, and combinations should be done."""
 
 _COMBINATIONS = 24
 
@@ -137,12 +136,6 @@ class _RenderTradeoffSession(TradeoffSession):
     def point_setup(self, number: int) -> tuple[TradeoffSetup, RenderConfig]:
         return self.setup, self.setup.parse(self.record.points[number].words)
 
-    @cached_property
-    def exact(self) -> ExactTradeoffImages:
-        """Exact images, rendered when the first point needs them."""
-        self.progress("exact images", 0.0)
-        return self.render_exact(self.setup, _EXACT)
-
     def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
         """Yield what can be drawn here and differs; the record says what is left out."""
         base = self.setup.backend(self.setup.reference).name
@@ -165,7 +158,7 @@ class _RenderTradeoffSession(TradeoffSession):
                 continue
             self.progress(f"images of point {number + 1} of {len(wanted)}", number / len(wanted))
             try:
-                points.append(measure_point(self.setup, knob, config, self.exact))
+                points.append(measure_point(self.setup, knob, config))
             except ConfigError as error:  # a format that does not hold the model's values
                 self.record.leave_out(knob, words, str(error))
             self.write_record()

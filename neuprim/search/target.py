@@ -33,9 +33,9 @@ from neuprim.runs.launch.launcher import use_launcher_threads_for_runs
 from neuprim.runs.measure import measure_quality
 from neuprim.runs.open import COMPRESSED, load_dataset, lock_run_directory, move_to_render_device
 from neuprim.runs.training import train_in_directory
+from neuprim.search.compress import QuantizationSearch, dequantize
 from neuprim.search.model_quality import SearchQuality, choose_trial_views, measure_trial_views
 from neuprim.search.pruning import PruneRequest, prune_run
-from neuprim.search.quantized_finetune import QuantizationSearch, dequantize
 from neuprim.search.size_forecast import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
 from neuprim.search.size_search import SizeSearch
 from neuprim.search.target_record import TARGET_FILE, Attempt, TargetRecord, read_target_record

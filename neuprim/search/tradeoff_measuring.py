@@ -1,8 +1,7 @@
-"""Measure the points of a trade-off: images against ground truth and exact images, file size, frame times in rounds."""
+"""Measure the points of a trade-off: images against ground truth, file size, frame times in rounds."""
 
 from __future__ import annotations
 
-import math
 import platform
 import statistics
 import time
@@ -35,8 +34,6 @@ from neuprim.version import __version__
 _MAX_CACHED = 1 << 29  # bytes of prepared models that are kept between rounds
 _PER_REFERENCE = 6  # points per drawing of the reference in a round
 _WARM_UP_SIZE = 16  # pixels of the side of a first image, so that compiling and loading are no part of a frame's time
-_MAX_PSNR = 400.0  # dB of exact images that equal those in float64, as JSON has no infinity
-_CHECK_SIZE = 48  # pixels of the longer side of the image that checks exact images against float64
 
 Renderer = Callable[[View], Tensor]
 Progress = Callable[[str, float], None]  # text, fraction 0..1 of what it names
@@ -164,87 +161,23 @@ def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
     }
 
 
-# ---------------------------------------------------------------- exact images
-
-
-class ExactTradeoffImages(NamedTuple):
-    """Images without any cut-off.
-
-    Attributes:
-        images: (H, W, C) float64, one per view.
-        float64: whether the reference backend drew them in float64. Otherwise the reference configuration's backend
-            did in float32, and ``error`` is its PSNR against float64 on an image of ``checked`` pixels.
-    """
-
-    images: list[Tensor]
-    float64: bool
-    error: float | None
-    checked: tuple[int, int]
-
-    def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able facts."""
-        return {
-            "drawn_by": "reference backend, float64" if self.float64 else "nothing cut, float32",
-            "float64": self.float64,
-            "psnr_against_float64": self.error,
-            "checked_size": list(self.checked),
-        }
-
-
-def render_exact_for_tradeoff(setup: TradeoffSetup, allowed: float, float64: bool | None = None) -> ExactTradeoffImages:
-    """Render exact images of all views: by the float64 reference backend if ``allowed`` seconds suffice, else uncut.
-
-    Opacity clamp, order and samples per pixel are the reference configuration's: they define the image.
-
-    Args:
-        float64: whether to use the reference backend, where that is decided already.
-    """
-    settings = replace(setup.reference.settings, alpha_min=0.0, transmittance_min=0.0)
-    oracle = RenderConfig(replace(settings, backend=backends.REFERENCE, device="auto"))
-    model, view, background = setup.model, setup.views[0].view, setup.dataset.background.double()
-    params = {name: value.detach().double() for name, value in model.params.items()}
-    double = Primitives(model.density, model.colour, params)
-    width, height = view.camera.width, view.camera.height
-    scale = min(1.0, _CHECK_SIZE / max(width, height))
-    size = (max(1, round(scale * width)), max(1, round(scale * height)))
-    small = replace(view, camera=view.camera.resized(*size))
-    start = time.perf_counter()
-    check = oracle.render_view(double, small, background)
-    pixels = sum(v.view.camera.width * v.view.camera.height for v in setup.views) / len(setup.views)
-    expected = (time.perf_counter() - start) * pixels / (size[0] * size[1])
-    if float64 or (float64 is None and expected * len(setup.views) <= allowed):
-        images = [oracle.render_view(double, v.view, background) for v in setup.views]
-        return ExactTradeoffImages(images, True, None, size)
-    draw = setup.renderer(RenderConfig(settings))
-    images = [draw(v.view).double() for v in setup.views]
-    return ExactTradeoffImages(images, False, min(psnr(draw(small).double(), check), _MAX_PSNR), size)
-
-
 # ---------------------------------------------------------------- one point
 
 
-def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig, exact: ExactTradeoffImages) -> TradeoffPoint:
-    """Measure images and size of a configuration.
-
-    Numbers are means over views. ``psnr_exact`` is that of the mean squared error over all views, and at most the
-    accuracy of the exact images themselves.
-    """
+def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> TradeoffPoint:
+    """Measure images, means over views, and size of a configuration."""
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
-    for view, ideal in zip(setup.views, exact.images, strict=True):
+    for view in setup.views:
         image = fill_masked(draw(view.view), view)
         shown, wanted = setup.display(image), setup.display(view.image)
         row = {"psnr": psnr(image, view.image, view.mask), "ssim": ssim(image, view.image)}
-        row |= {"ssim_3dgs": ssim_3dgs(shown, wanted), "ssim_exact": ssim(image.double(), ideal)}
-        row["mse_exact"] = float((image.double() - ideal).square().mean())
+        row["ssim_3dgs"] = ssim_3dgs(shown, wanted)
         if setup.lpips is not None and min(shown.shape[:2]) >= setup.lpips.least:
             row |= {"lpips": setup.lpips(shown, wanted), "lpips_3dgs": setup.lpips.unmapped(shown, wanted)}
         rows.append(row)
     common = [name for name in rows[0] if all(name in row for row in rows)]
     quality = {name: float(np.mean([row[name] for row in rows])) for name in common}
-    error = quality.pop("mse_exact")
-    exactness = -10.0 * math.log10(error) if error > 0 else math.inf
-    quality["psnr_exact"] = exactness if exact.error is None else min(exactness, exact.error)
     size = estimate_run_file_bytes(setup.file, setup.model, model, config.storage)
     return TradeoffPoint(knob, setup.overrides(config), quality, size)
 
@@ -366,13 +299,6 @@ class TradeoffSession:
             if not own:
                 self.record.leave_out(name, (), "there is no other value")
         return chosen
-
-    def render_exact(self, setup: TradeoffSetup, share: float) -> ExactTradeoffImages:
-        """Render exact images in a share of the budget; those of all models are made alike."""
-        float64 = self.record.facts.get("exact", {}).get("float64")
-        exact = render_exact_for_tradeoff(setup, share * self.request.budget, float64)
-        self.record.facts.setdefault("exact", exact.to_dict())
-        return exact
 
     def take_times(self, part: float) -> None:
         """Time all points that lack rounds, until a share of the budget is used."""

@@ -1,4 +1,4 @@
-"""Measured points of a trade-off, their record ``tradeoff.json``, and ``tradeoff.csv``.
+"""Points of a trade-off, their Pareto fronts and combinations, their record ``tradeoff.json``, and ``tradeoff.csv``.
 
 The table has the columns of the 3DGS compression survey.
 """
@@ -7,17 +7,18 @@ from __future__ import annotations
 
 import csv
 import io
+import math
 import shlex
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
+from itertools import zip_longest
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple, TypeVar
 
 from neuprim.core.io.files import read_json_record, write_json, write_text
 from neuprim.core.metrics import metric_from_json, metric_to_json
 from neuprim.core.validation import Range, validate_settings, validate_value
-from neuprim.search.pareto import Objectives, pareto_front
 
 _FORMAT = 1
 
@@ -29,7 +30,7 @@ REFERENCE, COMBINED = "reference", "combined"
 
 _COLUMNS = (
     *("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians"),  # of the survey
-    *("time ratio", "ms per frame", "frames/s", "PSNR against exact", "speed front", "size front"),
+    *("time ratio", "ms per frame", "frames/s", "speed front", "size front"),
 )
 _MODEL_COLUMNS = ("numbers per primitive", "training steps", "training seconds", "ms per step", "command")
 
@@ -38,11 +39,98 @@ _DIGITS = 2  # decimals of PSNR that count on a front
 _DRAWN = ("knob", "words", "bytes", "ms", "ratios")
 _TRAINED = (
     *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
-    *("centre_ms", "seeds", "run_dir"),
+    *("centre_ms", "run_dir"),
 )
 """Fields of every point, and those of trained models."""
 
 _Positive = Annotated[float, Range(above=0)]
+T = TypeVar("T")
+
+
+# ---------------------------------------------------------------- Pareto fronts
+
+
+class Objectives(NamedTuple):
+    """Cost (less is better), quality (more is better), and the uncertainty of the cost."""
+
+    cost: float
+    quality: float
+    doubt: float = 0.0
+
+
+def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> list[T]:
+    """Return the Pareto front, best quality first.
+
+    Measured costs of equal points differ by chance. A point must therefore be cheaper than the next better one by more
+    than the uncertainty of both. Of equally good points the first stays, unless another is cheaper by as much.
+    """
+    known = [(o, p) for p in points if not math.isnan((o := objectives(p)).cost) and not math.isnan(o.quality)]
+    front: list[tuple[Objectives, T]] = []
+    for here, point in sorted(known, key=lambda pair: -pair[0].quality):
+        if front:
+            last = front[-1][0]
+            if here.cost >= last.cost - (here.doubt + last.doubt):
+                continue
+            if here.quality == last.quality:
+                front.pop()
+        front.append((here, point))
+    return [point for _, point in front]
+
+
+class ParetoStep(NamedTuple):
+    """A single change: the knob, its override, the gain (log of the cost's reduction) and the loss of quality."""
+
+    knob: str
+    override: str
+    gain: float
+    loss: float
+
+
+def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> list[tuple[str, ...]]:
+    """Return combinations of overrides along the expected front, one override per knob, two or more each.
+
+    Gains and losses are assumed to add up; measuring the combinations corrects that. The next step is always the one
+    with the least loss per gain, of another knob or further along the same.
+    """
+    state: dict[str, ParetoStep] = {}
+    chain: list[tuple[str, ...]] = []
+    while True:
+        options = []
+        for step in steps:
+            now = state.get(step.knob, ParetoStep(step.knob, "", 0.0, 0.0))
+            if (gain := step.gain - now.gain) > min_gain:
+                options.append((max(step.loss - now.loss, 0.0) / gain, -gain, step.override, step))
+        if not options:
+            return chain
+        best = min(options)[3]
+        state[best.knob] = best
+        if len(state) > 1:
+            chain.append(tuple(step.override for step in state.values()))
+
+
+def combine_pareto_steps(
+    directions: Sequence[Sequence[ParetoStep]], known: Sequence[Sequence[str]], most: int
+) -> list[tuple[str, ...]]:
+    """Return at most ``most`` new combinations, alternating between directions and evenly spread along each."""
+    taken = {frozenset(overrides) for overrides in known}
+    chains = [[way for way in chain_pareto_steps(steps) if frozenset(way) not in taken] for steps in directions]
+    chosen: dict[frozenset[str], tuple[str, ...]] = {}
+    for rung in zip_longest(*(thin_pareto_chain(chain, most) for chain in chains)):
+        for way in filter(None, rung):
+            chosen.setdefault(frozenset(way), way)
+    return list(chosen.values())[: max(most, 0)]
+
+
+def thin_pareto_chain(items: Sequence[T], most: int) -> list[T]:
+    """Return at most ``most`` of the items, evenly spread."""
+    if len(items) <= most or most < 1:
+        return list(items[: max(most, 0)])
+    if most == 1:
+        return [items[len(items) // 2]]
+    return [items[round(i * (len(items) - 1) / (most - 1))] for i in range(most)]
+
+
+# ---------------------------------------------------------------- points
 
 
 @dataclass
@@ -52,13 +140,12 @@ class TradeoffPoint:
     Attributes:
         knob: what it changes; :data:`REFERENCE` and :data:`COMBINED` are none.
         words: overrides that reproduce it.
-        quality: psnr, ssim, ssim_3dgs, psnr_exact, ssim_exact; lpips and lpips_3dgs where there are weights.
+        quality: psnr, ssim, ssim_3dgs; lpips and lpips_3dgs where there are weights.
         bytes: size of the model file.
         ms: mean milliseconds per frame of each round of timing; ratios: the same over the reference's of that round.
         turned, length: of a trained model, the overrides over the centre's, and the share of the full training.
         centre_ms: median milliseconds per frame of the centre over all rounds.
-        seeds: PSNR of each seed; ``quality`` has the means.
-        run_dir: run directory of the first seed, relative to the record's folder; empty unless trained.
+        run_dir: run directory, relative to the record's folder; empty unless trained.
     """
 
     knob: str
@@ -74,7 +161,6 @@ class TradeoffPoint:
     steps: int = 0
     seconds: float = 0.0
     centre_ms: float = 0.0
-    seeds: tuple[float, ...] = ()
     run_dir: str = ""
 
     @property
@@ -98,11 +184,6 @@ class TradeoffPoint:
     @property
     def ms_per_step(self) -> float:
         return 1e3 * self.seconds / max(self.steps, 1)
-
-    @property
-    def seed_spread(self) -> float | None:
-        """Standard deviation of PSNR over seeds; None of one."""
-        return statistics.stdev(self.seeds) if len(self.seeds) > 1 else None
 
     @property
     def spread(self) -> float | None:
@@ -163,7 +244,7 @@ class TradeoffRecord:
 
     Attributes:
         same: what must be equal to keep points: model or configuration, settings, views, versions, machine.
-        facts: further facts for readers: the run, its data, the exact images.
+        facts: further facts for readers: the run, its data.
         points: the reference first.
         speed, size: numbers of the points on the fronts of time and of bytes against PSNR, best quality first.
     """
@@ -247,13 +328,13 @@ def write_tradeoff_csv(path: Path, record: TradeoffRecord, primitives: int = 0) 
     writer = csv.writer(buffer, lineterminator="\n")
     writer.writerow((*_COLUMNS, *(_MODEL_COLUMNS if trained else ())))
     for number, point in enumerate(record.points):
-        psnr, ssim, distance, exact = (
+        psnr, ssim, distance = (
             "" if (value := point.quality.get(name)) is None else f"{value:.6g}"
-            for name in ("psnr", "ssim_3dgs", lpips, "psnr_exact")
+            for name in ("psnr", "ssim_3dgs", lpips)
         )
         row: list[object] = [point.name, psnr, ssim, distance, point.bytes, point.primitives or primitives]
         row += [f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}"] if point.ms else [""] * 3
-        row += [exact, int(number in record.speed), int(number in record.size)]
+        row += [int(number in record.speed), int(number in record.size)]
         if trained:
             row += [point.parameters_per_primitive, point.steps, f"{point.seconds:.3f}", f"{point.ms_per_step:.4f}"]
             row.append(shlex.join(["neuprim", "run", *point.words]))

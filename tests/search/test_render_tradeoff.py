@@ -11,7 +11,6 @@ import torch
 
 from neuprim.cli import main
 from neuprim.core.errors import ConfigError
-from neuprim.core.metrics import psnr
 from neuprim.runs.measure import evaluate_run
 from neuprim.search import render_tradeoff as engine
 from neuprim.search.render_tradeoff import measure_tradeoff
@@ -19,8 +18,6 @@ from neuprim.search.tradeoff_measuring import (
     TimedPoint,
     TradeoffRequest,
     load_tradeoff_setup,
-    measure_point,
-    render_exact_for_tradeoff,
     time_tradeoff_points,
 )
 from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord, read_tradeoff_record
@@ -56,7 +53,7 @@ def test_every_value_of_every_knob_is_measured(measured: tuple[Path, TradeoffRec
     assert "combined" in knobs and len({point.words for point in record.points}) == len(record.points)
     for point in record.points:
         assert len(point.ms) == len(point.ratios) >= 3 and min(point.ms) > 0
-        assert {"psnr", "ssim", "ssim_3dgs", "psnr_exact", "ssim_exact"} == point.quality.keys()
+        assert {"psnr", "ssim", "ssim_3dgs"} == point.quality.keys()
         assert (point.knob == "combined") == (len(point.words) > 1 and point.knob != "store")
     assert record.speed and record.size and set(record.points[0].ratios) == {1.0}
 
@@ -66,25 +63,6 @@ def test_the_reference_has_the_numbers_of_eval(measured: tuple[Path, TradeoffRec
     metrics, reference = evaluate_run(run_dir), record.points[0]
     assert all(reference.quality[name] == metrics[name] for name in ("psnr", "ssim", "ssim_3dgs"))
     assert reference.bytes == (run_dir / "model.safetensors").stat().st_size
-
-
-def test_coarser_points_are_farther_from_the_exact_image(measured: tuple[Path, TradeoffRecord]) -> None:
-    _, record = measured
-
-    exactness = {" ".join(point.words): point.quality["psnr_exact"] for point in record.points}
-    values = [exactness[f"renderer.alpha_min={v}"] for v in ("0", "0.0009765625", "0.0078125", "0.03125")]
-    assert values == sorted(values, reverse=True) and values[0] > 90
-    sizes = [exactness[f"resolution={v}"] for v in ("0.75", "0.5", "0.25")]
-    assert sizes == sorted(sizes, reverse=True) and record.facts["exact"]["float64"] is True
-
-
-def test_exact_images_without_float64_know_their_error(bare: Path) -> None:
-    setup = load_tradeoff_setup(bare, (), 1)
-    fast, slow = render_exact_for_tradeoff(setup, 0.0), render_exact_for_tradeoff(setup, 1e9)
-    assert slow.float64 and slow.error is None and not fast.float64 and fast.checked == (24, 24)
-    assert fast.error is not None and 100 < fast.error <= psnr(fast.images[0], slow.images[0]) + 1e-6
-    uncut = setup.parse(["renderer.alpha_min=0", "renderer.transmittance_min=0"])
-    assert measure_point(setup, "alpha_min", uncut, fast).quality["psnr_exact"] == fast.error
 
 
 def test_outputs_and_what_is_kept(measured: tuple[Path, TradeoffRecord], monkeypatch: pytest.MonkeyPatch) -> None:
@@ -135,7 +113,6 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
     ]
     for more, text in (
         (["--knobs", "alpha"], "no such knob"),
-        (["--seeds", "2"], "--seeds"),
         (["--budget", "x"], "--budget x"),
     ):
         assert main(["tradeoff", str(run_dir), *more]) == 2

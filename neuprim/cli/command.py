@@ -31,10 +31,9 @@ KEY=VALUE overrides how the run is drawn:
   resolution=0.5             render at half the width and height, and upsample
   density.NAME=N colour.NAME=N
                              a smaller field, e.g. colour.degree=1 (bands of spherical harmonics) density.neurons=4
-  store.GROUP=float16|uint8  store means, shape, density, colour or all as 16-bit floats or 8-bit codes
 `neuprim tradeoff RUN_DIR` measures their cost and gain."""
 
-RENDER_OVERRIDE_HEADS = ("renderer", "resolution", "density", "colour", "store")
+RENDER_OVERRIDE_HEADS = ("renderer", "resolution", "density", "colour")
 """A copy of neuprim.runs.render_config.HEADS, as importing that module loads torch."""
 
 

@@ -227,7 +227,7 @@ neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR
 
 After RUN_DIR, """
 
-_TRADEOFF_FILES = ("tradeoff.json", "tradeoff.csv", "tradeoff.html", "front.png")
+_TRADEOFF_FILES = ("tradeoff.json", "tradeoff.html", "front.png")
 
 
 def is_override_argument(first: str) -> bool:

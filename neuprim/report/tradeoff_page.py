@@ -190,5 +190,4 @@ class _TradeoffPage:
             words = " ".join(r["words"]) or "none"
             pairs += [("overrides of the centre", words), ("budget", budget)]
         pairs += [*same["machine"].items(), *same["versions"].items()]
-        pairs += [(f"{name} not measured", why) for name, why in r.get("not_measured", {}).items()]
         return section("Where the numbers come from", elements.fact_list(pairs))

@@ -208,7 +208,7 @@ def evaluate_run(
         check_dataset_views(dataset, run.task.conditions)
         training = {name: run.header.get(name) for name in ("iterations", "train_seconds")}
         model = config.prepare_model(run.model)
-        size = estimate_run_file_bytes(model_file(run.directory), run.model, model, config.storage)
+        size = estimate_run_file_bytes(model_file(run.directory), run.model, model)
         model = move_to_render_device(model, config.settings, dataset.test.view(0))
         views = measure_views(model, run.task, dataset, config.settings, distance, render_view=config.render_view)
         return summarize_metrics(run, dataset, model, views, size, training, distance)

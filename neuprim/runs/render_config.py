@@ -4,7 +4,6 @@ renderer.KEY=VALUE       any setting of the renderer, over the run's own
 resolution=0.5           render at half the width and height, and upsample bilinearly
 density.NAME=N           a smaller density, for example fewer neurons (Field.reductions)
 colour.NAME=N            a smaller colour: bands of spherical harmonics, terms in time
-store.GROUP=FORMAT       emulate storage of means, shape, density, colour or all of them in one of :data:`FORMATS`
 
 A view is drawn as an image, or as layers of one OpenEXR file: linear light, numbers beside it, and the camera and
 conditions in its header.
@@ -13,7 +12,6 @@ conditions in its header.
 from __future__ import annotations
 
 import dataclasses
-import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -31,13 +29,11 @@ from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.checkpoint import read_header
 from neuprim.core.compression import is_compressed
-from neuprim.core.compression.quantizers import fit_columns
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.exr import ExrChannel, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.model.fields import Conditions
-from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.reduction import KINDS, reduce_model, reduction_names, validate_reduction
 from neuprim.core.render import RenderSettings, backends, render
@@ -49,7 +45,7 @@ from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.plugins.returns import draw_task_layer
 from neuprim.version import __version__
 
-HEADS = ("renderer", "resolution", "density", "colour", "store")
+HEADS = ("renderer", "resolution", "density", "colour")
 """First parts of the keys."""
 
 _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0, at most 1")]
@@ -58,80 +54,16 @@ _MOST_LIGHTS = 128
 _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # those of sRGB: x and y of red, green, blue, white
 
 
-# ---------------------------------------------------------------- storage formats
-
-FLOAT32 = "float32"
-"""Format of model files."""
-
-FORMATS = (FLOAT32, "float16", "uint8")
-"""``uint8`` has even steps between the ends of each column."""
-
-GROUPS = ("means", "shape", "density", "colour")
-"""Groups of parameters: centres, other numbers of the ellipsoids, and both fields."""
-
-ALL_GROUPS = "all"
-
-
-def _round_trip_run_storage(value: Tensor, format: str) -> Tensor:
-    """(N, ...) float32 after storing and reading."""
-    if format == "float16":
-        return value.half().float()
-    if format == FLOAT32:
-        return value
-    flat = value.detach().cpu().reshape(len(value), math.prod(value.shape[1:]))
-    columns = fit_columns(flat, [8] * flat.shape[1])
-    return columns.values(columns.codes(flat)).reshape(value.shape).to(value)
-
-
-def _run_tensor_storage_bytes(value: Tensor, format: str) -> int:
-    if format == "uint8":
-        return value.numel() + 8 * math.prod(value.shape[1:])  # every column has two float32 ends
-    return (2 if format == "float16" else 4) * value.numel()
-
-
-def _run_storage_parameters(model: Primitives, group: str) -> tuple[str, ...]:
-    if group == "means":
-        return ("means",)
-    if group == "shape":
-        return tuple(spec.name for spec in GEOMETRY_SPECS if spec.name != "means")
-    return tuple(spec.name for spec in (model.density if group == "density" else model.colour).parameters())
-
-
-def emulate_run_storage(model: Primitives, storage: Mapping[str, str]) -> Primitives:
-    """Return the model after storing groups of parameters in formats; itself if all are float32.
-
-    Raises:
-        ConfigError: a value is outside the range of its format.
-    """
-    if all(name == FLOAT32 for name in storage.values()):
-        return model
-    params = dict(model.params)
-    for group, name in storage.items():
-        for parameter in _run_storage_parameters(model, group):
-            params[parameter] = _round_trip_run_storage(params[parameter].detach(), name)
-            if not bool(torch.isfinite(params[parameter]).all()):
-                raise ConfigError(f"store.{group}={name}: {parameter} has values outside the range of {name}")
-    return Primitives(model.density, model.colour, params)
-
-
-def run_storage_bytes(model: Primitives, storage: Mapping[str, str]) -> int:
-    """Return the bytes of the model's tensors, each group in its format."""
-    return sum(
-        _run_tensor_storage_bytes(model.params[name], storage.get(group, FLOAT32))
-        for group in GROUPS
-        for name in _run_storage_parameters(model, group)
-    )
-
-
-def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives, storage: Mapping[str, str]) -> int:
-    """Return the bytes of a run's model file if it held ``reduced`` in these formats instead of the ``full`` model.
+def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -> int:
+    """Return the bytes of a run's model file if it held ``reduced`` instead of the ``full`` model.
 
     An unchanged model has its file's own size. Otherwise a compressed file, or one without zeros, counts as tensors.
     """
-    size, after = path.stat().st_size, run_storage_bytes(reduced, storage)
+    before, after = (4 * model.count * model.parameters_per_primitive for model in (full, reduced))
+    size = path.stat().st_size
     if not is_compressed(path) and "sparse" not in read_header(path, "model"):
-        return size - run_storage_bytes(full, {}) + after
-    return size if after == run_storage_bytes(full, {}) else after
+        return size - before + after
+    return size if after == before else after
 
 
 # ---------------------------------------------------------------- render configuration
@@ -144,13 +76,11 @@ class RenderConfig:
     Attributes:
         resolution: factor of width and height, above 0 and at most 1.
         reduced: ("density" or "colour", setting) -> its smaller value.
-        storage: group of parameters -> name of a format.
     """
 
     settings: RenderSettings = field(default_factory=RenderSettings)
     resolution: float = 1.0
     reduced: Mapping[tuple[str, str], int] = field(default_factory=dict)
-    storage: Mapping[str, str] = field(default_factory=dict)
 
     def to_overrides(self, defaults: RenderSettings) -> tuple[str, ...]:
         """Return overrides that :func:`parse_run_rendering` reads back, over default settings."""
@@ -162,21 +92,13 @@ class RenderConfig:
             if value != before[name]
         ]
         words += [_format_run_render_override("resolution", self.resolution)] if self.resolution != 1.0 else []
-        words += [f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()]
-        formats = set(self.storage.values())
-        if len(self.storage) == len(GROUPS) and len(formats) == 1 and formats != {FLOAT32}:
-            return (*words, f"store.{ALL_GROUPS}={formats.pop()}")
-        return (*words, *(f"store.{group}={name}" for group, name in self.storage.items() if name != FLOAT32))
+        return (*words, *(f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()))
 
     def prepare_model(self, model: Primitives) -> Primitives:
-        """Return the model to draw: fields reduced first, then storage emulated; itself if nothing changes.
-
-        Raises:
-            ConfigError: a value is outside the range of its format.
-        """
+        """Return the model to draw, with reduced fields; itself if nothing changes."""
         for (kind, name), value in self.reduced.items():
             model = reduce_model(model, kind, name, value)
-        return emulate_run_storage(model, self.storage)
+        return model
 
     def scale_view(self, view: View) -> View:
         """Return the view at the resolution to draw."""
@@ -212,10 +134,10 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
     """Parse overrides of the rendering of a model, over default settings.
 
     Raises:
-        ConfigError: an unknown key, setting or format, a reduction that the model's fields lack, or an invalid value.
+        ConfigError: an unknown key or setting, a reduction that the model's fields lack, or an invalid value.
     """
     values: dict[str, Any] = dataclasses.asdict(defaults)
-    resolution, reduced, storage = 1.0, dict[tuple[str, str], int](), dict[str, str]()
+    resolution, reduced = 1.0, dict[tuple[str, str], int]()
     for assignment in parse_overrides(overrides):
         head, dot, name = assignment.key.partition(".")
         if head == "resolution" and not dot:
@@ -224,14 +146,10 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
             values[name] = assignment.value
         elif head in KINDS and dot:
             reduced[head, name] = validate_reduction(model.density, model.colour, head, name, assignment.value)
-        elif head == "store" and dot:
-            format = _check_run_storage_format(name, assignment.value)
-            storage |= dict.fromkeys(GROUPS if name == ALL_GROUPS else [name], format)
         else:
             known = [
                 *(f"renderer.{name}" for name in values),
                 "resolution",
-                *(f"store.{name}" for name in (*GROUPS, ALL_GROUPS)),
                 *reduction_names(model.density, model.colour),
             ]
             raise ConfigError(f"{assignment.key}: no setting of rendering{nearest(assignment.key, known)}")
@@ -240,15 +158,7 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
     backends.check_backend_name(settings.backend)
     backends.check_backend_device(settings)
-    return RenderConfig(settings, resolution, dict(sorted(reduced.items())), dict(sorted(storage.items())))
-
-
-def _check_run_storage_format(group: str, name: Any) -> str:
-    if group not in (*GROUPS, ALL_GROUPS):
-        raise ConfigError(f"store.{group}: no such group of parameters{nearest(group, (*GROUPS, ALL_GROUPS))}")
-    if name not in FORMATS:
-        raise ConfigError(f"store.{group}={name}: no such format{nearest(str(name), FORMATS)}")
-    return str(name)
+    return RenderConfig(settings, resolution, dict(sorted(reduced.items())))
 
 
 def _format_run_render_override(key: str, value: Any) -> str:

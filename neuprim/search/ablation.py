@@ -80,7 +80,7 @@ def run_ablation(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> tuple[Path, TradeoffRecord]:
-    """Train, measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
+    """Train, measure, and write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
 
     Returns the folder of the set and its record. A larger budget adds what did not fit.
 

@@ -20,7 +20,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import backends
 from neuprim.runs.fit import use_one_torch_thread_for_run
-from neuprim.runs.render_config import FLOAT32, FORMATS, GROUPS, RenderConfig
+from neuprim.runs.render_config import RenderConfig
 from neuprim.search.tradeoff_measuring import (
     Progress,
     Tell,
@@ -76,13 +76,6 @@ def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, l
         for name, own in values.items()
     }
     knobs["resolution"] = [replace(reference, resolution=part) for part in (1.0, 0.75, 0.5, 0.25)]
-    stored = [
-        dict(reference.storage) | dict.fromkeys(groups, name)
-        for name in FORMATS
-        if name != FLOAT32
-        for groups in (*((group,) for group in GROUPS), GROUPS)
-    ]
-    knobs["store"] = [replace(reference, storage=dict(sorted(storage.items()))) for storage in stored]
     for kind, own in (("density", model.density), ("colour", model.colour)):
         for name, counts in own.reductions().items():
             reduced = [{**reference.reduced, (kind, name): count} for count in counts]
@@ -96,7 +89,7 @@ def measure_tradeoff(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> TradeoffRecord:
-    """Measure, and write ``tradeoff.json``, ``tradeoff.csv``, ``tradeoff.html`` and ``front.png``.
+    """Measure, and write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
 
     Raises:
         NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
@@ -108,14 +101,14 @@ def measure_tradeoff(
     with find_config_plugins(setup.config).attribute_errors(), use_one_torch_thread_for_run():
         if (reason := setup.unsupported(setup.reference)) is not None:
             raise ConfigError(reason)
-        record.facts |= {**describe_tradeoff_setup(setup), "primitives": setup.model.count}
+        record.facts |= describe_tradeoff_setup(setup)
         session = _RenderTradeoffSession(folder, request, record, progress, setup)
         session.measure([(REFERENCE, setup.reference), *session.single_changes(knobs)], _IMAGES)
         session.take_times(_TIMES)
         session.measure([(COMBINED, config) for config in session.combinations()], _COMBINED)
         session.take_times(1.0)
-        record.find_fronts(session.stores_the_reference, session.draws_the_reference)
-        session.write_results(partial(format_tradeoff_render_command, str(run_dir)), setup.model.count)
+        record.find_fronts(in_size=session.draws_the_reference)
+        session.write_results(partial(format_tradeoff_render_command, str(run_dir)))
     return record
 
 
@@ -157,15 +150,8 @@ class _RenderTradeoffSession(TradeoffSession):
                 self.record.leave_out(knob, words, self.no_time)
                 continue
             self.progress(f"images of point {number + 1} of {len(wanted)}", number / len(wanted))
-            try:
-                points.append(measure_point(self.setup, knob, config))
-            except ConfigError as error:  # a format that does not hold the model's values
-                self.record.leave_out(knob, words, str(error))
+            points.append(measure_point(self.setup, knob, config))
             self.write_record()
-
-    def stores_the_reference(self, point: TradeoffPoint) -> bool:
-        """Return whether a point stores the model as the reference does: storage does not change times."""
-        return self.setup.parse(point.words).storage == self.setup.reference.storage
 
     def draws_the_reference(self, point: TradeoffPoint) -> bool:
         """Return whether a point draws as the reference does, so that only its bytes differ."""
@@ -182,7 +168,7 @@ class _RenderTradeoffSession(TradeoffSession):
             if point.knob == COMBINED or len(turned) != 1:
                 continue
             knob, loss = turned[0].partition("=")[0], base.quality["psnr"] - point.quality["psnr"]
-            if point.ratios and point.ratio < 1.0 - point.doubt and self.stores_the_reference(point):
+            if point.ratios and point.ratio < 1.0 - point.doubt:
                 faster.append(ParetoStep(knob, turned[0], -math.log(point.ratio), loss))
             if point.bytes < base.bytes and self.draws_the_reference(point):
                 smaller.append(ParetoStep(knob, turned[0], math.log(base.bytes / point.bytes), loss))

@@ -28,7 +28,7 @@ from neuprim.report.tradeoff_page import TradeoffPicture, write_tradeoff_page
 from neuprim.runs.open import load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import RenderConfig, estimate_run_file_bytes, parse_run_rendering
 from neuprim.search.model_quality import EvalView, choose_trial_views, fill_masked
-from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord, write_tradeoff_csv
+from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord
 from neuprim.version import __version__
 
 _MAX_CACHED = 1 << 29  # bytes of prepared models that are kept between rounds
@@ -64,8 +64,7 @@ class TradeoffSetup:
 
     def prepare_model(self, config: RenderConfig) -> Primitives:
         """Return the model as a configuration draws it, on its device; recent ones are cached."""
-        changes = (tuple(config.reduced.items()), tuple(config.storage.items()))
-        key = (*changes, config.settings.backend, config.settings.device)
+        key = (tuple(config.reduced.items()), config.settings.backend, config.settings.device)
         if key not in self._prepared:
             model = move_to_render_device(config.prepare_model(self.model), config.settings, self.views[0].view)
             cached = (*self._prepared.values(), model)
@@ -157,7 +156,6 @@ def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
         "data_source": setup.dataset.data_source,
         "backend": setup.backend(setup.reference).name,
         "shown": setup.channels.display_text,
-        "not_measured": {} if setup.lpips is not None else {"lpips": "no weights were given (--lpips FILE)"},
     }
 
 
@@ -178,7 +176,7 @@ def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> Trad
         rows.append(row)
     common = [name for name in rows[0] if all(name in row for row in rows)]
     quality = {name: float(np.mean([row[name] for row in rows])) for name in common}
-    size = estimate_run_file_bytes(setup.file, setup.model, model, config.storage)
+    size = estimate_run_file_bytes(setup.file, setup.model, model)
     return TradeoffPoint(knob, setup.overrides(config), quality, size)
 
 
@@ -266,7 +264,7 @@ class TradeoffRequest:
 
 
 class TradeoffSession:
-    """Measure points within a budget, find the fronts, and write record, table and page.
+    """Measure points within a budget, find the fronts, and write record and page.
 
     Args:
         folder: of the record and its pages.
@@ -314,15 +312,9 @@ class TradeoffSession:
         deadline, views = time.monotonic() + self.seconds_left(part), self.point_setup(0)[0].views
         time_tradeoff_points(timed, self.request.repeats, views, deadline, note_round)
 
-    def write_results(self, command: Callable[[Sequence[str]], str], primitives: int = 0) -> None:
-        """Write record, table, page and chart of the fronts.
-
-        Args:
-            command: overrides of a point -> the command that draws or trains it.
-            primitives: of a finished run.
-        """
+    def write_results(self, command: Callable[[Sequence[str]], str]) -> None:
+        """Write record, page and chart of the fronts; ``command`` gives the one that draws or trains a point."""
         self.write_record()
-        write_tradeoff_csv(self.folder / "tradeoff.csv", self.record, primitives)
         self.progress("pictures of the front", 0.0)
         write_tradeoff_page(self.folder, self.record.to_dict(), self._render_front_pictures(), command)
 

@@ -1,14 +1,8 @@
-"""Points of a trade-off, their Pareto fronts and combinations, their record ``tradeoff.json``, and ``tradeoff.csv``.
-
-The table has the columns of the 3DGS compression survey.
-"""
+"""Points of a trade-off, their Pareto fronts and combinations, and their record ``tradeoff.json``."""
 
 from __future__ import annotations
 
-import csv
-import io
 import math
-import shlex
 import statistics
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
@@ -16,7 +10,7 @@ from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeVar
 
-from neuprim.core.io.files import read_json_record, write_json, write_text
+from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.metrics import metric_from_json, metric_to_json
 from neuprim.core.validation import Range, validate_settings, validate_value
 
@@ -27,12 +21,6 @@ TRADEOFF_FILE, TRADEOFF_FOLDER = "tradeoff.json", "tradeoff"
 
 REFERENCE, COMBINED = "reference", "combined"
 """In place of a knob's name: the point that others are compared with, and points that change several knobs."""
-
-_COLUMNS = (
-    *("Submethod", "PSNR", "SSIM", "LPIPS", "Size [Bytes]", "#Gaussians"),  # of the survey
-    *("time ratio", "ms per frame", "frames/s", "speed front", "size front"),
-)
-_MODEL_COLUMNS = ("numbers per primitive", "training steps", "training seconds", "ms per step", "command")
 
 _DIGITS = 2  # decimals of PSNR that count on a front
 
@@ -268,15 +256,14 @@ class TradeoffRecord:
 
     def find_fronts(
         self,
-        in_speed: Callable[[TradeoffPoint], bool] = lambda point: True,
         in_size: Callable[[TradeoffPoint], bool] = lambda point: True,
     ) -> None:
-        """Compute both fronts, of the points that may be on each."""
+        """Compute both fronts; that of size has the points that may be on it."""
         costs = [
             (Objectives(p.ratio, psnr := round(p.quality["psnr"], _DIGITS), p.doubt), Objectives(float(p.bytes), psnr))
             for p in self.points
         ]
-        timed = [i for i, point in enumerate(self.points) if point.ratios and in_speed(point)]
+        timed = [i for i, point in enumerate(self.points) if point.ratios]
         self.speed = pareto_front(timed, lambda i: costs[i][0])
         self.size = pareto_front([i for i, p in enumerate(self.points) if in_size(p)], lambda i: costs[i][1])
 
@@ -313,30 +300,3 @@ def read_tradeoff_record(path: Path) -> TradeoffRecord | None:
         return TradeoffRecord(dict(data["same"]), facts, points, left_out, speed, size)
 
     return read_json_record(path, "a record of `neuprim tradeoff`", "delete it to measure anew", _FORMAT, parse)
-
-
-def write_tradeoff_csv(path: Path, record: TradeoffRecord, primitives: int = 0) -> None:
-    """Write the table, a row per point; empty cells are not measured.
-
-    Args:
-        primitives: of a finished run; trained models have their own numbers.
-    """
-    # The survey's LPIPS is that of VGG; another network's would not compare.
-    lpips = "lpips_3dgs" if record.same.get("lpips") == "vgg" else ""
-    trained = any(point.run_dir for point in record.points)
-    buffer = io.StringIO()
-    writer = csv.writer(buffer, lineterminator="\n")
-    writer.writerow((*_COLUMNS, *(_MODEL_COLUMNS if trained else ())))
-    for number, point in enumerate(record.points):
-        psnr, ssim, distance = (
-            "" if (value := point.quality.get(name)) is None else f"{value:.6g}"
-            for name in ("psnr", "ssim_3dgs", lpips)
-        )
-        row: list[object] = [point.name, psnr, ssim, distance, point.bytes, point.primitives or primitives]
-        row += [f"{point.ratio:.4f}", f"{point.time:.4f}", f"{1e3 / point.time:.2f}"] if point.ms else [""] * 3
-        row += [int(number in record.speed), int(number in record.size)]
-        if trained:
-            row += [point.parameters_per_primitive, point.steps, f"{point.seconds:.3f}", f"{point.ms_per_step:.4f}"]
-            row.append(shlex.join(["neuprim", "run", *point.words]))
-        writer.writerow(row)
-    write_text(path, buffer.getvalue())

@@ -381,7 +381,6 @@ def _read_records(folder: Path) -> None:
     from neuprim.search import trials
     from neuprim.search.target_record import read_target_record as read_target
     from neuprim.search.tradeoff_record import read_tradeoff_record
-    from neuprim.search.tradeoff_record import write_tradeoff_csv as write_points
 
     _read_run(folder)
     if (sweep := read_launch_record(folder / "sweep.json")) is not None:
@@ -393,7 +392,7 @@ def _read_records(folder: Path) -> None:
         target.write(folder / "again")
         repr((target.words, target.finished("size"), [one.count for one in target.attempts if one.outcome]))
     if (points := read_tradeoff_record(folder / "run/tradeoff/tradeoff.json")) is not None:
-        write_points(folder / "out.csv", points, 40)
+        points.write(folder / "again/tradeoff.json")
     trials.read_trial(folder)
     read_status(folder / "status.json")
 

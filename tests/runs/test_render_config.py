@@ -20,12 +20,10 @@ from neuprim.core.render import RenderSettings
 from neuprim.runs.measure import evaluate_run, render_image
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import (
-    GROUPS,
     HEADS,
     RenderConfig,
     estimate_run_file_bytes,
     parse_run_rendering,
-    run_storage_bytes,
 )
 from tests.search.tradeoff_runs import tiny_run
 
@@ -56,7 +54,6 @@ CONFIGS = st.builds(
     st.fixed_dictionaries(
         {}, optional={("colour", "degree"): st.integers(0, 2), ("density", "neurons"): st.integers(0, 3)}
     ),
-    st.dictionaries(st.sampled_from(GROUPS), st.sampled_from(["float16", "uint8"])),
 )
 
 
@@ -82,8 +79,6 @@ def test_the_command_line_knows_the_keys() -> None:
         ("colour.degre=1", "did you mean 'colour.degree'"),
         ("colour.degree=3", "colour.degree=3: expected 2 or 1 or 0"),
         ("density.neurons=5", "density.neurons=5"),
-        ("store.mean=float16", "did you mean 'means'"),
-        ("store.means=float61", "did you mean 'float16'"),
         ("resolution.x=1", "resolution.x"),
     ],
 )
@@ -93,26 +88,12 @@ def test_invalid_overrides_are_refused_in_one_line(word: str, key: str, model: P
     assert key in str(refused.value) and "\n" not in str(refused.value)
 
 
-def test_storage_changes_its_group_alone(model: Primitives) -> None:
-    config = parse_run_rendering(["store.colour=float16"], RenderSettings(), model)
-    stored = config.prepare_model(model)
-    for name, value in model.params.items():
-        assert torch.equal(stored.params[name], value.half().float() if name in ("sh_dc", "sh_rest") else value)
-    saved = 2 * sum(model.params[name].numel() for name in ("sh_dc", "sh_rest"))
-    assert run_storage_bytes(stored, config.storage) == run_storage_bytes(model, {}) - saved
-    codes = parse_run_rendering(["store.colour=uint8"], RenderSettings(), model).prepare_model(model).params["sh_dc"]
-    assert len(codes[:, 0].unique()) <= 256
-    huge = Primitives(model.density, model.colour, {**model.params, "means": model.params["means"] + 1e6})
-    with pytest.raises(ConfigError, match=r"store\.means=float16: means"):
-        parse_run_rendering(["store.means=float16"], RenderSettings(), model).prepare_model(huge)
-
-
 def test_file_bytes_follow_the_tensors(model: Primitives, tmp_path: Path) -> None:
     config = parse_run_rendering(["colour.degree=1", "density.neurons=2"], RenderSettings(), model)
     reduced = config.prepare_model(model)
     save_model(tmp_path / "reduced.safetensors", reduced, "static", {})
     save_model(tmp_path / "full.safetensors", model, "static", {})
-    estimated = estimate_run_file_bytes(tmp_path / "full.safetensors", model, reduced, config.storage)
+    estimated = estimate_run_file_bytes(tmp_path / "full.safetensors", model, reduced)
     assert abs(estimated - (tmp_path / "reduced.safetensors").stat().st_size) <= 16  # the headers differ
 
 
@@ -121,10 +102,10 @@ def test_reductions_of_a_file_without_zeros_count_as_tensors(model: Primitives, 
     sparse = Primitives(model.density, model.colour, {**model.params, "sh_rest": 0 * model.params["sh_rest"]})
     path = tmp_path / "sparse.safetensors"
     save_model(path, sparse, "static", {}, without_zeros=True)
-    assert path.stat().st_size < run_storage_bytes(sparse, {})
-    assert estimate_run_file_bytes(path, sparse, sparse, {}) == path.stat().st_size
-    half = dict.fromkeys(GROUPS, "float16")
-    assert estimate_run_file_bytes(path, sparse, sparse, half) == run_storage_bytes(sparse, half)
+    assert estimate_run_file_bytes(path, sparse, sparse) == path.stat().st_size
+    reduced = RenderConfig(reduced={("colour", "degree"): 1}).prepare_model(sparse)
+    tensors = 4 * reduced.count * reduced.parameters_per_primitive
+    assert estimate_run_file_bytes(path, sparse, reduced) == tensors
 
 
 def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, tmp_path: Path) -> None:
@@ -133,7 +114,7 @@ def test_render_and_eval_apply_the_overrides(run_dir: Path, model: Primitives, t
     run_config = stored.config
     dataset = load_dataset(stored)
     view = dataset.test.view(1)
-    words = ["renderer.alpha_min=0.25", "resolution=0.5", "colour.degree=0", "store.all=float16"]
+    words = ["renderer.alpha_min=0.25", "resolution=0.5", "colour.degree=0"]
     config = parse_run_rendering(words, run_config.renderer, model)
     image = config.render_view(config.prepare_model(model), view, dataset.background)
     out = tmp_path / "views"

@@ -1,5 +1,4 @@
-"""Models end no larger than their scenes: a still sequence without time, matte things without bands, soft blobs without
-cosines."""
+"""Models end no larger than their scenes: a still sequence without time."""
 
 from __future__ import annotations
 
@@ -9,12 +8,12 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.config import RunConfig, compose
+from neuprim.config import compose
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import LoweredPrimitives, Primitives
+from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.plugins.registry import load_task
 from neuprim.runs.fit import prepare_training, train_to_end
@@ -24,12 +23,10 @@ SIZE = 24
 
 
 class Blobs(ViewSet):
-    """Three soft blobs from all sides, as a camera with some noise sees them, and where there is time, the same at all
-    times."""
+    """Three soft blobs from all sides, as a camera with some noise sees them, the same at all times."""
 
-    def __init__(self, count: int, begin: float, times: bool) -> None:
+    def __init__(self, count: int, begin: float) -> None:
         self.cameras = [_camera(begin + 2.4 * i, 0.7 * math.sin(1.7 * i)) for i in range(count)]
-        self.times = [torch.tensor(i * 0.37 % 1.0) for i in range(count)] if times else None
         frames = [render_lowered(_truth(), camera, RenderSettings(alpha_min=0.0, threads=1)) for camera in self.cameras]
         generator = torch.Generator().manual_seed(count)
         self.images = [
@@ -41,8 +38,7 @@ class Blobs(ViewSet):
         return len(self.cameras)
 
     def view(self, index: int) -> View:
-        conditions = {} if self.times is None else {"time": self.times[index]}
-        return View(f"v{index}", self.cameras[index], conditions)
+        return View(f"v{index}", self.cameras[index], {"time": torch.tensor(index * 0.37 % 1.0)})
 
     def pixels(self, index: int) -> Pixels:
         return self.images[index]
@@ -70,12 +66,11 @@ def _camera(angle: float, height: float) -> Camera:
 def _near(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     side = torch.arange(count) % 3
     means: Tensor = _truth().geometry.means[side] + 0.3 * (torch.rand(count, 3, generator=generator) - 0.5)
-    times = {"time": torch.rand(count, generator=generator)} if views.view(0).conditions else {}
-    return PointCloud(means, torch.full((count, 3), 0.5), times)
+    return PointCloud(means, torch.full((count, 3), 0.5), {"time": torch.rand(count, generator=generator)})
 
 
-def dataset(times: bool) -> Dataset:
-    train, test = Blobs(48, 0.0, times), Blobs(4, 0.5, times)
+def dataset() -> Dataset:
+    train, test = Blobs(48, 0.0), Blobs(4, 0.5)
     extent = camera_extent([train.view(i).camera for i in range(len(train))])
     return Dataset(
         name="blobs",
@@ -88,34 +83,15 @@ def dataset(times: bool) -> Dataset:
     )
 
 
-def pruned(task: str, *words: str, steps: int = 2400) -> tuple[Primitives, Primitives, tuple[str, ...], ModelShrinker]:
-    """A model that could do more than its scene asks for, what is left of it, and what its fields do with less of."""
-    scene = {"static": "solids", "dynamic": "smoke_fire"}[task]
-    common = ["model.primitives=24", "train.max_seconds=null", "train.eval_every=0", "renderer.threads=1"]
-    config: RunConfig = compose([f"task={task}", f"scene={scene}", *common, *words], check_output=False)
-    data = dataset(task == "dynamic")
-    fitted = train_to_end(prepare_training(config, dataset=data))
-    shrinker = ModelShrinker(
-        replace(config, output_dir=config.output_dir / "none"), load_task(task), data, tolerance=0.5, steps=steps
-    )
-    small, less = shrinker.shrink(fitted.model)
-    assert shrinker.quality(small) >= shrinker.base - shrinker.tolerance - 1e-6 and shrinker.base > 33.0
-    return fitted.model, small, less, shrinker
-
-
-def test_what_is_matte_ends_without_bands_and_what_is_soft_with_few_cosines() -> None:
-    words = ("train.iterations=500", "model.neurons=4", "model.sh_degree=3", "seed=0")
-    _, small, less, _ = pruned("static", *words, steps=9000)
-    assert small.colour.settings()["degree"] == 0 and less.count("colour.degree=0") == 1
-    neurons = small.density.settings()["neurons"]
-    assert neurons <= 2 and [word for word in less if word.startswith("density.neurons")] == [
-        f"density.neurons={neurons}"
-    ]
-    assert small.count <= 16, "three blobs, of 24 primitives"
-
-
 def test_what_is_still_ends_without_time() -> None:
-    model, small, _, _ = pruned("dynamic", "train.iterations=1000", "train.supervision=images", "train.ssim_weight=0.0")
+    words = ["task=dynamic", "scene=smoke_fire", "model.primitives=24", "train.max_seconds=null", "train.eval_every=0"]
+    words += ["train.iterations=1000", "train.supervision=images", "train.ssim_weight=0.0", "renderer.threads=1"]
+    config, data = compose(words, check_output=False), dataset()
+    model = train_to_end(prepare_training(config, dataset=data)).model
+    config = replace(config, output_dir=config.output_dir / "none")
+    shrinker = ModelShrinker(config, load_task("dynamic"), data, tolerance=0.5, steps=2400)
+    small, _ = shrinker.shrink(model)
+    assert shrinker.quality(small) >= shrinker.base - shrinker.tolerance - 1e-6 and shrinker.base > 33.0
     assert model.density.settings()["time"] == "window+motion"
     assert small.density.settings()["time"] == "none"
     assert not {"window_center", "log_window", "velocity", "acceleration"} & small.params.keys()

@@ -1,8 +1,7 @@
-"""Trade-offs: records, table, damaged files, Pareto fronts against brute force, and combinations of changes."""
+"""Trade-offs: records, damaged files, Pareto fronts against brute force, and combinations of changes."""
 
 from __future__ import annotations
 
-import csv
 import json
 import math
 from pathlib import Path
@@ -26,7 +25,6 @@ from neuprim.search.tradeoff_record import (
     pareto_front,
     read_tradeoff_record,
     thin_pareto_chain,
-    write_tradeoff_csv,
 )
 
 
@@ -51,7 +49,7 @@ def trained(name: str, psnr: float, seconds: float = 2.0) -> TradeoffPoint:
 @pytest.mark.parametrize("points", [[drawn(), drawn("renderer.sort=entry", psnr=29, ratio=0.5)], [trained("1", 20.0)]])
 def test_what_is_written_is_read(points: list[TradeoffPoint], tmp_path: Path) -> None:
     record = TradeoffRecord({"views": ["a"]}, {"task": "static"}, points, [LeftOutPoint("a", ("b=1",), "why")])
-    record.find_fronts(lambda p: True, lambda p: p is points[0])
+    record.find_fronts(lambda p: p is points[0])
     record.write(tmp_path / "tradeoff.json")
     assert (
         read_tradeoff_record(tmp_path / "tradeoff.json") == record
@@ -66,23 +64,6 @@ def test_derived_numbers() -> None:
     assert point.ratio == 3.0 and point.spread == 1.0 and point.doubt == pytest.approx(3.14 / 5**0.5)
     model = trained("2", 20.0)
     assert model.name == "neurons=2" and model.time == 20.0 and model.ms_per_step == 100.0
-
-
-def test_the_table_has_the_columns_of_the_survey(tmp_path: Path) -> None:
-    record = TradeoffRecord(
-        {"lpips": "vgg"}, {}, [drawn(), drawn("renderer.sort=entry", ratio=0.5)], speed=[1], size=[0]
-    )
-    write_tradeoff_csv(tmp_path / "a.csv", record, 40)
-    rows = list(csv.DictReader((tmp_path / "a.csv").open()))
-    assert rows[0]["Submethod"] == "as the run draws" and rows[1]["Submethod"] == "sort=entry"
-    assert (
-        [row["#Gaussians"] for row in rows] == ["40", "40"] and rows[0]["LPIPS"] == "0.2" and rows[0]["SSIM"] == "0.91"
-    )
-    assert rows[1]["time ratio"] == "0.5000" and rows[1]["speed front"] == "1" and rows[1]["size front"] == "0"
-    record.same["lpips"] = "alex"
-    write_tradeoff_csv(tmp_path / "a.csv", TradeoffRecord({}, {}, [trained("1", 20.0)]))
-    (row,) = csv.DictReader((tmp_path / "a.csv").open())
-    assert row["command"] == "neuprim run model.neurons=1" and row["LPIPS"] == "" and row["training steps"] == "20"
 
 
 @pytest.mark.parametrize(

@@ -40,7 +40,7 @@ from neuprim.core.compute.threads import cpu_name
 from neuprim.runs.fit import Event, Note
 from neuprim.runs.open import load_dataset
 from neuprim.search.target import choose_target_hold_out, run_target
-from neuprim.search.trial_runner import VIEWS
+from neuprim.search.target_record import VIEWS
 from neuprim.search.trials import Trial, run_trial
 
 RECORD = RESULTS / "target.json"

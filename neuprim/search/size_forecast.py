@@ -13,7 +13,7 @@ from itertools import pairwise
 from typing import Literal, NamedTuple
 
 from neuprim.config.command_settings import SearchTarget
-from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord
+from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord, forecast_time
 
 ALLOWANCE, MIN_MARGIN = 0.1, 0.05
 """dB above the target that full runs aim at, and need at least: the cost of quantization."""
@@ -30,8 +30,6 @@ _SEED_NOISE = 0.1  # dB between two seeds of one configuration
 _FURTHEST, _APART, _CLOSE = 3.0, 0.5, 0.3
 """Doublings from the sizes tried to the next, at most; between two sizes that give a slope, at least; and between two
 sizes of which the second gives no new information."""
-
-_FIXED_SHARE = 0.5  # share of a time that does not depend on the number of primitives, where only one number was tried
 
 
 class Forecast(NamedTuple):
@@ -74,18 +72,6 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
 def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
     """Return gain (ratio + ratio^2 + ...), for a number of doublings that need not be whole."""
     return gain * doublings if ratio == 1 else gain * ratio * (1 - ratio**doublings) / (1 - ratio)
-
-
-def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> float:
-    """Return a time at a number of primitives, by a least-squares line that neither falls nor starts below zero."""
-    counts, times = [float(n) for n, _ in known], [t for _, t in known]
-    mean_n, mean_t = sum(counts) / len(counts), sum(times) / len(times)
-    spread = sum((n - mean_n) ** 2 for n in counts)
-    slope = (1 - _FIXED_SHARE) * mean_t / mean_n
-    if spread > 0:
-        slope = sum((n - mean_n) * (t - mean_t) for n, t in zip(counts, times, strict=True)) / spread
-    slope = min(max(slope, 0.0), mean_t / mean_n)
-    return mean_t + slope * (primitives - mean_n)
 
 
 def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> tuple[float, float]:

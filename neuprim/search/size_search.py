@@ -24,14 +24,20 @@ from neuprim.search.size_forecast import (
     SizePredictor,
     SizeProposal,
     exceeded_limit,
-    forecast_time,
     format_target_forecast,
     propose_best_size,
     propose_size,
     to_forecast_decibels,
 )
-from neuprim.search.target_record import Attempt, SettingChange, SettingValue, TargetRecord
-from neuprim.search.trial_runner import VIEWS, TrialRunner
+from neuprim.search.target_record import (
+    VIEWS,
+    Attempt,
+    SettingChange,
+    SettingValue,
+    TargetRecord,
+    TrialRunner,
+    forecast_time,
+)
 from neuprim.search.trials import get_trial_setting
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08

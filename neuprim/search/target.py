@@ -38,8 +38,15 @@ from neuprim.search.model_quality import SearchQuality, choose_trial_views, meas
 from neuprim.search.pruning import PruneRequest, prune_run
 from neuprim.search.size_forecast import ALLOWANCE, MIN_MARGIN, SizePredictor, exceeded_limit
 from neuprim.search.size_search import SizeSearch
-from neuprim.search.target_record import TARGET_FILE, Attempt, TargetRecord, read_target_record
-from neuprim.search.trial_runner import VIEWS, TrialRunner, count_compressed_trial_bytes
+from neuprim.search.target_record import (
+    TARGET_FILE,
+    VIEWS,
+    Attempt,
+    TargetRecord,
+    TrialRunner,
+    count_compressed_trial_bytes,
+    read_target_record,
+)
 from neuprim.search.trials import NOT_TRAINED_WITH
 
 _FIRST_SHARE = 0.05  # share of the squared error at which the search for coarse numbers begins

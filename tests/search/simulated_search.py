@@ -15,8 +15,7 @@ from neuprim.search import size_search
 from neuprim.search.size_forecast import SizePredictor
 from neuprim.search.size_search import SizeSearch
 from neuprim.search.target import choose_full_run
-from neuprim.search.target_record import Attempt, TargetRecord
-from neuprim.search.trial_runner import TrialRunner
+from neuprim.search.target_record import Attempt, TargetRecord, TrialRunner
 
 __all__ = ["Curves", "SimulatedRunner", "attempt", "from_grid", "interpolate", "simulate_search"]
 

@@ -20,7 +20,6 @@ from neuprim.search.size_forecast import (
     SizePredictor,
     exceeded_limit,
     forecast_quality,
-    forecast_time,
     format_target_forecast,
     from_forecast_decibels,
     propose_best_size,
@@ -28,7 +27,7 @@ from neuprim.search.size_forecast import (
     to_forecast_decibels,
 )
 from neuprim.search.size_search import propose_setting_trial, setting_change_pays
-from neuprim.search.target_record import Attempt, SettingChange, TargetRecord
+from neuprim.search.target_record import Attempt, SettingChange, TargetRecord, forecast_time
 from tests.search.simulated_search import attempt, from_grid, simulate_search
 
 BENCHMARKS = Path(__file__).parents[2] / "benchmarks"

@@ -19,7 +19,7 @@ from neuprim.runs.fit import Event, Note, Step
 from neuprim.runs.launch.jobs import JobResult
 from neuprim.runs.measure import evaluate_run
 from neuprim.runs.open import load_dataset, read_metrics
-from neuprim.search import pruning, size_search, target, trial_runner
+from neuprim.search import pruning, size_search, target, target_record
 from neuprim.search.target import run_target
 from neuprim.search.target_record import TargetRecord, read_target_record
 from neuprim.search.trials import Outcome, Trial, run_trial
@@ -69,7 +69,7 @@ def timed(trial: Trial, *args: Any) -> Outcome:
 def clocked_trials() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 4)
-        patch.setattr(trial_runner, "run_trial", timed)
+        patch.setattr(target_record, "run_trial", timed)
         patch.setattr(size_search, "_MAX_SIZES", 3)
         patch.setattr(size_search, "_MAX_CHANGES", 1)
         yield
@@ -157,7 +157,7 @@ def test_launched_it_trains_two_lengths_together(tmp_path: Path, monkeypatch: py
         clock.now += max(seconds)
         return [JobResult("done", one, seconds=each) for one, each in zip(outcomes, seconds, strict=True)]
 
-    monkeypatch.setattr(trial_runner, "launch_trials", launch)
+    monkeypatch.setattr(target_record, "launch_trials", launch)
     monkeypatch.setattr(target, "_finish_target_search", lambda runner, predictor: None)
     monkeypatch.setattr("neuprim.runs.launch.executors.machine_cores", lambda: 2)
     settings = LauncherSettings("processes")

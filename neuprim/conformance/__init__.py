@@ -15,13 +15,22 @@ what it demands.
 
 from __future__ import annotations
 
+import json
+import math
+import tempfile
 import traceback
-from collections.abc import Callable, Mapping
-from contextlib import suppress
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager, suppress
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
+
+from neuprim.config import check_config_groups, list_task_presets, preset_settings, read_task_config
+from neuprim.config.setting_checks import check_config_parameter_names, complete_task_options
+from neuprim.config.task_files import Level, read_config_effort_levels
 from neuprim.conformance.field_checks import (
     check_activity_conformance,
     check_gradients_conformance,
@@ -30,47 +39,324 @@ from neuprim.conformance.field_checks import (
     check_scaling_conformance,
     check_split_conformance,
 )
-from neuprim.conformance.task_checks import (
-    check_channels_conformance,
-    check_conditions_conformance,
-    check_description_conformance,
-    check_evaluation_conformance,
-    check_fields_conformance,
-    check_loss_conformance,
-    check_parameters_conformance,
-    check_resume_conformance,
-    check_save_load_conformance,
+from neuprim.conformance.task_under_test import (
+    ConformanceError,
+    TaskUnderTest,
+    conformance_range,
+    random_conformance_condition,
 )
-from neuprim.conformance.task_under_test import ConformanceError, TaskUnderTest
-from neuprim.core.errors import FormError
-from neuprim.core.task import TaskSpec
+from neuprim.core import checkpoint
+from neuprim.core.channels import find_channels
+from neuprim.core.compression import LEVELS, canonical_model
+from neuprim.core.errors import ConfigError, FormError, NeuprimError
+from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.model.geometry import GEOMETRY_SPECS
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import render
+from neuprim.core.render.layer_frame import LayerFrame
+from neuprim.core.task import Supervision, TaskSpec
+from neuprim.core.train.settings import ModelSettings
+from neuprim.core.used_settings import build_settings, loss_settings
+from neuprim.core.validation import validate_settings
+from neuprim.plugins.returns import (
+    ReturnError,
+    call_task_clips,
+    call_task_diagnose,
+    call_task_facts,
+    call_task_mask,
+    call_task_metrics,
+    call_task_orbit,
+    call_task_tunable_settings,
+    check_loss_returns,
+    draw_task_layer,
+)
+from neuprim.plugins.spec_validation import validate_spec
 
 __all__ = ["CHECKS", "ConformanceError", "check_task", "checks", "named_checks"]
 
-CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
-    function.__name__.removeprefix("check_").removesuffix("_conformance"): function
-    for function in (
-        check_description_conformance,
-        check_fields_conformance,
-        check_parameters_conformance,
-        check_evaluation_conformance,
-        check_loss_conformance,
-        check_channels_conformance,
-        check_activity_conformance,
-        check_integral_conformance,
-        check_gradients_conformance,
-        check_scaling_conformance,
-        check_split_conformance,
-        check_reductions_conformance,
-        check_resume_conformance,
-        check_save_load_conformance,
-        check_conditions_conformance,
-    )
-}
-"""Every check by name, in reading order."""
-
 _NOT_THE_TASKS = ("neuprim.core", "neuprim.config", "neuprim.plugins")
 _LIBRARIES = ("torch", "numpy", "scipy", "numba", "importlib", "omegaconf", "hydra", "yaml")
+_STEPS = 4
+"""Steps before the checkpoint and again after it; the population changes twice in each half."""
+
+
+# ---------------------------------------------------------------- what a task declares
+
+
+def check_description_conformance(t: TaskUnderTest) -> None:
+    """The TaskSpec is valid, its scenes, presets, efforts and tunable settings compose, and typos are refused."""
+    problem = validate_spec(t.task)
+    t.require(problem is None, "TaskSpec", problem, "members as documented in neuprim.core.task.TaskSpec")
+    t.require(bool(t.task.fields), "TaskSpec.fields", t.task.fields, "every field class by its name")
+    check_config_groups(t.task)
+    choice, presets = read_task_config(t.task), list_task_presets(t.task)
+    levels = read_config_effort_levels(t.task, presets) or {}
+    chosen: list[tuple[str, str, Level | None]] = [(f"preset {preset}", preset, None) for preset in presets]
+    chosen += [(f"effort {number}", level.preset, level) for number, level in levels.items()]
+    for where, preset, level in chosen:
+        with _settings_accepted(t, where):
+            settings = preset_settings(t.task, preset, choice.scene, level)
+            check_config_parameter_names(t.task, settings)
+            _check_settings(t, asdict(settings.model), choice.options)
+    for scene in t.task.scenes:
+        preset_settings(t.task, choice.preset, scene.name)
+    for name, values in call_task_tunable_settings(t.task, build_settings(t.task, t.settings.model, t.options)).items():
+        for value in values:
+            tree: dict[str, Any] = {"model": asdict(t.settings.model), "task": {"options": dict(t.options)}}
+            *path, last = name.split(".")
+            node = tree
+            for part in path:
+                node = node.setdefault(part, {})
+            node[last] = value
+            with _settings_accepted(t, f"tunable_settings: {name}={value}"):
+                _check_settings(t, tree["model"], tree["task"]["options"])
+    for group in ("density", "colour"):
+        changed: dict[str, Any] = {group: {**getattr(t.settings.model, group), "no_such_setting": 1}}
+        where = f"TaskSpec.check with model.{group}.no_such_setting=1"
+        found = "it was accepted"
+        try:
+            t.task.check(build_settings(t.task, replace(t.settings.model, **changed), t.options))
+        except ConfigError as error:
+            found = str(error)
+        t.require("no_such_setting" in found, where, repr(found), "ConfigError, a message that names the setting")
+
+
+@contextmanager
+def _settings_accepted(t: TaskUnderTest, where: str) -> Iterator[None]:
+    try:
+        yield
+    except ConfigError as error:
+        t.require(False, where, f"a setting that is refused ({error})", "settings that the task accepts")
+
+
+def _check_settings(t: TaskUnderTest, model: dict[str, Any], options: dict[str, Any]) -> None:
+    complete = complete_task_options(t.task.options, options, f"task {t.task.name!r}")
+    t.task.check(build_settings(t.task, validate_settings(ModelSettings, model, "model"), complete))
+
+
+def check_fields_conformance(t: TaskUnderTest) -> None:
+    """A field is rebuilt from its class and JSON-able settings with the same parameters; other settings are refused."""
+    for kind, field in zip(("density", "colour"), t.build_fields(), strict=True):
+        name, settings = type(field).__name__, field.settings()
+        listed = (t.task.fields or {}).get(name)
+        t.require(listed is type(field), f"TaskSpec.fields[{name!r}]", listed, f"the class of the {kind}")
+        same = json.loads(json.dumps(settings, allow_nan=False)) == settings
+        t.require(same, f"{name}.settings()", settings, "values that JSON holds unchanged")
+        before, after = ([(s.name, tuple(s.shape)) for s in f.parameters()] for f in (field, type(field)(**settings)))
+        t.require(before == after, f"{name}(**settings)", f"parameters {after}", before)
+        try:
+            type(field)(**{**settings, "no_such_setting": 1})
+        except (TypeError, ValueError):
+            continue
+        t.require(False, f"{name}(no_such_setting=1)", "it was accepted", "TypeError, so that damage is noticed")
+
+
+def check_parameters_conformance(t: TaskUnderTest) -> None:
+    """Names of parameters are unique; shapes, rates and start values are valid and depend on nothing but the seed."""
+    taken = {s.name for s in GEOMETRY_SPECS}
+    for kind, spec in t.parameter_specs():
+        where = f"{kind}.parameters: {spec.name!r}"
+        t.require(str(spec.name).isidentifier(), where, repr(spec.name), "a name of letters, digits and _")
+        t.require(spec.name not in taken, where, "a name used twice", "a unique one")
+        taken.add(spec.name)
+        fits = isinstance(spec.shape, tuple) and all(isinstance(n, int) and n >= 0 for n in spec.shape)
+        t.require(fits, f"{where}: shape", spec.shape, "a tuple of whole numbers, () for a scalar")
+        t.require(math.isfinite(spec.lr) and spec.lr > 0, f"{where}: lr", spec.lr, "a positive rate")
+        t.require(spec.lr_unit in ("absolute", "extent"), f"{where}: lr_unit", spec.lr_unit, "absolute or extent")
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(1)
+        one = t.initial_model()
+        torch.manual_seed(2)
+        other = t.initial_model()
+    for kind, spec in t.parameter_specs():
+        where, value = f"{kind}.parameters: {spec.name!r}: start value", one.params[spec.name]
+        expected = (one.count, *spec.shape)
+        t.require(tuple(value.shape) == expected, where, f"shape {tuple(value.shape)}", expected)
+        t.require_finite(where, value)
+        t.require(torch.equal(value, other.params[spec.name]), f"{where}s of one seed", "different ones", "equal ones")
+
+
+def check_evaluation_conformance(t: TaskUnderTest) -> None:
+    """What the task measures, films and displays of its example can be used, and its orbit has every condition."""
+    task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
+    channels = find_channels(task, data)
+    image = data.test.pixels(0).over(data.background)
+    shown, rows = channels.display(image.clone()), [channels.display(row[None]) for row in image.clone()]
+    off = float((shown - torch.cat(rows)).abs().max())
+    t.require(off < 1e-4, "display of an image", f"{off:.3g} off its rows one by one", "each pixel by itself")
+    before = {name: value.clone() for name, value in model.params.items()}
+    try:
+        call_task_clips(task, data)
+        call_task_facts(task, data)
+        for i in range(len(data.test)):
+            truth = data.test.pixels(i).over(data.background)
+            call_task_mask(task, data, i)
+            call_task_metrics(task, data, i, 0.5 * truth, truth)
+        call_task_diagnose(task, data, model)
+        orbit = call_task_orbit(task, data, 3)
+        for spec in task.layers:
+            for view in t.views:
+                frame = LayerFrame(model, view.camera, view.conditions, t.settings.renderer, data.color_space)
+                one, two = (draw_task_layer(spec, frame, data.channels) for _ in range(2))
+                same = one is two is None or (one is not None and two is not None and torch.equal(one, two))
+                t.require(same, f"layer {spec.name!r} of view {view.name}", "other values the second time", "the same")
+    except ReturnError as error:  # it says what was found and what was expected
+        raise ConformanceError(f"task {task.name!r}: {t.check}: {error}") from error
+    changed = [name for name, value in model.params.items() if not torch.equal(value, before[name])]
+    t.require(not changed, "diagnose or layers", f"parameters {', '.join(changed)} changed", "the model as it was")
+    for view in orbit:
+        missing = [spec.name for spec in task.conditions if spec.name not in view.conditions]
+        t.require(not missing, f"orbit: view {view.name}", f"no {', '.join(missing)}", "every condition of the task")
+
+
+def check_loss_conformance(t: TaskUnderTest) -> None:
+    """The loss is one finite number with a finite gradient, least where image and truth agree, also under a mask."""
+    loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
+    pixels = t.dataset.train.pixels(0)
+    frame = Supervision(t.dataset.train.view(0), pixels.mask, pixels.alpha)
+    truth = pixels.over(t.dataset.background)
+    off = (truth + 0.2 * torch.rand(truth.shape, generator=torch.Generator().manual_seed(2))).requires_grad_()
+    value, parts = loss(off, truth, frame)
+    check_loss_returns(value, parts, off)
+    t.require(math.isfinite(value.item()), "loss", value.item(), "a finite number")
+    value.backward()
+    t.require_finite("gradient of the loss", off.grad)
+    t.require(off.grad is not None and bool(off.grad.any()), "gradient of the loss", "none or zero", "another one")
+    mask = torch.zeros(truth.shape[:2], dtype=torch.bool)
+    mask[: max(1, len(mask) // 2)] = True
+    masked = torch.where(mask[..., None], off.detach(), truth).requires_grad_()
+    part = loss(masked, truth, replace(frame, mask=mask))[0].item()
+    t.require(math.isfinite(part), "loss of a frame with a mask", part, "a finite number")
+    least = loss(truth.clone().requires_grad_(), truth, frame)[0].item()
+    t.require(least < value.item(), "loss of the truth itself", f"{least:g}", f"less than {value.item():g}")
+
+
+def check_channels_conformance(t: TaskUnderTest) -> None:
+    """A colour built for grey images has one channel and for five bands five, or ``build`` refuses such data."""
+    if t.task.example is not None or t.task.channels:
+        return  # only the task knows what data of other channels would look like, or there are no others
+    declared = {}
+    for count in (1, 5):
+        other = t.with_channels(count)
+        with suppress(NeuprimError, ValueError):  # refused
+            declared[count] = other.build_fields()[1].channels, other
+    if len(declared) == 2 and len({found for found, _ in declared.values()}) == 1:
+        return  # a fixed number, which the renderer compares with every background
+    for count, (found, other) in declared.items():
+        data = f"with data of {count} channel{'s' * (count > 1)}"
+        t.require(found == count, f"colour.channels {data}", found, count)
+        try:
+            other.draw(data, other.perturbed_model(torch.float32), other.views[0])
+        except FormError as error:
+            raise FormError(f"{data}: {error}") from error
+        for _ in other.trainer(2).run():
+            pass
+
+
+# ---------------------------------------------------------------- files and conditions
+
+
+def check_resume_conformance(t: TaskUnderTest) -> None:
+    """2N steps equal N steps, a checkpoint on disk and N more steps, bit for bit."""
+    whole, first, second = (t.trainer(2 * _STEPS) for _ in range(3))
+    for _ in range(_STEPS):
+        whole.train_step()
+        first.train_step()
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "checkpoint.safetensors"
+        tensors, header = first.state()
+        checkpoint.write_tensors(path, "checkpoint", tensors, {"task": t.task.name, **header})
+        header, tensors = checkpoint.read_tensors(path, "checkpoint")
+        second.load_state(tensors, header, str(path))
+    for _ in range(_STEPS):
+        whole.train_step()
+        second.train_step()
+    where = f"{2 * _STEPS} steps against {_STEPS} + resume + {_STEPS}"
+    t.require_equal(where, second.state()[0], whole.state()[0])
+
+
+def check_save_load_conformance(t: TaskUnderTest) -> None:
+    """A model comes back from its files with the same bits and picture; compressing it again changes nothing more."""
+    model = t.perturbed_model(torch.float32)
+    canonical = canonical_model(model)
+    with tempfile.TemporaryDirectory() as folder, torch.no_grad():
+        path = Path(folder) / "model.safetensors"
+        checkpoint.save_model(path, model, t.task.name, {})
+        loaded = checkpoint.load_model_checkpoint(path, t.task)[0]
+        t.require_equal("after loading", loaded.params, model.params)
+        t.require_equal("after folding twice", canonical_model(canonical).params, canonical.params)
+        for view in t.views[:3]:
+            image = t.draw("saved", model, view)
+            for where, other, tolerance in (("loading", loaded, 0.0), ("folding", canonical, 1e-4)):
+                change = float((t.draw(where, other, view) - image).abs().max())
+                found = f"a change of {change:.3g}"
+                t.require(change <= tolerance, f"view {view.name} after {where}", found, tolerance)
+        stored = [canonical.params]
+        for _ in range(2):
+            again = Primitives(model.density, model.colour, stored[-1])
+            checkpoint.save_compressed(Path(folder) / "model.neuprim", again, t.task.name, {}, LEVELS[1])
+            stored.append(checkpoint.load_model_checkpoint(Path(folder) / "model.neuprim", t.task)[0].params)
+        t.require_equal("compressed twice", stored[2], stored[1])
+
+
+def check_conditions_conformance(t: TaskUnderTest) -> None:
+    """Each condition parses text and refuses nonsense, any value in its range draws, and a missing one is refused."""
+    model = t.perturbed_model(torch.float32)
+    view = t.views[0]
+    for spec in t.task.conditions:
+        where = f"condition {spec.name!r}"
+        _check_condition_parsing(t, spec, where)
+        generator = torch.Generator().manual_seed(9)
+        others = {name: value for name, value in view.conditions.items() if name != spec.name}
+        ends = [torch.full(spec.shape, float(end)) for end in spec.range]
+        for value in (*ends, random_conformance_condition(spec, generator)):
+            changed = replace(view, conditions={**others, spec.name: value})
+            t.draw(f"{where} = {value.tolist()}", model, changed)
+        found = "it was drawn"
+        try:
+            render(model, view.camera, others, t.settings.renderer)
+        except (KeyError, NeuprimError) as error:
+            found = str(error)
+        t.require(spec.name in found, f"a frame without {where}", repr(found), "KeyError or ConfigError that names it")
+
+
+def _check_condition_parsing(t: TaskUnderTest, spec: ConditionSpec, where: str) -> None:
+    low, high = conformance_range(spec)
+    expected = torch.full(spec.shape, low + 0.25 * (high - low))
+    text = ",".join(f"{x:g}" for x in expected.flatten().tolist())
+    values = spec.parse(text)
+    shapes = [tuple(value.shape) for value in values]
+    fits = len(shapes) >= 1 and all(shape == spec.shape for shape in shapes)
+    t.require(fits, f"{where}: parse({text!r})", f"shapes {shapes}", f"frames of shape {spec.shape}")
+    near = torch.allclose(values[0].float(), expected, rtol=1e-4, atol=1e-6)
+    t.require(near, f"{where}: parse({text!r})", values[0].tolist(), expected.tolist())
+    try:
+        spec.parse("no such value")
+    except NeuprimError:
+        return
+    t.require(False, f"{where}: parse('no such value')", "it was accepted", "ConfigError")
+
+
+# ---------------------------------------------------------------- running the checks
+
+CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
+    "description": check_description_conformance,
+    "fields": check_fields_conformance,
+    "parameters": check_parameters_conformance,
+    "evaluation": check_evaluation_conformance,
+    "loss": check_loss_conformance,
+    "channels": check_channels_conformance,
+    "activity": check_activity_conformance,
+    "integral": check_integral_conformance,
+    "gradients": check_gradients_conformance,
+    "scaling": check_scaling_conformance,
+    "split": check_split_conformance,
+    "reductions": check_reductions_conformance,
+    "resume": check_resume_conformance,
+    "save_load": check_save_load_conformance,
+    "conditions": check_conditions_conformance,
+}
+"""Every check by name, in reading order."""
 
 
 def named_checks(

@@ -75,6 +75,30 @@ class TaskUnderTest:
         ok = value is None or bool(torch.isfinite(value).all())
         self.require(ok, where, "NaN or infinity", "finite numbers")
 
+    def require_layout(self, where: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+        """Raise :class:`ConformanceError` unless the tensors have the expected names, dtypes and shapes and are
+        finite."""
+        self.require(set(found) == set(expected), where, f"tensors {sorted(found)}", sorted(expected))
+        for name, value in expected.items():
+            a, b = (f"{x.dtype} {tuple(x.shape)}" for x in (found[name], value))
+            self.require(a == b, f"{where}: {name}", a, b)
+            self.require_finite(f"{where}: {name}", found[name])
+
+    def require_close(self, where: str, found: Tensor, expected: Tensor, rows: Tensor) -> None:
+        """Raise :class:`ConformanceError` unless values of the primitives ``rows`` agree to a millionth of the
+        largest."""
+        if len(rows):
+            error = (found - expected).abs() / expected.abs().max().clamp_min(1e-30)
+            i = int(error.argmax())
+            place = f"{where}, primitive {int(rows[i])}"
+            self.require(float(error[i]) <= 1e-6, place, f"{float(found[i]):.6g}", f"{float(expected[i]):.6g}")
+
+    def require_equal(self, where: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
+        """Raise :class:`ConformanceError` unless tensors of the same names have equal bits."""
+        for name in expected.keys() | found.keys():
+            same = name in found and name in expected and torch.equal(found[name], expected[name])
+            self.require(same, f"{where}: {name}", "different values", "equal bits")
+
     def draw(self, where: str, model: Primitives, view: View) -> Tensor:
         """Draw (H, W, C) colours of a view, which must be finite."""
         try:
@@ -108,6 +132,16 @@ class TaskUnderTest:
     def views(self) -> list[View]:
         """The training views."""
         return [self.dataset.train.view(i) for i in range(len(self.dataset.train))]
+
+    @property
+    def double_views(self) -> list[View]:
+        """The training views with camera and conditions in float64."""
+        found = []
+        for view in self.views:
+            conditions = {k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()}
+            camera = replace(view.camera, viewmat=view.camera.viewmat.double())
+            found.append(replace(view, camera=camera, conditions=conditions))
+        return found
 
     def build_fields(self) -> tuple[DensityField, ColourField]:
         """Build fresh fields."""
@@ -196,15 +230,11 @@ def conformance_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3
     The conditions have random values, which the images do not depend on.
     """
     generator = torch.Generator().manual_seed(7)
-    cameras = [_conformance_camera(1.1 * i, 0.6 * math.sin(2.0 * i)) for i in range(8)]
-    views = [
-        View(
-            f"{'train' if i < 6 else 'test'}{i % 6}",
-            c,
-            {s.name: random_conformance_condition(s, generator) for s in conditions},
-        )
-        for i, c in enumerate(cameras)
-    ]
+    views = []
+    for i in range(8):
+        drawn = {spec.name: random_conformance_condition(spec, generator) for spec in conditions}
+        camera = _conformance_camera(1.1 * i, 0.6 * math.sin(2.0 * i))
+        views.append(View(f"{'train' if i < 6 else 'test'}{i % 6}", camera, drawn))
 
     def start(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
         means = 1.4 * (torch.rand(count, 3, generator=generator) - 0.5)
@@ -219,7 +249,7 @@ def conformance_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3
         train=_ConformanceViews(views[:6], channels),
         test=_ConformanceViews(views[6:], channels),
         start=start,
-        extent=camera_extent(cameras[:6]),
+        extent=camera_extent([view.camera for view in views[:6]]),
         background=torch.full((channels,), 0.3),
         channels=channels,
         data_source="generated",

@@ -97,7 +97,7 @@ def test_conformance_holds_packages_to_their_levels(levels: Path) -> None:
     check()
     file = levels / "conf" / "effort" / "toy.yaml"
     file.write_text(file.read_text().replace("model.primitives: 400", "train.rates.glow: 0.1"))
-    with pytest.raises(ConformanceError, match=r"effort 4: train\.rates\.glow: found no such parameter"):
+    with pytest.raises(ConformanceError, match=r"effort 4: found .*train\.rates\.glow: no such parameter"):
         check()
     file.write_text(file.read_text().replace("train.rates.glow: 0.1", "model.primitives: 0"))
     with pytest.raises(ConformanceError, match=r"model\.primitives"):

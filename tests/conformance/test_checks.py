@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
 from neuprim.conformance import ConformanceError, check_task, checks, named_checks
 from neuprim.conformance.task_under_test import TaskUnderTest
 from neuprim.core.errors import ConfigError
+from neuprim.core.task import TaskSpec
 from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.tasks.static import TASK as STATIC
@@ -19,33 +19,29 @@ from neuprim.tasks.static import TASK as STATIC
 Check = Callable[[], None]
 
 
-@checks(STATIC)
-def test_static(check: Check) -> None:
-    check()
+VARIANTS: dict[str, tuple[TaskSpec, str | None, dict[str, Any]]] = {
+    "static": (STATIC, None, {}),
+    "static-gaussian": (STATIC, None, {"density": {"form": "gaussian"}, "sh_degree": 0}),
+    "static-edge": (STATIC, None, {"density": {"edge": 1, "gain": True}, "sh_degree": 0}),
+    "dynamic": (DYNAMIC, None, {}),
+    "dynamic-edge": (
+        DYNAMIC,
+        "paper",
+        {"density": {"time": "phase+offset+window+motion", "edge": 2, "gain": True}},
+    ),
+    "relight": (RELIGHT, None, {"colour": {"form": "multiplicative", "hidden": 4, "visibility": "none"}}),
+}
 
 
-@checks(STATIC, model={"density": {"form": "gaussian"}, "sh_degree": 0})
-def test_static_with_a_gaussian_density(check: Check) -> None:
-    check()
-
-
-@checks(STATIC, model={"density": {"edge": 1, "gain": True}, "sh_degree": 0})
-def test_static_with_a_soft_edge(check: Check) -> None:
-    check()
-
-
-@checks(DYNAMIC, preset="paper", model={"density": {"time": "phase+offset+window+motion", "edge": 2, "gain": True}})
-def test_dynamic_with_a_soft_edge(check: Check) -> None:
-    check()
-
-
-@checks(DYNAMIC)
-def test_dynamic(check: Check) -> None:
-    check()
-
-
-@checks(RELIGHT, model={"colour": {"form": "multiplicative", "hidden": 4, "visibility": "none"}})
-def test_relight(check: Check) -> None:
+@pytest.mark.parametrize(
+    "check",
+    [
+        pytest.param(run, id=f"{variant}-{name}")
+        for variant, (task, preset, model) in VARIANTS.items()
+        for name, run in named_checks(task, preset, model).items()
+    ],
+)
+def test_built_in_tasks(check: Check) -> None:
     check()
 
 
@@ -87,8 +83,3 @@ def test_an_unforeseen_error_names_task_and_check() -> None:
     ) as caught:
         named_checks(replace(STATIC, build=build))["split"]()  # type: ignore[arg-type]
     assert isinstance(caught.value.__cause__, RuntimeError)
-
-
-def test_pytest_is_imported_only_where_it_is_used() -> None:
-    code = "import sys, neuprim.conformance as c; c.named_checks; sys.exit('pytest' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0

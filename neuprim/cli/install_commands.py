@@ -11,14 +11,21 @@ from typing import TYPE_CHECKING, Any
 
 from packaging.requirements import Requirement
 
-from neuprim.cli.command import Command, plain_console
-from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.plugins.registry import EXPORTERS, INSPECTORS, LOSSES, SCENES, TASKS, PluginGroup, PluginReport
+from neuprim.cli.command import Command
+from neuprim.core.errors import NeuprimError
+from neuprim.plugins.registry import (
+    EXPORTERS,
+    INSPECTORS,
+    LOSSES,
+    SCENES,
+    TASKS,
+    PluginGroup,
+    PluginReport,
+    qualified_plugin_name,
+)
 from neuprim.version import __version__
 
 if TYPE_CHECKING:
-    from rich.console import Console
-
     from neuprim.core.extensions import LossExtension, SceneExtension
     from neuprim.core.task import TaskSpec
 
@@ -34,46 +41,30 @@ _OTHER_PLUGINS: tuple[tuple[str, PluginGroup[Any]], ...] = (
 
 
 def list_printed_plugins() -> list[str]:
-    """Return the lines of ``neuprim tasks``; a broken plugin is one of them, with its error, and stops no other."""
+    """Return the lines of ``neuprim tasks``: names as users type them; a broken plugin is a line with its error."""
     lines: list[str] = []
     scenes = SCENES.survey()
-    for report in TASKS.survey():
-        try:
-            if report.spec is None:
-                raise ConfigError(report.error or "cannot be loaded")
-            summary, body = report.spec.summary, _describe_task_choices(report.spec, scenes)
-        except NeuprimError as broken:
-            summary, body = "BROKEN", [str(broken)]
-        title = f"{report.info.name}  ({report.info.origin})  {summary}{_format_printed_plugin_note(report)}"
-        lines += [title, *(f"  {line}" for line in body), ""]
-    tasks = {info.name for info in TASKS.list_plugins()}
-    homeless = [report for report in scenes if report.info.name.partition(".")[0] not in tasks]
-    if homeless:
-        described = (f"  {_format_printed_plugin(report, report.info.name)}" for report in homeless)
-        lines += ["scenes of tasks that are not installed", *described, ""]
+    for task in TASKS.survey():
+        lines.append(_format_printed_plugin(TASKS, task))
+        if task.spec is not None:
+            try:
+                lines += [f"  {line}" for line in _describe_task_choices(task.spec, scenes)]
+            except NeuprimError as broken:
+                lines.append(f"  BROKEN  {broken}")
+        lines.append("")
     for heading, group in _OTHER_PLUGINS:
-        reports = group.survey()
-        width = max((len(report.info.name) for report in reports), default=0)
-        lines += [heading] if reports else []
-        for report in reports:
-            lines.append(f"  {_format_printed_plugin(report, f'{report.info.name:{width}}')}")
+        lines.append(heading)
+        for report in group.survey():
+            lines.append(f"  {_format_printed_plugin(group, report)}")
             if group is LOSSES and report.spec is not None:
                 lines += [f"    {line}" for line in _describe_options(report.spec)]
-        lines += [""] if reports else []
+        lines.append("")
     return lines
 
 
-def _format_printed_plugin(report: PluginReport[Any], name: str) -> str:
-    if report.spec is None:
-        return f"{name}  BROKEN  ({report.info.origin})  {report.error}{_format_printed_plugin_note(report)}"
-    return (
-        f"{name}  ({report.info.origin})  {getattr(report.spec, 'summary', '')}".rstrip()
-        + _format_printed_plugin_note(report)
-    )
-
-
-def _format_printed_plugin_note(report: PluginReport[Any]) -> str:
-    return f"  [{report.note}]" if report.note else ""
+def _format_printed_plugin(group: PluginGroup[Any], report: PluginReport[Any]) -> str:
+    text = f"BROKEN  {report.error}" if report.spec is None else getattr(report.spec, "summary", "")
+    return f"{group.shortest_name(report.info)}  ({report.info.origin})  {text}".rstrip()
 
 
 def _describe_task_choices(spec: TaskSpec, scenes: list[PluginReport[SceneExtension]]) -> list[str]:
@@ -81,13 +72,20 @@ def _describe_task_choices(spec: TaskSpec, scenes: list[PluginReport[SceneExtens
     from neuprim.config.task_files import LEVELS, read_config_effort_levels
 
     check_config_groups(spec)
-    default, levels = read_task_config(spec), read_config_effort_levels(spec, list_task_presets(spec))
+    default, presets = read_task_config(spec), list_task_presets(spec)
+    levels = read_config_effort_levels(spec, presets)
     rows = [(s.name, f"{s.summary}{' (default)' if s.name == default.scene else ''}") for s in spec.scenes]
-    rows += [_describe_scene(spec, report) for report in scenes if report.info.name.startswith(f"{spec.name}.")]
+    for report in scenes:
+        if report.info.name.startswith(f"{spec.name}."):
+            name = SCENES.shortest_name(report.info)
+            if any(scene.name == name for scene in spec.scenes):  # the bare name means the task's own
+                name = qualified_plugin_name(report.info.distribution, name)
+            text = f"BROKEN  {report.error}" if report.spec is None else report.spec.scene.summary
+            rows.append((name, f"({report.info.origin})  {text}"))
     width = max(len(name) for name, _ in rows)
     found = {
         "scenes": [f"{name:{width}}  {text}" for name, text in rows],
-        "presets": [", ".join(name + " (default)" * (name == default.preset) for name in list_task_presets(spec))],
+        "presets": [", ".join(name + " (default)" * (name == default.preset) for name in presets)],
         "effort": [f"{LEVELS[0]} (fast) to {LEVELS[-1]} (good), of preset {levels[1].preset}"] if levels else [],
         "conditions": [", ".join(f"{c.name} [{c.unit}]" for c in spec.conditions)] if spec.conditions else [],
         "options": _describe_options(spec),
@@ -97,23 +95,6 @@ def _describe_task_choices(spec: TaskSpec, scenes: list[PluginReport[SceneExtens
 
 def _describe_options(spec: TaskSpec | LossExtension) -> list[str]:
     return [f"task.options.{name}={option[0]}  {option[1]}" for name, option in spec.options.items()]
-
-
-def _describe_scene(spec: TaskSpec, report: PluginReport[SceneExtension]) -> tuple[str, str]:
-    """(name, summary or error) of a scene that another package adds to a task."""
-    from neuprim.config import check_scene_config
-
-    name = report.info.name.removeprefix(f"{spec.name}.")
-    problem, note = report.error, _format_printed_plugin_note(report)
-    if any(scene.name == name for scene in spec.scenes):
-        note = f"  [hidden by the task's own; {SCENES.choice(report.info)} chooses it]"
-    if report.spec is not None:
-        try:
-            check_scene_config(spec, name, report.spec.config_package)
-            return name, f"({report.info.origin})  {report.spec.scene.summary}{note}"
-        except ConfigError as error:
-            problem = str(error)
-    return name, f"BROKEN  ({report.info.origin})  {problem}{note}"
 
 
 def _tasks_command(arguments: argparse.Namespace) -> int:
@@ -155,16 +136,12 @@ _DEVELOPERS = ("test", "docs", "dev")
 Rows = list[tuple[str, str]]
 
 
-def print_doctor_report(console: Console | None = None) -> int:
+def print_doctor_report() -> int:
     """Print what is installed and what works; return 0, or 1 if no backend works."""
-    from rich.table import Table
-    from rich.text import Text
-
     from neuprim.core.compute.kernels import cache_directory as kernel_cache
     from neuprim.core.io.files import cache_directory
     from neuprim.core.render import backends
 
-    console = console or plain_console()
     reasons = {name: _probe_doctor_backend(name) for name in backends.backend_names()}
     working = None in reasons.values()
     tables: dict[str, Rows] = {
@@ -178,14 +155,10 @@ def print_doctor_report(console: Console | None = None) -> int:
         ],
     }
     for title, rows in tables.items():
-        table = Table(title=title, title_justify="left", show_header=False)
-        table.add_column(no_wrap=True)
-        table.add_column(overflow="fold")
-        for name, value in rows:
-            table.add_row(Text(name), Text(value))  # "neuprim[video]" is no markup
-        console.print(table)
+        width = max(len(name) for name, _ in rows)
+        print(title, *(f"  {name:{width}}  {value}" for name, value in rows), "", sep="\n")
     if not working:
-        console.print("no renderer backend works on this machine")
+        print("no renderer backend works on this machine")
     return 0 if working else 1
 
 
@@ -205,16 +178,7 @@ def _describe_doctor_machine() -> Rows:
         ("cpu", cpu_name()),
         ("cores", str(total) if usable == total else f"{usable} of {total} usable by this process"),
         ("simd", ", ".join(simd) or "none known"),
-        ("memory", _describe_memory()),
     ]
-
-
-def _describe_memory() -> str:
-    try:
-        total = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    except (ValueError, OSError, AttributeError):
-        return "unknown"
-    return f"{total / 2**30:.1f} GiB"
 
 
 def _list_doctor_packages() -> Rows:

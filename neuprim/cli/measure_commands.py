@@ -16,14 +16,13 @@ from neuprim.cli.command import (
     check_run_dir_argument,
     parse_count,
     plain_console,
+    print_columns,
     take_override_arguments,
     take_render_override_arguments,
 )
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
-    from rich.table import Table
-
     from neuprim.runs.paper import PlannedRun
     from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 
@@ -104,7 +103,7 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _bench_command(args: argparse.Namespace) -> int:
     """List the tables, or run what stands for their rows."""
-    from neuprim.cli.run_commands import run_command_here
+    from neuprim.cli.progress import run_command_here
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.open import read_metrics
     from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
@@ -316,7 +315,8 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
     if "length" in record.facts:
         console.print(record.facts["length"])
     for title, numbers in (("front of speed", record.speed), ("front of size", record.size)):
-        console.print(_build_printed_front_table(title, record, numbers))
+        console.print(title)
+        print_columns(_list_front_rows(record, numbers))
         for place, number in enumerate(numbers, 1):
             console.print(f"{commands[number]}  # {place}")
         console.print()
@@ -327,21 +327,12 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
         console.print(folder / name)
 
 
-def _build_printed_front_table(title: str, record: TradeoffRecord, numbers: Sequence[int]) -> Table:
-    """Build the table of the reference and a front; the numbers are those of the commands."""
-    from rich import box
-    from rich.table import Table
-    from rich.text import Text
-
+def _list_front_rows(record: TradeoffRecord, numbers: Sequence[int]) -> list[Sequence[str]]:
+    """List the reference and a front; the numbers are those of the commands."""
     trained = bool(record.points[0].run_dir)
-    table = Table(title=title, title_justify="left", box=box.SIMPLE, padding=(0, 1, 0, 0))
     names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "bytes", *(["ms/step"] if trained else [])]
-    for name in names:
-        table.add_column(name, justify="right", no_wrap=True)
-    first = "centre" if trained else "ref."
-    for place, number in ((first, 0), *((str(k), number) for k, number in enumerate(numbers, 1))):
-        table.add_row(*(Text(cell) for cell in (place, *_format_printed_point(record.points[number]))))
-    return table
+    first = ("centre" if trained else "ref.", *_format_printed_point(record.points[0]))
+    return [names, first, *((str(k), *_format_printed_point(record.points[n])) for k, n in enumerate(numbers, 1))]
 
 
 def _format_printed_point(point: TradeoffPoint) -> tuple[str, ...]:

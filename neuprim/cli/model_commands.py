@@ -5,8 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import textwrap
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -62,11 +63,12 @@ def _take_export_options(arguments: argparse.Namespace, rest: list[str], parser:
 
 
 def _export_command(arguments: argparse.Namespace) -> int:
-    from neuprim.cli.progress import LineProgress
+    from neuprim.cli.progress import DrawProgress
     from neuprim.runs.export import export_run
 
     out, options = arguments.out, arguments.options
-    report = export_run(arguments.run, arguments.format, out, options, arguments.force, LineProgress())
+    with DrawProgress() as progress:
+        report = export_run(arguments.run, arguments.format, out, options, arguments.force, progress.show)
     print_export_report(report, arguments.json)
     return 0
 
@@ -75,12 +77,8 @@ def _export_help(words: Sequence[str]) -> str:
     """Without a format only package metadata is read; with one, that exporter is imported."""
     if not {"-h", "--help"} & set(words):
         return ""
-    name = None
-    for word, following in zip(words, [*words[1:], ""], strict=True):
-        key, equals, value = word.partition("=")
-        if name is None and key == "--format":
-            name = value if equals else following * (not following.startswith("-")) or None
-    return "\n".join(_list_export_formats() if name is None else _describe_export_format(name))
+    found = re.search(r"--format[= ]([^-\s]\S*)", " ".join(words))
+    return "\n".join(_list_export_formats() if found is None else _describe_export_format(found[1]))
 
 
 def _list_export_formats() -> Iterator[str]:
@@ -123,24 +121,11 @@ def print_export_report(report: ExportReport, as_json: bool) -> None:
         return
     print(*report.files, sep="\n")
     print("lossless" if report.lossless else "lossy")
-    _print_export_errors(report.errors)
+    width = max((len(name) for name in report.errors), default=0)
+    for name, value in report.errors.items():
+        print(f"{name:{width}}  {value:.4f}")
     for note in report.notes:
         print(f"note: {note}")
-
-
-def _print_export_errors(errors: Mapping[str, float]) -> None:
-    """Print a line per number; numbers of several things, as ``frame_0007.relative_l2``, in a line per thing."""
-    rows: dict[str, dict[str, str]] = {}
-    for name, value in errors.items():
-        thing, _, key = name.rpartition(".")
-        rows.setdefault(thing, {})[key] = f"{value:.4f}"
-    if "" in rows or len(rows) < 2:
-        width = max((len(name) for name in errors), default=0)
-        for name, value in errors.items():
-            print(f"{name:{width}}  {value:.4f}")
-    else:
-        columns = list(dict.fromkeys(key for row in rows.values() for key in row))
-        print_columns([("", *columns), *((t, *(row.get(key, "") for key in columns)) for t, row in rows.items())])
 
 
 def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
@@ -192,13 +177,15 @@ def _add_compress_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _compress_command(args: argparse.Namespace) -> int:
-    from neuprim.cli.progress import LineProgress
+    from neuprim.cli.progress import DrawProgress
     from neuprim.search.compress import CompressRequest, compress_run
 
     request = CompressRequest(
         args.run_dir, args.level, args.bits, args.out, args.force, args.seconds, args.steps, args.tolerance
     )
-    _print_compression(compress_run(request, LineProgress()))
+    with DrawProgress() as progress:
+        made = compress_run(request, progress.show)
+    _print_compression(made)
     return 0
 
 

@@ -1,4 +1,4 @@
-"""Show the progress of commands: a bar on a terminal, otherwise a line now and then."""
+"""Show the progress of commands: a bar on a terminal, otherwise a line now and then; and run a scene under it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Self
 
 from rich import box
@@ -15,10 +16,12 @@ from rich.progress import BarColumn, Progress, ProgressColumn, TextColumn, TimeE
 from rich.table import Table
 from rich.text import Text
 
-from neuprim.cli.command import plain_console
+from neuprim.cli.command import describe_interrupted_command, plain_console
 from neuprim.config import RunConfig
+from neuprim.config.command_settings import LOOPBACK, LauncherSettings, ViewerSettings
+from neuprim.config.overrides import CommandLine
 from neuprim.runs.fit import Evaluated, Event, Finishing, Note, Preparing, Step
-from neuprim.runs.launch.jobs import ENDED, JobStatus
+from neuprim.runs.launch.jobs import JobStatus
 
 
 class _ProgressBar:
@@ -114,22 +117,6 @@ class DrawProgress(_ProgressBar):
             self.print_note(f"{text}, {fraction:.0%}")
 
 
-class LineProgress:
-    """Print a line per stage and quarter."""
-
-    def __init__(self) -> None:
-        self.console, self.last = plain_console(stderr=True), ("", -1.0)
-
-    def __call__(self, text: str, fraction: float) -> None:
-        if text != self.last[0] or fraction >= self.last[1] + 0.25:
-            self.last = (text, fraction)
-            self.console.print(f"{text}, {fraction:.0%}" if fraction > 0 else text)
-
-    def print_note(self, text: str) -> None:
-        """Print a line that stays."""
-        self.console.print(f"neuprim: {text}")
-
-
 def print_notes(event: Event) -> None:
     """Print notes on standard output, for commands whose notes are what they were asked for."""
     if isinstance(event, Note):
@@ -141,11 +128,6 @@ def print_notes(event: Event) -> None:
 _LINE_INTERVAL = 0.25
 """Share of a training between two lines, where there is no terminal."""
 
-_STATE_ORDER = ("training", "finishing", "preparing", "starting", "failed", "interrupted", "done", "waiting")
-"""Jobs that go first where not all rows fit the screen."""
-
-_STYLES = {"failed": "red", "done": "green", "waiting": "dim"}
-
 
 class RunLaunchProgress:
     """Show several runs: one table on a terminal, a line now and then elsewhere. Call it with their statuses."""
@@ -155,7 +137,6 @@ class RunLaunchProgress:
         self.live = self.console.is_terminal
         self._directories = [config.output_dir for config in configs]
         self._statuses = [JobStatus()] * len(configs)
-        self._seconds: dict[int, float] = {}
         self._printed: dict[int, tuple[object, ...]] = {}
         self._display = Live(self, console=self.console, redirect_stdout=True)
 
@@ -170,10 +151,6 @@ class RunLaunchProgress:
     def __call__(self, number: int, status: JobStatus) -> None:
         """Show a run's status."""
         before, self._statuses[number] = self._statuses[number], status
-        if status.state != "waiting":
-            self._seconds.setdefault(number, time.monotonic())
-        if status.state in ENDED and before.state not in ENDED:
-            self._seconds[number] = time.monotonic() - self._seconds[number]  # a time, from now on a duration
         if not self.live:
             self._print_line(number, status)
             self._print_change(number, before, status)
@@ -205,28 +182,15 @@ class RunLaunchProgress:
 
     def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
         table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
-        table.add_column("run", overflow="fold")
-        table.add_column("state", no_wrap=True)
-        for name in ("steps", "held-out dB", "seconds"):
-            table.add_column(name, justify="right", no_wrap=True)
-        table.add_column("", overflow="ellipsis", no_wrap=True)
-        room = max(console.size.height - 6, 4)
-        order = sorted(range(len(self._statuses)), key=lambda n: (_STATE_ORDER.index(self._statuses[n].state), n))
-        for number in sorted(order[:room]):
-            status, name = self._statuses[number], self._directories[number].name
-            numbers = (_format_steps(status), _format_psnr(status), self._format_seconds(number))
-            cells = (name, _format_state(status), *numbers, status.text)
-            table.add_row(*(Text(cell, style=_STYLES.get(status.state, "")) for cell in cells))
+        for name in ("run", "state", "steps", "held-out dB", ""):
+            table.add_column(name, overflow="fold" if name == "run" else "ellipsis", no_wrap=name != "run")
+        for directory, status in zip(self._directories, self._statuses, strict=True):
+            if status.state not in ("waiting", "done"):
+                cells = (_format_state(status), _format_steps(status), _format_psnr(status), status.text)
+                table.add_row(*(Text(cell) for cell in (directory.name, *cells)))
         yield table
         counts = Counter(status.state for status in self._statuses)
-        more = f"; {len(order) - room} not shown" if len(order) > room else ""
-        yield Text("  ".join(f"{counts[state]} {state}" for state in _STATE_ORDER if counts[state]) + more)
-
-    def _format_seconds(self, number: int) -> str:
-        if number not in self._seconds:
-            return ""
-        seconds = self._seconds[number]
-        return f"{seconds if self._statuses[number].state in ENDED else time.monotonic() - seconds:.0f}"
+        yield Text("  ".join(f"{count} {state}" for state, count in counts.items()))
 
 
 def _format_state(status: JobStatus) -> str:
@@ -239,3 +203,53 @@ def _format_steps(status: JobStatus) -> str:
 
 def _format_psnr(status: JobStatus, unit: str = "") -> str:
     return "" if status.psnr is None else f"{status.psnr:.2f}{unit}"
+
+
+# ---------------------------------------------------------------- a run in this process
+
+
+def run_command_here(
+    config: RunConfig,
+    typed: CommandLine,
+    viewer: ViewerSettings | None = None,
+    launcher: LauncherSettings | None = None,
+) -> Path:
+    """Run one configuration in this process and return its directory.
+
+    An interruption says where the run is and the command that continues it.
+
+    Args:
+        launcher: where the chunks of a scene that is fitted in chunks work; None: here.
+    """
+    from neuprim.runs.run import run
+
+    try:
+        with RunProgress(f"{config.task}/{config.scene_name}") as events:
+            if viewer is not None:
+                return _run_with_viewer(config, events, viewer)
+            return run(config, events, launcher=launcher or LauncherSettings())
+    except KeyboardInterrupt:
+        raise KeyboardInterrupt(describe_interrupted_command(config.output_dir, typed)) from None
+
+
+def _run_with_viewer(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
+    from neuprim.runs.run import run
+    from neuprim.viewer.view import LiveTraining
+
+    warn_of_open_host(settings)
+    with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:
+        return run(config, live, live.between)
+
+
+def warn_of_open_host(settings: ViewerSettings) -> None:
+    """Warn of an address that other machines can reach."""
+    from neuprim.viewer.server import is_loopback
+
+    if not is_loopback(settings.host):
+        port = settings.port or 8080
+        print(
+            f"neuprim: warning: other machines can reach the viewer at {settings.host}, without encryption: whoever "
+            "can read the network can read its token. Safer: leave the host out, and type on the other machine "
+            f"`ssh -L {port}:{LOOPBACK}:{port} THIS_MACHINE`",
+            file=sys.stderr,
+        )

@@ -18,7 +18,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_
 
 if TYPE_CHECKING:
     from neuprim.config import RunConfig
-    from neuprim.config.command_settings import LauncherSettings, SearchTarget, ViewerSettings
+    from neuprim.config.command_settings import LauncherSettings, SearchTarget
     from neuprim.config.overrides import CommandLine
     from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
     from neuprim.runs.launch.jobs import JobResult
@@ -78,6 +78,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _run_command(args: argparse.Namespace) -> int:
+    from neuprim.cli.progress import run_command_here
     from neuprim.config import compose, compose_all, read_stored_config
     from neuprim.config.command_settings import (
         LauncherSettings,
@@ -123,33 +124,6 @@ def _run_command(args: argparse.Namespace) -> int:
         return run_command_with_launcher(configs, overrides, launcher, typed)
     print(run_command_here(configs[0], typed, viewer, launcher))
     return 0
-
-
-def run_command_here(
-    config: RunConfig,
-    typed: CommandLine,
-    viewer: ViewerSettings | None = None,
-    launcher: LauncherSettings | None = None,
-) -> Path:
-    """Run one configuration in this process and return its directory.
-
-    An interruption says where the run is and the command that continues it.
-
-    Args:
-        launcher: where the chunks of a scene that is fitted in chunks work; None: here.
-    """
-    from neuprim.cli.progress import RunProgress
-    from neuprim.cli.view_commands import run_command_with_viewer
-    from neuprim.config.command_settings import LauncherSettings
-    from neuprim.runs.run import run
-
-    try:
-        with RunProgress(f"{config.task}/{config.scene_name}") as events:
-            if viewer is not None:
-                return run_command_with_viewer(config, events, viewer)
-            return run(config, events, launcher=launcher or LauncherSettings())
-    except KeyboardInterrupt:
-        raise KeyboardInterrupt(describe_interrupted_command(config.output_dir, typed)) from None
 
 
 def _run_command_with_target(

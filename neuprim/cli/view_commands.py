@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,9 +28,6 @@ from neuprim.core.errors import ConfigError, DataError
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from neuprim.cli.progress import RunProgress
-    from neuprim.config import RunConfig
-    from neuprim.config.command_settings import ViewerSettings
     from neuprim.core.environment import EnvironmentFile
     from neuprim.core.io.vdb import GridHeader, VdbGrid
 
@@ -211,47 +208,22 @@ def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _view_command(args: argparse.Namespace) -> int:
     """Show the run until Ctrl-C."""
-    from neuprim.cli.progress import LineProgress
+    from neuprim.cli.progress import DrawProgress, warn_of_open_host
     from neuprim.config.command_settings import LOOPBACK, ViewerSettings
     from neuprim.viewer.view import view_run
 
     settings = ViewerSettings(args.host or LOOPBACK, args.port)
-    _print_open_host_warning(settings)
-    progress = LineProgress()
+    warn_of_open_host(settings)
 
     def print_address(address: str) -> None:
         print(f"{address}\nopen it in a browser; Ctrl-C ends the viewer", flush=True)
 
     try:
-        view_run(args.run_dir, settings, print_address, progress.print_note, progress)
+        with DrawProgress() as progress:
+            view_run(args.run_dir, settings, print_address, progress.print_note, progress.show)
     except KeyboardInterrupt:
         print("neuprim: the viewer is closed", file=sys.stderr)
     return 0
-
-
-def run_command_with_viewer(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:
-    """Run a training with a live viewer; raise as :func:`neuprim.runs.run.run`."""
-    from neuprim.runs.fit import Note
-    from neuprim.runs.run import run
-    from neuprim.viewer.view import LiveTraining
-
-    _print_open_host_warning(settings)
-    with LiveTraining(settings, config, lambda address: events(Note(f"the viewer is at {address}")), events) as live:
-        return run(config, live, live.between)
-
-
-def _print_open_host_warning(settings: ViewerSettings) -> None:
-    from neuprim.config.command_settings import LOOPBACK
-    from neuprim.viewer.server import is_loopback
-
-    if not is_loopback(settings.host):
-        port = settings.port or 8080
-        print(
-            f"neuprim: warning: other machines can reach the viewer at {settings.host}, without encryption: whoever "
-            "can read the network can read its token. Safer: leave the host out, and type on the other machine "
-            f"`ssh -L {port}:{LOOPBACK}:{port} THIS_MACHINE`",
-            file=sys.stderr,
-        )
 
 
 def _parse_port(text: str) -> int:
@@ -272,9 +244,6 @@ VIEW_COMMAND = Command(
 # ---------------------------------------------------------------- vdb info
 
 
-_GRID_COLUMNS = ("grid", "type", "compression", "voxel size", "bounds", "active", "range", "dense")
-
-
 def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("info",), metavar="info", help="what to do")
     parser.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
@@ -290,7 +259,7 @@ def _vdb_info_command(arguments: argparse.Namespace) -> int:
         return 0
     console = plain_console()
     for file in files:
-        _print_vdb_table(console, _describe_vdb_command_file(file))
+        _print_vdb_file(console, _describe_vdb_command_file(file))
     for note in notes:
         console.print(note)
     return 0
@@ -372,48 +341,25 @@ def _vdb_command_to_json(value: Any) -> Any:
     return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
-def _print_vdb_table(console: Console, file: dict[str, Any]) -> None:
-    from rich.box import SIMPLE_HEAD
-    from rich.table import Table
-    from rich.text import Text
-
-    grids = file["grids"]
-    title = f"{file['path']}  (version {file['version']}, {len(grids)} {'grid' if len(grids) == 1 else 'grids'})"
-    table = Table(title=Text(_printable(title)), title_justify="left", box=SIMPLE_HEAD)
-    for name in _GRID_COLUMNS:
-        table.add_column(name, overflow="fold", no_wrap=name in ("bounds", "active", "range", "dense"))
-    for grid in grids:
-        table.add_row(*(Text(_printable(cell)) for cell in _format_grid_cells(grid)))
-    console.print(table)
-    for grid in grids:
+def _print_vdb_file(console: Console, file: dict[str, Any]) -> None:
+    console.print(_printable(f"{file['path']}  (version {file['version']}, {len(file['grids'])} grids)"))
+    for grid in file["grids"]:
+        kind = grid["type"] + " as half" * grid["half"]
+        texts = [f"{kind}, {grid['class']}, {grid['compression']}, {grid['map']}"]
+        if grid["voxel_size"] is not None:
+            texts.append("voxel size " + " ".join(f"{v:.4g}" for v in grid["voxel_size"]))
+        if "bounds" in grid:
+            box, span = grid["bounds"], grid["range"]
+            texts.append("empty" if box is None else " ".join(f"{a}:{b}" for a, b in zip(*box, strict=True)))
+            texts.append(f"{grid['active_voxels']:,} active" + (f", {span[0]:.4g} to {span[1]:.4g}" if span else ""))
+            texts.append(f"{grid['dense_bytes'] / 2**20:,.2f} MiB dense")
+        else:
+            texts.append("not read")
         if grid["reason"]:
-            console.print(_printable(f"  {grid['name']}: {grid['reason']}"))
+            texts.append(grid["reason"])
         if grid.get("non_finite"):
-            console.print(_printable(f"  {grid['name']}: {grid['non_finite']} active values are NaN or infinite"))
-
-
-def _format_grid_cells(grid: dict[str, Any]) -> Iterator[str]:
-    size = grid["voxel_size"]
-    kind = grid["type"].removeprefix("Tree_").removesuffix("_5_4_3") + " as half" * grid["half"]
-    yield from (grid["name"], f"{kind}\n{grid['class']}", grid["compression"].replace(" + ", "\n"))
-    yield grid["map"] if size is None else "\n".join(f"{v:.4g}" for v in (size[:1] if len(set(size)) == 1 else size))
-    if "bounds" not in grid:
-        yield from ("not read", "", "", "")
-        return
-    box, span = grid["bounds"], grid["range"]
-    yield "empty" if box is None else "\n".join(f"{a}:{b}" for a, b in zip(*box, strict=True))
-    yield f"{grid['active_voxels']:,}"
-    yield "–" if span is None else f"{span[0]:.4g}\n{span[1]:.4g}"
-    yield _format_bytes(grid["dense_bytes"])
-
-
-def _format_bytes(count: int) -> str:
-    size = float(count)
-    for unit in ("B", "KiB", "MiB", "GiB"):
-        if size < 1024:
-            return f"{size:.3g} {unit}" if unit != "B" else f"{count} B"
-        size /= 1024
-    return f"{size:,.3g} TiB"
+            texts.append(f"{grid['non_finite']} active values are NaN or infinite")
+        console.print(_printable(f"  {grid['name']}: {'; '.join(texts)}"))
 
 
 def _printable(text: str) -> str:

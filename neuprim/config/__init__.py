@@ -1,15 +1,16 @@
 """A run's configuration: Hydra's key=value words and the tasks' YAML files in, one validated :class:`RunConfig` out."""
 
 from neuprim.config.compose import compose, compose_all, preset_settings
-from neuprim.config.job import (
+from neuprim.config.overrides import expand_sweep_overrides
+from neuprim.config.run_config import (
     Job,
+    RunConfig,
+    RunSettings,
     current_config_provenance,
     find_config_plugins,
     find_config_scene,
     load_config_task,
 )
-from neuprim.config.overrides import expand_sweep_overrides
-from neuprim.config.run_config import RunConfig, RunSettings
 from neuprim.config.stored_run import read_stored_config
 from neuprim.config.task_files import check_config_groups, check_scene_config, list_task_presets, read_task_config
 

@@ -13,8 +13,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from neuprim.config.job import refuse_missing_config_plugins
-from neuprim.config.outputs import DEFAULT_TASK, config_output_directory, config_output_name
 from neuprim.config.overrides import (
     Assignment,
     drop_output_overrides,
@@ -25,7 +23,7 @@ from neuprim.config.overrides import (
     sweep_override_names,
     swept_override_keys,
 )
-from neuprim.config.run_config import RunConfig, RunSettings, flatten
+from neuprim.config.run_config import RunConfig, RunSettings, flatten, refuse_missing_config_plugins
 from neuprim.config.setting_checks import (
     CHOICES,
     check_config_key,
@@ -36,6 +34,9 @@ from neuprim.config.setting_checks import (
     unused_settings,
 )
 from neuprim.config.stored_run import (
+    DEFAULT_TASK,
+    config_output_directory,
+    config_output_name,
     find_resumed_config,
     refuse_contradictions,
     refuse_untrusted_settings,

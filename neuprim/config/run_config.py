@@ -1,4 +1,4 @@
-"""The typed configuration of one run, and its form on disk."""
+"""The typed configuration of one run, its form on disk, and the task and scene of the packages that made it."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from functools import reduce
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import yaml
 
@@ -19,8 +19,12 @@ from neuprim.core.train import population
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.used_settings import OPTIONAL
 from neuprim.core.validation import Range, join_setting_key, validate_fields, validate_settings
-from neuprim.plugins.provenance import Provenance
-from neuprim.plugins.registry import split_plugin_name
+from neuprim.plugins.attribution import RunPlugins
+from neuprim.plugins.provenance import Provenance, load_recorded_plugin
+from neuprim.plugins.registry import LOSSES, SCENES, TASKS, FoundScene, find_registered_scene, split_plugin_name
+
+if TYPE_CHECKING:
+    from neuprim.core.task import TaskSpec
 
 _MAX_BYTES = 1_000_000
 """A configuration has a few kilobytes; anything larger is another file."""
@@ -229,3 +233,72 @@ def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
         name = join_setting_key(where, str(key))
         found |= flatten(value, name) if isinstance(value, Mapping) else {name: value}
     return found
+
+
+# ---------------------------------------------------------------- the plugins of a run
+
+
+@dataclass(frozen=True)
+class Job:
+    """A configuration with the task that its name stands for, looked up once and handed on together."""
+
+    config: RunConfig
+    task: TaskSpec
+
+    @classmethod
+    def of(cls, config: RunConfig) -> Job:
+        """Load the task of a configuration. Raises as :func:`load_config_task`."""
+        return cls(config, load_config_task(config, config.source))
+
+    @property
+    def scene(self) -> FoundScene:
+        """The scene, of the task or of another package."""
+        return find_config_scene(self.config, self.task, self.config.source)
+
+    @property
+    def plugins(self) -> RunPlugins:
+        """The plugins of the run, which errors in their code name."""
+        return find_config_plugins(self.config)
+
+
+def load_config_task(config: RunConfig, file: Path | None = None) -> TaskSpec:
+    """Load the task of a run's configuration from the package that made the run; warn of another version of it.
+
+    Raises:
+        ConfigError: the package is not installed; names it and ``file``, where the configuration was read from.
+        PluginError: the task is broken.
+    """
+    return load_recorded_plugin(TASKS, config.made_by.task, file)[1]
+
+
+def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
+    """Find the scene of a run's configuration, the task's own or of the package that made the run.
+
+    Raises as :func:`load_config_task`.
+    """
+    if config.made_by.scene is None:
+        own = [scene for scene in task.scenes if scene.name == config.scene_name]
+        return FoundScene(own[0], task.config_package) if own else find_registered_scene(task, config.scene_name)
+    info, extension = load_recorded_plugin(SCENES, config.made_by.scene, file, f"{config.task}.{config.scene_name}")
+    return FoundScene(extension.scene, extension.config_package, info)
+
+
+def current_config_provenance(config: RunConfig, task: TaskSpec) -> Provenance:
+    """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
+    task_info = TASKS.find(config.made_by.task.qualified_name)
+    loss = None if config.train.loss is None else LOSSES.find(config.train.loss)
+    return Provenance.of_installed(task_info, find_config_scene(config, task), loss)
+
+
+def find_config_plugins(config: RunConfig) -> RunPlugins:
+    """Find the plugins of a run, which errors in their code name."""
+    made = config.made_by
+    scene = config.scene_name if made.scene is None else made.scene.qualified_name
+    return RunPlugins(made.task.qualified_name, scene, config.train.loss)
+
+
+def refuse_missing_config_plugins(config: RunConfig) -> None:
+    """Raise ConfigError for a package that made a stored run and is not installed."""
+    find_config_scene(config, load_config_task(config, config.source), config.source)
+    if config.made_by.loss is not None:
+        load_recorded_plugin(LOSSES, config.made_by.loss, config.source)

@@ -58,7 +58,7 @@ from neuprim.core.task import Supervision, TaskSpec
 from neuprim.core.train.settings import ModelSettings
 from neuprim.core.used_settings import build_settings, loss_settings
 from neuprim.core.validation import validate_settings
-from neuprim.plugins.returns import (
+from neuprim.plugins.attribution import (
     ReturnError,
     call_task_clips,
     call_task_diagnose,

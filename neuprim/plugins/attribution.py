@@ -1,4 +1,4 @@
-"""Name the package of a plugin whose code fails, in one line.
+"""Call the code of plugins: check what it returns, and name its package in its errors, in one line.
 
 A :class:`~neuprim.core.errors.NeuprimError` passes unchanged, because its text is the whole message. Any other
 exception of another package's code becomes a PluginError that says where it was raised; the traceback stays its
@@ -7,21 +7,39 @@ exception of another package's code becomes a PluginError that says where it was
 
 from __future__ import annotations
 
+import json
+import math
 import traceback
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from packaging.utils import canonicalize_name
 from torch import Tensor
 
-from neuprim.core.data.dataset_check import DatasetError
+from neuprim.core.data import Clip, Dataset, View
+from neuprim.core.data.dataset_check import DatasetError, check_mask
 from neuprim.core.errors import DISK, DataError, NeuprimError
-from neuprim.core.task import Loss, Supervision
+from neuprim.core.model.fields import ColourField, DensityField
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
+from neuprim.core.task import Loss, Supervision, TaskSpec
 from neuprim.plugins.registry import LOSSES, SCENES, TASKS, PluginError, PluginGroup, PluginInfo, split_plugin_name
-from neuprim.plugins.returns import ReturnError, check_loss_returns
+
+Kind = TypeVar("Kind")
+
+_VIEW_METRICS = ("name", "psnr", "ssim", "ssim_3dgs", "lpips", "lpips_3dgs", "seconds")
+"""Names that every view has in ``metrics.json``."""
+_TUNABLE = ("model.", "task.options.")
+
+
+# ---------------------------------------------------------------- errors
+
+
+class ReturnError(NeuprimError):
+    """A plugin's function returned something unusable; :func:`attribute_errors` adds the plugin's name."""
 
 
 @dataclass(frozen=True)
@@ -142,3 +160,145 @@ class RunPlugins:
                     if _is_plugin_code(frame.f_globals, source):
                         raise PluginError(f"{source.label}: {_describe_plugin_error(error, source)}") from error
             raise
+
+
+# ---------------------------------------------------------------- what functions return
+
+
+def check_returns(ok: bool, function: str, found: object, expected: str) -> None:
+    """Raise ReturnError unless ``ok``."""
+    if not ok:
+        raise ReturnError(f"{function}: found {found}; expected {expected}")
+
+
+def check_fields(density: object, colour: object, dataset: Dataset) -> None:
+    """Check that a task's ``build`` returned two fields, the colour with the data set's channels."""
+    for name, field, kind in (("density", density, DensityField), ("colour", colour, ColourField)):
+        expected = f"a neuprim.core.model.fields.{kind.__name__}"
+        check_returns(isinstance(field, kind), f"build: {name}", _describe_returned_type(field), expected)
+    channels = getattr(colour, "channels", None)
+    expected = f"{dataset.channels}, as data set {dataset.name!r} has"
+    check_returns(channels == dataset.channels, "build: channels of the colour", channels, expected)
+
+
+def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
+    """Check one result of a loss (:data:`~neuprim.core.task.Loss`) for this rendered image."""
+    number = isinstance(value, Tensor) and not value.dim()
+    check_returns(number, "value", _describe_returned_type(value), "one number as a tensor")
+    gradient = value.requires_grad or not rendered.requires_grad
+    check_returns(gradient, "value", "no gradient", "one that depends on the rendered image")
+    check_returns(isinstance(parts, dict), "parts", _describe_returned_type(parts), "a dictionary of names to numbers")
+    for name, part in parts.items():
+        check_returns(isinstance(part, int | float), f"part {name!r}", _describe_returned_type(part), "a number")
+
+
+def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
+    """Return the part of a test view whose error is reported on its own, (H, W) bool, or None."""
+    mask = task.mask(dataset, index)
+    if mask is not None:
+        try:
+            check_mask("test", dataset.test.view(index), mask)
+        except DatasetError as error:
+            raise ReturnError(str(error)) from None
+    return mask
+
+
+def call_task_metrics(
+    task: TaskSpec, dataset: Dataset, index: int, rendered: Tensor, truth: Tensor
+) -> dict[str, float]:
+    """Return the task's own metrics of a test view by name; they may be +inf."""
+    function = f"metrics of test view {dataset.test.view(index).name}"
+    metrics = _check_returned_keys(task.metrics(dataset, index, rendered, truth), function)
+    for name, value in metrics.items():
+        number = isinstance(value, int | float) and not math.isnan(value) and value != -math.inf
+        check_returns(number, f"{function}: {name}", repr(value), "a number")
+        check_returns(name not in _VIEW_METRICS, function, f"the name {name}, which every view has", "another name")
+    return dict(metrics)
+
+
+def call_task_diagnose(task: TaskSpec, dataset: Dataset, model: Primitives) -> dict[str, Any]:
+    """Return the task's own numbers of a model."""
+    return _check_returned_json(task.diagnose(dataset, model), "diagnose")
+
+
+def call_task_facts(task: TaskSpec, dataset: Dataset) -> dict[str, Any]:
+    """Return what a model's header keeps of its data: the scene's "up" and "center", and what the task adds."""
+    own = {"up": [float(x) for x in dataset.up], "center": [float(x) for x in dataset.center]}
+    return {**own, **_check_returned_json(task.facts(dataset), "facts")}
+
+
+def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
+    """Return the films that the task makes of its data."""
+    clips = _check_returned_list(task.clips(dataset), "clips", Clip)
+    for clip in clips:
+        count = len(dataset.test if clip.source is None else clip.source)
+        wrong = [i for i in clip.views if not isinstance(i, int) or not 0 <= i < count]
+        ok = not wrong and len(clip.views) > 0
+        check_returns(ok, f"clips: {clip.name!r}", f"view {wrong[0]!r}" if wrong else "no views", f"some below {count}")
+    return clips
+
+
+def call_task_orbit(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]:
+    """Return views that circle the scene, with the task's conditions."""
+    views = _check_returned_list(task.orbit(dataset, frames), "orbit", View)
+    check_returns(len(views) > 0, "orbit", "no views", "some")
+    return views
+
+
+def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
+    """Return the settings that trade quality for speed or size: name -> values worth training."""
+    found = task.tunable_settings(settings)
+    expected = "a dictionary of setting names to values"
+    check_returns(isinstance(found, Mapping), "tunable_settings", _describe_returned_type(found), expected)
+    for name, values in found.items():
+        known = isinstance(name, str) and name.startswith(_TUNABLE)
+        expected = f"the name of a setting that begins with {' or '.join(_TUNABLE)}"
+        check_returns(known, "tunable_settings", repr(name), expected)
+        plain = isinstance(values, Sequence) and not isinstance(values, str)
+        plain = plain and all(isinstance(value, bool | int | float | str) for value in values)
+        check_returns(plain, f"tunable_settings: {name}", repr(values), "a list of numbers, texts, true or false")
+    return {name: tuple(values) for name, values in found.items()}
+
+
+def draw_task_layer(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None:
+    """Draw a layer: (H, W, C) finite values, or None; layers of light have the ``channels`` of the model's image."""
+    values = spec.draw(frame)
+    if values is None:
+        return None
+    count = len(spec.channels) or channels
+    shape = (frame.camera.height, frame.camera.width, count)
+    if isinstance(values, Tensor) and tuple(values.shape) == shape[:2] and count == 1:
+        values = values[..., None]
+    ok = isinstance(values, Tensor) and tuple(values.shape) == shape and values.is_floating_point()
+    check_returns(ok, f"layers: {spec.name}", _describe_returned_type(values), f"floats of shape {shape}")
+    bad = int((~values.isfinite()).sum())
+    check_returns(not bad, f"layers: {spec.name}", f"{bad} NaN or infinite values", "finite numbers")
+    return values.detach()
+
+
+def _describe_returned_type(value: object) -> str:
+    return f"{value.dtype} of shape {tuple(value.shape)}" if isinstance(value, Tensor) else f"a {type(value).__name__}"
+
+
+def _check_returned_list(found: Any, function: str, kind: type[Kind]) -> list[Kind]:
+    expected = f"a list of neuprim.core.data.{kind.__name__}"
+    check_returns(isinstance(found, Sequence), function, _describe_returned_type(found), expected)
+    for entry in found:
+        check_returns(isinstance(entry, kind), function, f"{_describe_returned_type(entry)} in the list", expected)
+    return list(found)
+
+
+def _check_returned_keys(found: Any, function: str) -> Mapping[str, Any]:
+    ok = isinstance(found, Mapping) and all(isinstance(name, str) for name in found)
+    check_returns(ok, function, _describe_returned_type(found), "a dictionary with texts as keys")
+    return found  # type: ignore[no-any-return]
+
+
+def _check_returned_json(found: Any, function: str) -> dict[str, Any]:
+    for name, value in _check_returned_keys(found, function).items():
+        try:
+            json.dumps(value, allow_nan=False)
+        except (TypeError, ValueError) as error:
+            expected = "finite numbers, texts, lists and dictionaries"
+            raise ReturnError(f"{function}: {name} cannot be written as JSON ({error}); expected {expected}") from None
+    return dict(found)

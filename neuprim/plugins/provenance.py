@@ -130,29 +130,20 @@ def load_recorded_plugin(
     try:
         info, spec = group.load_with_info(qualified_plugin_name(plugin.package, entry or plugin.name))
     except UnknownPlugin as error:
-        raise ConfigError(_prefix_provenance_file(file, missing_plugin_message(group, plugin))) from error
+        there = installed_version(plugin.package)
+        what = "which is not installed" if there is None else f"but the installed {there} has no such {group.kind}"
+        made = f"this run was made by {plugin.origin} ({group.kind} {plugin.name}), {what}"
+        raise ConfigError(_prefix_provenance_file(file, made)) from error
     if not info.built_in:
         _warn_of_plugin_version(file, plugin, group.kind, PluginVersion.of(info))
     return info, spec
 
 
-def missing_plugin_message(group: PluginGroup[Any], plugin: PluginVersion) -> str:
-    """Say that the plugin which made a run is not there."""
-    who = f"this run was made by {plugin.origin} ({group.kind} {plugin.name})"
-    there = installed_version(plugin.package)
-    return (
-        f"{who}, which is not installed" if there is None else f"{who}; the installed {there} has no such {group.kind}"
-    )
-
-
 def warn_of_other_provenance(made_by: Provenance, file: Path | None = None) -> None:
     """Warn if another minor version of neuprim made a run; patch versions keep results."""
     if _minor_provenance_version(made_by.neuprim) != _minor_provenance_version(__version__):
-        warn_once(
-            _prefix_provenance_file(
-                file, f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"
-            )
-        )
+        text = f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"
+        warn_once(_prefix_provenance_file(file, text))
 
 
 def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:

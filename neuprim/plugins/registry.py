@@ -85,16 +85,11 @@ class PluginInfo:
 
 @dataclass(frozen=True)
 class PluginReport(Generic[T]):
-    """A registered plugin, loaded, or the reason why it could not be.
-
-    Attributes:
-        note: how to choose it if its bare name does not; else None.
-    """
+    """A registered plugin, loaded, or the reason why it could not be."""
 
     info: PluginInfo
     spec: T | None = None
     error: str | None = None
-    note: str | None = None
 
 
 @dataclass(frozen=True)
@@ -145,11 +140,10 @@ class PluginGroup(Generic[T]):
         """Load every registered plugin. Broken ones come with their error."""
         reports: list[PluginReport[T]] = []
         for info, entry in self._entries():
-            note = self._name_clash_note(info)
             try:
-                reports.append(PluginReport(info, self._load(info, entry), note=note))
+                reports.append(PluginReport(info, self._load(info, entry)))
             except PluginError as error:
-                reports.append(PluginReport(info, error=str(error), note=note))
+                reports.append(PluginReport(info, error=str(error)))
         return reports
 
     def choice(self, info: PluginInfo) -> str:
@@ -159,7 +153,8 @@ class PluginGroup(Generic[T]):
     def shortest_name(self, info: PluginInfo) -> str:
         """Return the plugin's bare name if it is unambiguous, else ``PACKAGE:NAME``."""
         name = self.typed_name(info.name)
-        return name if self._name_clash_note(info) is None else qualified_plugin_name(info.distribution, name)
+        clash = any(other.name == info.name and other != info for other in self.list_plugins())
+        return qualified_plugin_name(info.distribution, name) if clash and not info.built_in else name
 
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
         """Warn that the name of ``info`` means another plugin, and how to choose it."""
@@ -193,16 +188,6 @@ class PluginGroup(Generic[T]):
             there = installed_version(package)
             hint = f"; {package or 'the package'} is not installed" if there is None else f"; {there} registers none"
         return f"{self.typed.format(word)}: no such {self.kind}{hint}"
-
-    def _name_clash_note(self, info: PluginInfo) -> str | None:
-        """Say how to choose a plugin whose bare name means another one or several; None if the name is enough."""
-        others = [other for other in self.list_plugins() if other.name == info.name and other != info]
-        if info.built_in or not others:
-            return None
-        if any(other.built_in for other in others):
-            return f"hidden by the built-in {self.kind}; {self.choice(info)} chooses it"
-        origins = " and ".join(other.origin for other in others)
-        return f"also registered by {origins}; {self.choice(info)} chooses this one"
 
     def _entries(self) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
         """List the group's entry points by name, the built-in ones first."""

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Mapping
 from dataclasses import MISSING, fields
 from pathlib import PurePath
 from typing import Any
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.extensions import Exporter, Inspector, LossExtension
+from neuprim.core.extensions import Exporter, LossExtension
 from neuprim.core.io.exr import exr_channel_name_error
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.render.layer_frame import COMMON, LIGHTS, LayerSpec
@@ -110,29 +109,12 @@ def _check_layer_spec(spec: LayerSpec) -> None:
     _check_plugin_channel_names(spec.channels)
 
 
-def _check_inspector(spec: Inspector) -> None:
-    try:
-        signature = inspect.signature(spec.layers)
-    except (TypeError, ValueError):  # compiled code may have no signature
-        return
-    try:
-        signature.bind(None)
-    except TypeError:
-        expected = "expected one of a frame alone, returning layers"
-        raise _InvalidMember(f"layers is a function of {signature}; {expected}") from None
-
-
 def _check_exporter(spec: Exporter) -> None:
     for name, value in spec.options.items():
         pair = isinstance(value, tuple | list) and len(value) == 2 and isinstance(value[1], str)
         _require_member(pair, f"options[{name!r}] is {value!r}; expected (default, one line of help)")
-    default, suffixes = spec.default, spec.suffixes
-    plain = PurePath(default).name == default and default != ".."
-    _require_member(plain, f"default is {default!r}; expected the name of a file or folder")
-    lower = all(isinstance(s, str) and s.startswith(".") and s == s.lower() for s in suffixes)
-    _require_member(lower, f"suffixes is {suffixes!r}; expected a tuple of such as '.json', in lower case")
-    fits = not default or not suffixes or default.lower().endswith(tuple(suffixes))
-    _require_member(fits, f"default is {default!r}; expected a name that ends in {' or '.join(suffixes)}")
+    plain = PurePath(spec.default).name == spec.default and spec.default != ".."
+    _require_member(plain, f"default is {spec.default!r}; expected the name of a file or folder")
 
 
 def _check_plugin_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
@@ -160,5 +142,4 @@ _CHECKS: dict[type, Any] = {
     LayerSpec: _check_layer_spec,
     LossExtension: lambda spec: _check_plugin_options(spec, "train."),
     Exporter: _check_exporter,
-    Inspector: _check_inspector,
 }

@@ -16,7 +16,7 @@ from neuprim.core.io.files import write_json
 from neuprim.core.io.images import FrameSpool, write_animation
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.plugins.returns import call_task_clips, call_task_orbit
+from neuprim.plugins.attribution import call_task_clips, call_task_orbit
 from neuprim.report.pictures import WorstRegions, error_map
 from neuprim.report.run_report import Viewer, write_report
 from neuprim.runs.fit import Fitted

@@ -30,9 +30,8 @@ from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.core.used_settings import build_settings, loss_settings
-from neuprim.plugins.attribution import attribute_errors, guard_loss
+from neuprim.plugins.attribution import attribute_errors, call_task_clips, call_task_facts, check_fields, guard_loss
 from neuprim.plugins.registry import LOSSES
-from neuprim.plugins.returns import call_task_clips, call_task_facts, check_fields
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics
 from neuprim.runs.open import load_dataset
 

@@ -35,7 +35,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, choose_backend, render
 from neuprim.core.task import TaskSpec
-from neuprim.plugins.returns import call_task_clips, call_task_diagnose, call_task_mask, call_task_metrics
+from neuprim.plugins.attribution import call_task_clips, call_task_diagnose, call_task_mask, call_task_metrics
 from neuprim.runs.open import StoredRun, load_dataset, load_run, model_file, move_to_render_device
 from neuprim.runs.render_config import estimate_run_file_bytes, parse_run_rendering
 from neuprim.version import __version__

@@ -42,7 +42,7 @@ from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.core.validation import Range, validate_settings, validate_value
-from neuprim.plugins.returns import draw_task_layer
+from neuprim.plugins.attribution import draw_task_layer
 from neuprim.version import __version__
 
 HEADS = ("renderer", "resolution", "density", "colour")

@@ -23,7 +23,7 @@ from neuprim.core.io.images import write_animation
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import Conditions
 from neuprim.core.task import TaskSpec
-from neuprim.plugins.returns import call_task_facts, call_task_orbit
+from neuprim.plugins.attribution import call_task_facts, call_task_orbit
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device, refuse_run_results
 from neuprim.runs.render_config import RunExrLayers, parse_run_rendering

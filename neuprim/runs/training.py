@@ -30,8 +30,8 @@ from neuprim.core.train.distributed.distributed_trainer import DistributedTraine
 from neuprim.core.train.distributed.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.trainer_state import select_state_tensors
+from neuprim.plugins.attribution import call_task_facts
 from neuprim.plugins.provenance import check_resumed_provenance
-from neuprim.plugins.returns import call_task_facts
 from neuprim.runs.fit import (
     Events,
     Fitted,

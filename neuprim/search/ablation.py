@@ -19,8 +19,8 @@ from typing import Any
 
 from neuprim.config import Job, RunConfig, compose, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.config.outputs import ROOT
 from neuprim.config.overrides import parse_overrides, quote_override
+from neuprim.config.stored_run import ROOT
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset_views

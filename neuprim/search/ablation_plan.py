@@ -16,7 +16,7 @@ from neuprim.core.task import TaskSpec
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
-from neuprim.plugins.returns import call_task_tunable_settings
+from neuprim.plugins.attribution import call_task_tunable_settings
 from neuprim.runs.fit import compile_run_kernels, prepare_training, use_one_torch_thread_for_run
 from neuprim.search.tradeoff_record import COMBINED, ParetoStep, TradeoffPoint, combine_pareto_steps, name_variant
 from neuprim.search.trials import get_trial_setting

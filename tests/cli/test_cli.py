@@ -18,7 +18,7 @@ from neuprim.core.errors import NonFiniteError
 from neuprim.core.extensions import ExportReport
 from neuprim.runs.fit import Events
 from neuprim.runs.render_images import RenderRequest
-from tests.plugins.fakes import install, site, toy
+from tests.plugins.fakes import site, toy
 
 __all__ = ["site", "toy"]
 
@@ -113,32 +113,19 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["--versoin"], "--help"),
         (["run", "--cfgg"], "--cfgg: no such argument of `neuprim run`; did you mean '--cfg'"),
         (["run", "task=toi"], "did you mean 'toy'"),
-        (["run", "task=toy", "scene=bll"], "did you mean 'ball'"),
-        (["run", "task=toy", "preset=qick"], "did you mean 'quick'"),
-        (["run", "task=toy", "train.iteration=1"], "did you mean 'train.iterations'"),
         (["run", "task=toy", "train.iterations=x"], "expected a whole number"),
-        (["run", "task=toy", "train"], "expected KEY=VALUE"),
         (["run", "task=toy", "seed=1,2"], "add -m"),
-        (["eval"], "RUN_DIR"),
         (["eval", "nowhere"], "nowhere: no such run directory"),
-        (["eval", ".", "x"], "x: no such argument"),
         (["render", "nowhere", "--camera", "orbit"], "nowhere: no such run directory"),
         (["render", "."], "--camera"),
         (["render", ".", "--camera", "spiral"], "expected orbit, test, or a file or folder of cameras"),
-        (["render", ".", "--camera", "no.json"], "no.json: no such file"),
         (["render", ".", "--camera", "orbit", "--size", "640"], "expected WIDTHxHEIGHT"),
-        (["render", ".", "--camera", "orbit", "--size", "0x5"], "expected WIDTHxHEIGHT"),
-        (["render", ".", "--camera", "orbit", "--format", "bmp"], "bmp"),
         (["render", ".", "--camera", "orbit", "--frames", "0"], "expected a positive count"),
         (["render", ".", "--camera", "orbit", "--time", "0"], "config.yaml: missing"),
         (["vdb", "info", "x" * 300], "File name too long"),
         (["tasks", "more"], "more: no such argument of `neuprim tasks`"),
-        (["run", "task=toy", "target.psnr=30"], "target.psnr=30: expected a budget beside it"),
         (["run", "-m", "task=toy", "target.psnr=30", "budget=5m", "seed=1,2"], "expected no -m beside it"),
-        (["run", "--config", "nowhere.yaml"], "no such file; expected RUN_DIR/config.yaml of an earlier run"),
         (["run", "-m", "viewer=true", "seed=1,2"], "viewer=true: shows one run; expected no -m beside it"),
-        (["run", "viewer=true", "target.psnr=20", "budget=1m"], "expected no target beside it"),
-        (["run", "viewer.prot=1"], "viewer.prot: no such setting; did you mean 'viewer.port'"),
         (["view", "."], "config.yaml: missing"),
         (["view", ".", "--port", "80000"], "--port 80000: expected a port, 1 to 65535, or 0 for any"),
     ],
@@ -151,27 +138,33 @@ def test_one_line_and_status_2(
     assert calls == []
 
 
-def test_interrupt_is_130_and_a_bug_keeps_its_traceback(calls: list[Any], monkeypatch: pytest.MonkeyPatch) -> None:
-    def stop(config: RunConfig, events: Events, launcher: Any = None) -> Path:
-        raise KeyboardInterrupt
+@pytest.mark.parametrize(
+    ("error", "status", "text"),
+    [
+        (KeyboardInterrupt(), 130, "neuprim: interrupted; outputs/toy-ball has no checkpoint yet"),
+        (torch.OutOfMemoryError("CUDA out of memory."), 2, "memory is full; expected a smaller image or grid"),
+        (ZeroDivisionError(), None, ""),
+    ],
+)
+def test_status_and_message_of_errors(
+    error: BaseException,
+    status: int | None,
+    text: str,
+    calls: list[Any],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A bug keeps its traceback."""
 
-    def bug(config: RunConfig, events: Events, launcher: Any = None) -> Path:
-        raise ZeroDivisionError
+    def fail(*args: Any, **options: Any) -> Path:
+        raise error
 
-    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
-    assert main(["run", "task=toy"]) == 130
-    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", bug)
-    with pytest.raises(ZeroDivisionError):
-        main(["run", "task=toy"])
-
-
-def test_a_full_gpu_is_one_line(calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: Any) -> None:
-    def fill(*args: Any, **options: Any) -> Path:
-        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 20.00 GiB")
-
-    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", fill)
-    assert main(["run", "task=toy"]) == 2
-    assert "memory is full; expected a smaller image or grid" in error_line(capsys)
+    monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", fail)
+    if status is None:
+        with pytest.raises(type(error)):
+            main(["run", "task=toy"])
+    else:
+        assert main(["run", "task=toy"]) == status and text in capsys.readouterr().err
 
 
 def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
@@ -251,39 +244,14 @@ def test_a_target_prints_what_came_of_it(
 # ---------------------------------------------------------------- eval, render, export
 
 
-@pytest.mark.parametrize(
-    ("errors", "rows"),
-    [
-        ({}, []),
-        ({"iou": 0.5, "front.iou": 0.75}, [["iou", "0.5000"], ["front.iou", "0.7500"]]),
-        ({"frame_1.l2": 0.25}, [["frame_1.l2", "0.2500"]]),
-        (
-            {"frame_1.l2": 0.25, "frame_1.psnr": 23.5, "frame_2.l2": 0.125},
-            [["l2", "psnr"], ["frame_1", "0.2500", "23.5000"], ["frame_2", "0.1250"]],
-        ),
-    ],
-)
-def test_export_reports_numbers_in_lines_or_columns(
-    errors: dict[str, float], rows: list[list[str]], capsys: pytest.CaptureFixture[str]
-) -> None:
-    print_export_report(ExportReport((Path("a.vdb"),), False, errors, ("a note",)), False)
+def test_export_reports_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    errors = {"iou": 0.5, "frame_1.psnr": float("inf")}
+    report = ExportReport((Path("a.vdb"),), False, errors, ("a note",))
+    print_export_report(report, False)
     lines = capsys.readouterr().out.splitlines()
-    assert (lines[:2], lines[-1]) == (["a.vdb", "lossy"], "note: a note")
-    assert [line.split() for line in lines[2:-1]] == rows
-    print_export_report(ExportReport((Path("a.vdb"),), False, {"psnr": float("inf")}), True)
-    assert json.loads(capsys.readouterr().out)["errors"] == {"psnr": None}
-
-
-def test_eval_prints_metrics(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    Path("r").mkdir()
-    assert main(["eval", "r"]) == 0
-    assert calls == [Path("r")]
-    assert capsys.readouterr().out.splitlines() == [
-        "psnr        31.2346",
-        "views       20",
-        "worst.name  r_3",
-        "worst.psnr  27.0000",
-    ]
+    assert lines == ["a.vdb", "lossy", "iou           0.5000", "frame_1.psnr  inf", "note: a note"]
+    print_export_report(report, True)
+    assert json.loads(capsys.readouterr().out)["errors"] == {"iou": 0.5, "frame_1.psnr": None}
 
 
 def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -317,20 +285,6 @@ def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: 
 # ---------------------------------------------------------------- tasks, help
 
 
-def test_tasks_lists_all_and_the_broken_ones(toy: Path, site: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    install(
-        site, "neuprim-bad", {"bad": "fake_bad:TASK"}, {"fake_bad.py": "raise ImportError('no such luck')"}, version="2"
-    )
-    assert main(["tasks"]) == 0
-    out = capsys.readouterr().out
-    assert "toy  (neuprim-toy 0.3)  a toy" in out
-    assert "one ball" in out
-    assert "long, quick (default)" in out
-    assert "bad  (neuprim-bad 2)  BROKEN" in out
-    assert "ImportError: no such luck" in out
-    assert f"(neuprim {neuprim.__version__})" in out
-
-
 def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["--version"]) == 0
     assert capsys.readouterr().out == f"neuprim {neuprim.__version__}\n"
@@ -345,16 +299,12 @@ def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None
     assert "neuprim run task=static scene=solids" in out
 
 
-def test_help_is_light() -> None:
+def test_help_is_light_and_the_module_runs() -> None:
     heavy = "{'torch', 'numpy', 'hydra', 'omegaconf', 'rich', 'numba'}"
     code = (
-        f"import sys, neuprim.cli as c; c.main(['run', '--help']); bad = {heavy} & set(sys.modules); "
-        f"sys.exit(str(bad) if bad else 0)"
+        f"import sys, neuprim.cli as c; c.main(['run', '--help']); print(*{heavy} & set(sys.modules), file=sys.stderr)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.returncode == 0, done.stderr
-
-
-def test_python_dash_m() -> None:
+    assert (done.returncode, done.stderr) == (0, "\n")
     done = subprocess.run([sys.executable, "-m", "neuprim", "--version"], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (0, f"neuprim {neuprim.__version__}\n")

@@ -45,13 +45,6 @@ def test_progress_shows_text_as_it_is(show: Callable[[Console], None], terminal:
     assert all("[video]" in line and ":smile:" in line for line in lines if "pip install" in line), lines
 
 
-def test_a_plain_console_prints_text_as_it_is(capsys: pytest.CaptureFixture[str]) -> None:
-    plain_console().print(ODD * 20)
-    plain_console(stderr=True).print(ODD * 20)
-    out, err = capsys.readouterr()
-    assert out == err == ODD * 20 + "\n", "nothing eaten, nothing wrapped"
-
-
 def test_every_console_is_a_plain_one() -> None:
     root = Path(neuprim.__file__).parent
     made = [

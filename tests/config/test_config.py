@@ -70,19 +70,11 @@ def test_typed_seconds_are_all_of_the_budget(toy: Path) -> None:
         toys("train.iterations=null")
 
 
-def test_interpolation_follows_the_override(toy: Path) -> None:
-    assert toys("seed=30", "train.log_every=${seed}").train.log_every == 30
-
-
 @pytest.mark.parametrize(
     ("words", "text"),
     [
         (["train.iteratons=5"], "train.iteratons: no such setting; did you mean 'train.iterations'"),
-        (["iterations=5"], "did you mean 'train.iterations'"),
-        (["train.population.evry=5"], "did you mean 'train.population.every'"),
         (["scene.sise=5"], "scene.sise: no such setting of scene 'ball'; did you mean 'scene.size'"),
-        (["+train.foo=5"], "train.foo: no such setting"),
-        (["hydra.run.dir=x"], "hydra.run.dir: no such setting"),
         (["train..rates=3"], "expected KEY=VALUE"),
         (["scene@foo=ball"], "packages (@)"),
         (["task=ty"], "task=ty: no such task; did you mean 'toy'?"),
@@ -93,11 +85,8 @@ def test_interpolation_follows_the_override(toy: Path) -> None:
         (["model=3"], "model is a group of settings"),
         (["scene.size=big"], "scene.size=big: expected a whole number"),
         (["scene=files"], "scene.path: required and not given; expected a directory or file, as scene.path=PATH"),
-        (["scene=files", "scene.path=null"], "scene.path: required and not given"),
         (["scene=files", "scene.path=[1]"], "expected a path"),
         (["seed=${nothing}"], "nothing"),
-        (["seed"], "'seed': expected KEY=VALUE"),
-        (["=3"], "expected KEY=VALUE"),
         (["~seed"], "cannot be deleted"),
         (["seed=1,2"], "several values; add -m"),
         (["output_dir=a=b"], "quote values that contain"),
@@ -125,10 +114,7 @@ def test_paths_are_made_absolute_and_survive_any_character(toy: Path) -> None:
     [
         ("preset/toy/quick.yaml", "train: {iteratons: 3}", "preset/toy/quick.yaml: train.iteratons: no such setting"),
         ("preset/toy/quick.yaml", "scene: {size: 3}", "a preset may only set model, train, renderer"),
-        ("preset/toy/quick.yaml", "train: {iterations: [", "preset/toy/quick.yaml cannot be read"),
         ("task/toy.yaml", "scnee: ball", "task/toy.yaml: scnee: no such setting; did you mean 'scene'"),
-        ("task/toy.yaml", "scene: [", "task/toy.yaml cannot be read"),
-        ("task/toy.yaml", "scene: [ball]", "no such scene; did you mean 'ball'"),
         ("task/toy.yaml", "preset: lng", "no such preset; did you mean 'long'"),
         ("task/toy.yaml", "options: 3", "options=3: expected entries"),
         ("scene/toy/ball.yaml", "[1]", "scene/toy/ball.yaml: expected a mapping"),
@@ -236,11 +222,6 @@ def test_sweep_directory_names_never_collide(toy: Path) -> None:
     assert runs[1].scene["path"] == str(Path.cwd() / "a b")
 
 
-def test_a_wrong_combination_stops_the_sweep_before_it_starts(toy: Path) -> None:
-    with pytest.raises(ConfigError, match=r"model.neurons=99"):
-        compose_all(["task=toy", "model.neurons=1,99"])
-
-
 # ---------------------------------------------------------------- on disk
 
 
@@ -257,7 +238,6 @@ def test_yaml_round_trip(toy: Path) -> None:
     [
         ("task: [", "line 1: damaged configuration"),
         ("", "expected a mapping, found NoneType"),
-        ("\x00", "damaged configuration"),
         ("!!python/object/apply:os.system ['touch hacked']", "damaged configuration"),
         ("[" * 500, "cannot be read"),
         ("# " + "x" * 1_000_001, "larger than"),
@@ -275,15 +255,13 @@ def test_damaged_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content:
     ("old", "new", "text"),
     [
         ("iterations: 7", "iteratons: 7", "train.iteratons: no such setting; did you mean 'train.iterations'"),
-        ("preset: quick", "preset: [3]", "preset=[3]: expected text"),
         ("preset: quick", "persett: quick", "persett: no such setting; did you mean 'preset'"),
         ("non_default: {}", "non_default: {a: 3}", "non_default.a=3: expected a list"),
         ("output_dir: outputs/toy-ball", "output_dir: null", "output_dir: missing"),
-        ("overrides:", "overrides: 3\n#", "overrides=3: expected a list"),
     ],
 )
 def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str) -> None:
-    content = toys().to_yaml().replace("\n- task=toy", "" if old == "overrides:" else " []")
+    content = toys().to_yaml()
     assert old in content
     Path("config.yaml").write_text(content.replace(old, new))
     with pytest.raises(ConfigError) as caught:

@@ -6,9 +6,8 @@ import importlib
 import re
 import statistics
 import sys
-import time
 from collections.abc import Callable
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import pytest
@@ -143,39 +142,3 @@ def test_a_fall_is_listed_and_doublings_compare_the_seeds_that_both_budgets_have
     assert "none made anything worse" in script.describe_falls(runs[::2])
     several = [run(100, 0, 30.0), run(100, 1, 40.0), run(200, 0, 31.0)]
     assert script.gains(several, "chair", "psnr") == [(100, 200, pytest.approx(1.0))]
-
-
-class Busy:
-    """Stands for a trainer: each step computes a millisecond, every ``every``-th as many more, and waits for ``waits``
-    seconds."""
-
-    def __init__(self, every: int = 0, waits: float = 0.0) -> None:
-        self.renderer, self.dataset = SimpleNamespace(threads=1), SimpleNamespace(points=None)
-        self.step, self.every, self.waits = 0, every, waits
-
-    def train_step(self) -> None:
-        self.step += 1
-        begin, due = time.thread_time(), self.every and self.step % self.every == 0
-        while time.thread_time() - begin < 1e-3 * (1 + (self.every if due else 0)):
-            pass
-        time.sleep(self.waits)
-
-
-def test_paces_are_what_a_thread_computes_with_its_share_of_rare_steps(
-    load: Load, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A median would not see every sixteenth step, and a clock on the wall would see what else the machine does."""
-    script = load("shared.trials")
-    monkeypatch.setattr(script, "compile_run_kernels", lambda trainer: None)
-    took = script.time_steps({"plain": Busy(), "waits": Busy(waits=2e-3), "sometimes more": Busy(every=16)}, 64)
-    assert took["plain"] == pytest.approx(1e-3, rel=0.1)
-    assert took["waits"] / took["plain"] == pytest.approx(1, rel=0.15)
-    assert took["sometimes more"] / took["plain"] == pytest.approx(2, rel=0.1)
-
-
-def test_forms_of_equal_bytes_are_counted_by_their_parameters(load: Load) -> None:
-    form = load("shared.forms").Form.named
-    counts = [form(text).equal_bytes(2000, "static") for text in ("8:0", "2:2", "0:2", "gaussian")]
-    assert counts == [2000, 2829, 3300, 3356]
-    assert form("0:2@images").equal_bytes(2000, "dynamic") == 5391 and str(form("0:2@images")) == "0:2@images"
-    assert "train.supervision=images" in form("0:2@images").words

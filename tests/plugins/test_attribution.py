@@ -14,10 +14,11 @@ from neuprim.cli import main
 from neuprim.core.data import Clip, View
 from neuprim.core.data.dataset_check import DatasetError
 from neuprim.core.errors import ConfigError, DataError
-from neuprim.plugins.attribution import PluginSource, RunPlugins, attribute_errors, find_plugin_source, guard_loss
-from neuprim.plugins.registry import EXPORTERS, PluginError, load_task
-from neuprim.plugins.returns import (
+from neuprim.plugins.attribution import (
+    PluginSource,
     ReturnError,
+    RunPlugins,
+    attribute_errors,
     call_task_clips,
     call_task_diagnose,
     call_task_facts,
@@ -26,7 +27,10 @@ from neuprim.plugins.returns import (
     call_task_orbit,
     call_task_tunable_settings,
     check_fields,
+    find_plugin_source,
+    guard_loss,
 )
+from neuprim.plugins.registry import EXPORTERS, PluginError, load_task
 from tests.core import tiny
 from tests.plugins.extras import LOSS, add
 from tests.plugins.fakes import site
@@ -133,19 +137,13 @@ CALLS: dict[str, Any] = {
     ("member", "found", "text"),
     [
         ("clips", 3, "clips: found a int; expected a list of neuprim.core.data.Clip"),
-        ("clips", [3], "clips: found a int in the list"),
         ("clips", [Clip("x", (99,), 5.0)], "clips: 'x': found view 99; expected some below 2"),
         ("clips", [Clip("x", (), 5.0)], "clips: 'x': found no views"),
         ("facts", {"x": float("nan")}, "facts: x cannot be written as JSON"),
-        ("facts", {3: 1}, "facts: found a dict; expected a dictionary with texts as keys"),
-        ("diagnose", {"x": object()}, "diagnose: x cannot be written"),
         ("orbit", [], "orbit: found no views"),
-        ("orbit", [3], "found a int in the list; expected a list of"),
         ("mask", torch.ones(2, 2), "mask"),
-        ("metrics", [3], "metrics of test view .*: found a list"),
         ("metrics", {"x": float("nan")}, "x: found nan"),
         ("metrics", {"psnr": 1.0}, "found the name psnr, which every"),
-        ("tunable_settings", 3, "tunable_settings: found a int; expected a dictionary"),
         ("tunable_settings", {"train.x": (1,)}, "tunable_settings: found 'train.x'; expected the name"),
         ("tunable_settings", {"model.x": "12"}, "tunable_settings: model.x: found '12'; expected a list"),
     ],
@@ -173,9 +171,3 @@ def test_fields_of_a_build() -> None:
     model.colour.channels = 5
     with pytest.raises(ReturnError, match="build: channels of the colour: found 5; expected 3"):
         check_fields(model.density, model.colour, DATA)
-
-
-def test_a_loss_that_is_right_is_called_as_it_is() -> None:
-    value = torch.ones((), requires_grad=True)
-    loss = guard_loss(lambda rendered, truth, frame: (value, {"one": 1.0}), STRANGER)
-    assert loss(value, value, None) == (value, {"one": 1.0})  # type: ignore[arg-type]

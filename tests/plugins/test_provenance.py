@@ -99,13 +99,6 @@ def test_scene_and_loss_of_other_packages_are_recorded(site: Path, tmp_path: Pat
     assert Provenance.from_dict(made_by.to_dict()) == made_by
 
 
-def test_a_version_of_any_length_is_readable_again(site: Path) -> None:
-    add(site, "loss")
-    (site / "fake_extra-0.3.dist-info" / "METADATA").write_text(f"Name: fake-extra\nVersion: 1{'.1' * 500}\t\n")
-    made_by = compose(["task=static", "train.loss=extra"], False).made_by
-    assert Provenance.from_dict(made_by.to_dict()) == made_by
-
-
 # ---------------------------------------------------------------- packages that are gone
 
 
@@ -116,12 +109,10 @@ def test_without_the_package_every_command_names_it(made: Path, site: Path, caps
     for words in (
         ["eval", "r"],
         ["render", "r", "--camera", "orbit"],
-        ["render", "r", "--camera", "orbit", "--time", "0.5"],
         ["export", "r", "--format", "ply"],
         ["inspect", "r", "--out", "x.html"],
         ["run", "output_dir=r", "resume=true"],
         ["run", "task=glow", "output_dir=r", "resume=true"],
-        ["run", "task=neuprim-glow:glow", "output_dir=r", "resume=true"],
     ):
         assert error(words, capsys) == f"neuprim: error: r/config.yaml: {text}", words
     assert error(["import", "r.npz", "--out", "again"], capsys) == f"neuprim: error: r.npz: {text}"
@@ -238,16 +229,11 @@ def task_record(**changes: Any) -> dict[str, Any]:
     ("record", "text"),
     [
         (3, "made_by=3: expected settings"),
-        (None, "made_by=null: expected settings"),
         ({}, "made_by.neuprim: required and not given"),
-        ({"neuprim": "0.1", "task": []}, "made_by.task=[]"),
         ({"neuprim": "0.1", "tsak": {}}, "made_by.tsak: no such setting; did you mean 'made_by.task'?"),
-        ({"neuprim": "0.1", "task": {"name": "static", "package": "neuprim"}}, "made_by.task.version: required"),
         (task_record(package="a:b"), "made_by.task.package=a:b: expected a name of at most 200 characters"),
-        (task_record(package=" "), "made_by.task.package"),
         (task_record(package="a\nb"), "made_by.task.package"),
         (task_record(package="\x1b[31m"), "made_by.task.package"),
-        (task_record(package="x" * 9999), "made_by.task.package"),
         (task_record(name="x"), "made_by.task.name: found 'x'; expected 'static', as task.name says"),
         ({**task_record(), "loss": {"name": "x", "package": "p", "version": "1"}}, "made_by.loss.name: found 'x'"),
     ],

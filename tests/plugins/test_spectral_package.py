@@ -157,18 +157,6 @@ SUM = "density field TwoScales: lower: sum of two Cosine forms: the first: "
         ),
         (
             "fields",
-            'params[f"{part}_b1"], params',
-            'params[f"{part}_b1"][:-1], params',
-            SUM + "b1 has shape (19, 2); expected (20, 2)",
-        ),
-        (
-            "fields",
-            '(params["offset"], torch',
-            '(params["offset"].expand(-1, 2), torch',
-            SUM + "b2 has shape (20, 2); expected (20, 1) or (20,)",
-        ),
-        (
-            "fields",
             CONSTANT,
             CONSTANT[:-1] + "[:, :3])",
             "colour field ShiftedSpectrum: lower returned a colour of C=3; expected 5, as its member channels says",

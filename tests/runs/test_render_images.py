@@ -22,7 +22,7 @@ from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.layer_frame import LayerSpec
-from neuprim.plugins.returns import ReturnError
+from neuprim.plugins.attribution import ReturnError
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.render_config import RenderConfig, RunExrLayers
 from neuprim.runs.render_images import _run_views_of_camera_file, _view_file_names, set_run_view_conditions

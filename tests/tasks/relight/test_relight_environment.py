@@ -25,7 +25,7 @@ from neuprim.core.model.densities.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import SceneContext
-from neuprim.plugins.returns import call_task_facts
+from neuprim.plugins.attribution import call_task_facts
 from neuprim.runs.measure import render_light_sum
 from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene

@@ -67,12 +67,6 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
 # ---------------------------------------------------------------- run
 
 
-def test_run(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "task=toy", "train.iterations=3", "output_dir=out"]) == 0
-    assert calls[0].train.iterations == 3
-    assert capsys.readouterr().out == "out\n"
-
-
 def test_cfg_prints_and_stops(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     Path("full").mkdir()
     Path("full/x").touch()
@@ -268,18 +262,12 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["light-pos=-1,0,2"], ["--light_pos=-1,0,2"]):
         assert main(["render", "r", "--camera", "orbit", *words]) == 0
         assert calls[-1][1].conditions == {"light_pos": "-1,0,2"}
-    flags = "--camera orbit --environment sky.exr --environment-samples 9 --environment-rotation=-45"
-    assert main(["render", "r", *flags.split()]) == 0
-    assert calls[-1][1].environment == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)
-
-
-def test_render_knows_the_conditions_of_the_runs_task(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    main(["run", "task=toy", "output_dir=r"])
     capsys.readouterr()
     assert main(["render", "r", "--camera", "orbit", "--tiem", "0"]) == 2
     assert "--tiem: no such argument of `neuprim render` for task 'toy'; did you mean '--time'" in error_line(capsys)
-    assert main(["render", "r", "--camera", "orbit", "--time"]) == 2
-    assert "--time" in error_line(capsys)
+    flags = "--camera orbit --environment sky.exr --environment-samples 9 --environment-rotation=-45"
+    assert main(["render", "r", *flags.split()]) == 0
+    assert calls[-1][1].environment == EnvironmentFile(Path("sky.exr"), 9, -45.0, 1.0)
 
 
 # ---------------------------------------------------------------- tasks, help

@@ -21,7 +21,6 @@ from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.tasks.static import TASK, SphericalHarmonics
@@ -220,7 +219,6 @@ def detached(settings: Mapping[str, Any]) -> Any:
     return lambda rendered, truth, frame: ((rendered.detach() - truth).abs().mean(), {})
 
 
-NOISE = LayerSpec("noise", "other values each time", lambda frame: torch.rand(9, 10), channels=("N",))
 GHOST = SceneSpec("ghost", "has no file", lambda s, c: None)  # type: ignore[arg-type, return-value]
 UNNAMED = replace(TASK, check=lambda model: None)
 
@@ -265,9 +263,7 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("parameters", "(12, 1)", using(specs(init=lambda context: torch.zeros(context.count)))),
     ("evaluation", "expected 2, which task 'static' names: a, b", using(channels=("a", "b"), example=bare)),
     ("evaluation", "display gave torch.float32 of shape (9, 10, 2)", using(display=lambda image: image[..., :2])),
-    ("evaluation", "off its rows one by one", using(display=lambda image: image / image.max())),
     ("evaluation", "orbit: view orbit_000: found no time", timed(orbit=without_conditions)),
-    ("evaluation", "layer 'noise' of view", using(layers=(NOISE,))),
     ("loss", "loss of the truth itself", using(loss=negative)),
     ("loss", "no gradient", using(loss=detached)),
     ("loss", "stopped by IndexError", using(loss=maskless)),

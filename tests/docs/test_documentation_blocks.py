@@ -210,8 +210,6 @@ def test_commands(
     "line",
     [
         "neuprim run task=static model.primitive=3",
-        "neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cahce=DIR",
-        "neuprim tradeoff task=static --seed 3",
         "neuprim render RUN_DIR --camera orbit --time 2",
         "neuprim export RUN_DIR --format vdb gird=8",
         "neuprim evla RUN_DIR",

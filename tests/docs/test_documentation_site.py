@@ -50,19 +50,9 @@ def test_roles_become_links(hooks: Any) -> None:
     assert made == 'see <autoref identifier="neuprim.core.errors.DataError" optional><code>DataError</code></autoref>.'
 
 
-@pytest.mark.parametrize(
-    "tag",
-    [
-        '<script src="https://a.b/c.js">',
-        "<link rel=stylesheet href=//fonts.x/y>",
-        '<img alt="x" src="http://a.b/c.png">',
-    ],
-)
-def test_a_page_that_loads_from_the_network_is_a_warning(
-    hooks: Any, caplog: pytest.LogCaptureFixture, tag: str
-) -> None:
+def test_a_page_that_loads_from_the_network_is_a_warning(hooks: Any, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         hooks.on_post_page('<a href="https://arxiv.org/x">x</a> <img src="pictures/a.png">', page("a.md"))
         assert caplog.messages == []
-        hooks.on_post_page(tag, page("a.md"))
+        hooks.on_post_page('<script src="https://a.b/c.js">', page("a.md"))
     assert len(caplog.messages) == 1 and "a.md would load" in caplog.messages[0]

@@ -127,18 +127,3 @@ def test_levels_of_effort_are_those_that_were_measured(load: Load) -> None:
         task = script.SCENES[scene].task
         file = ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml"
         assert file.read_text("utf-8") == script.levels_file(script.read_trials(script.record_of(scene)), scene)
-
-
-def test_a_fall_is_listed_and_doublings_compare_the_seeds_that_both_budgets_have(load: Load) -> None:
-    script = load("budget")
-
-    def run(steps: int, seed: int, psnr: float, worst: float = 20.0) -> dict[str, Any]:
-        numbers = {"psnr": psnr, "psnr_worst": worst, "cpu_seconds": steps / 100}
-        return {"scene": "chair", "iterations": steps, "seed": seed, **numbers}
-
-    runs = [run(100, 0, 30.0), run(200, 0, 29.95, 19.8), run(400, 0, 31.0, 21.0)]
-    text = script.describe_falls(runs)
-    assert text.count("\n* ") == 1 and "worst view: -0.20 dB from 100 to 200 steps" in text
-    assert "none made anything worse" in script.describe_falls(runs[::2])
-    several = [run(100, 0, 30.0), run(100, 1, 40.0), run(200, 0, 31.0)]
-    assert script.gains(several, "chair", "psnr") == [(100, 200, pytest.approx(1.0))]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -19,7 +18,6 @@ from neuprim.plugins.registry import (
     INSPECTORS,
     LOSSES,
     PLUGIN_GROUPS,
-    SCENES,
     TASKS,
     PluginError,
     PluginGroup,
@@ -58,14 +56,6 @@ def test_a_plugin_is_listed_without_import_and_loaded_by_name(kind: str, site: P
     assert "fake_other" not in sys.modules
     with pytest.raises(ConfigError, match=rf"no such {kind}; did you mean '.*extra'"):
         group.load(entry.replace("extra", "extar"))
-
-
-def test_listing_does_not_load_torch() -> None:
-    code = (
-        "import sys, neuprim.cli; from neuprim.plugins.registry import TASKS; TASKS.list_plugins(); "
-        "assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", code], check=True)
 
 
 def test_a_scene_and_a_loss_of_other_packages_make_a_run(
@@ -259,17 +249,3 @@ def test_a_damaged_distribution_does_not_affect_the_others(toy: Path, site: Path
     assert load_task("toy").name == "toy"
     for group in PLUGIN_GROUPS:
         group.survey()
-
-
-def test_of_two_copies_of_a_distribution_the_first_counts(
-    site: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    add(site, "loss", "raise SystemExit")
-    first = tmp_path / "first"
-    group = LOSSES.entry_points
-    install(first, "fake-extra", {"extra": "fake_newer:PLUGIN"}, {"fake_newer.py": LOSS}, version="0.4", group=group)
-    monkeypatch.syspath_prepend(str(first))
-    assert [info.origin for info in LOSSES.list_plugins() if info.name == "extra"] == ["fake-extra 0.4"]
-    assert LOSSES.load("extra").summary == "mean squared error"
-    sys.modules.pop("fake_newer", None)
-    assert SCENES.typed_name("static.solids") == "solids"

@@ -18,11 +18,10 @@ from neuprim.core.task import Supervision
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.used_settings import build_settings, loss_settings
 from neuprim.plugins.registry import LOSSES, load_task
-from neuprim.runs.run import run
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.core.tiny import camera
-from tests.plugins.extras import LOSS, add
+from tests.plugins.extras import add
 from tests.plugins.fakes import site, toy
 
 __all__ = ["site", "toy"]
@@ -93,18 +92,6 @@ def test_a_losss_options_belong_to_task_options_while_it_is_chosen(
     assert build_settings(load_task("toy"), config.model, config.options)["options"] == {"gain": 1.0}
     assert main(["tasks"]) == 0
     assert "    task.options.weight=3.0  of it" in capsys.readouterr().out
-
-
-def test_options_that_a_loss_refuses_cost_no_loading_of_data(site: Path, tmp_path: Path) -> None:
-    picky = LOSS.replace(
-        "    assert",
-        "    from neuprim.core.errors import ConfigError\n    if weight < 0: raise ConfigError('weight: expected "
-        "more')\n    assert",
-    )
-    add(site, "loss", picky, package="fake_loss")
-    words = "task=static scene=blender scene.path=not_there train.loss=extra task.options.weight=-1"
-    with pytest.raises(ConfigError, match="weight: expected more"):
-        run(compose([*words.split(), f"output_dir='{tmp_path / 'run'}'"]))
 
 
 # ---------------------------------------------------------------- shared settings that not everybody uses

@@ -24,7 +24,6 @@ from neuprim.core.channels import read_stored_channels
 from neuprim.core.errors import CheckpointError, ConfigError, NeuprimError
 from neuprim.core.io import images
 from neuprim.core.io.exr import exr_channels
-from neuprim.core.model.colours import sh
 from neuprim.core.render import render
 from neuprim.export import mesh, shared
 from neuprim.plugins.registry import load_task
@@ -156,8 +155,7 @@ def test_the_inspectors_page_has_the_displays_colours(trained: Path, tmp_path: P
     assert not any(line.startswith("shown") for line in said)
 
 
-@pytest.mark.parametrize("suffix", ["ply", "glb"])
-def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, suffix: str) -> None:
+def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path) -> None:
     pytest.importorskip("pyvista", exc_type=ImportError)
     import trimesh
 
@@ -170,13 +168,12 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path, s
     }
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
     checkpoint.write_tensors(tmp_path / "model.safetensors", "model", painted, rest)
-    report = export_run(tmp_path, "mesh", tmp_path / f"m.{suffix}", ["grid=32", "wavelength_shift=0"])
+    report = export_run(tmp_path, "mesh", tmp_path / "m.ply", ["grid=32", "wavelength_shift=0"])
     assert f"colours: {THROUGH}" in report.notes
     ball = trimesh.load(report.files[0], force="mesh", process=False)
     display = load_task("spectral").display
     assert display is not None
     wanted = display(colour[None, None])[0, 0]
-    wanted = wanted if suffix == "ply" else images.srgb_to_linear(wanted)
     found = np.asarray(ball.visual.vertex_colors)[:, :3] / 255
     assert len(found) > 100 and np.abs(found - wanted.numpy()).max() <= 0.5 / 255 + 1e-6
 
@@ -236,7 +233,7 @@ def test_without_a_display_it_is_said_what_is_shown(
         export_run(out, "mesh", words=["wavelength_shift=0"])
 
 
-@pytest.mark.parametrize(("count", "space"), [(1, "linear"), (2, "srgb"), (31, "linear")])
+@pytest.mark.parametrize(("count", "space"), [(1, "linear"), (31, "srgb")])
 def test_any_number_of_channels_runs_and_is_written(site: Path, tmp_path: Path, count: int, space: str) -> None:
     words = (f"scene.bands={count}", f"scene.space={space}", "train.iterations=5")
     out, said = changed(site, tmp_path, *words, display="None", channels="()")
@@ -268,17 +265,6 @@ def test_a_grey_model_is_exported_as_grey(site: Path, tmp_path: Path) -> None:
     )
     colours = np.asarray(ball.visual.vertex_colors)[:, :3]
     assert (colours == colours[:, :1]).all() and colours.std() > 0
-
-
-def test_red_green_and_blue_among_others_are_exported_by_name(site: Path, tmp_path: Path) -> None:
-    out, _ = changed(site, tmp_path, "scene.bands=4", display="None", channels="('NIR', 'B', 'G', 'R')")
-    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "wavelength_shift=0"])
-    assert "colours: R, G, B of 4 channels as red, green, blue" in report.notes and report.errors["psnr"] > 15
-    _, tensors = checkpoint.read_tensors(out / "model.safetensors", "model")
-    data = (tmp_path / "g.ply").read_bytes()
-    body = np.frombuffer(data[data.index(b"end_header\n") + 11 :], "<f4").reshape(-1, 62)
-    own = sh.initial_sh_dc(tensors["logit"].sigmoid()[:, [3, 2, 1]]).numpy()
-    assert len(body) and all(np.abs(own - row).max(1).min() < 1e-4 for row in body[:, 6:9])
 
 
 # ---------------------------------------------------------------- refused before training

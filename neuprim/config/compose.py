@@ -41,7 +41,6 @@ from neuprim.config.stored_run import (
     refuse_contradictions,
     refuse_untrusted_settings,
     restore_config_references,
-    resumed_config_choices,
     stored_choices,
     stored_settings,
 )
@@ -135,7 +134,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     # Where torchrun's ranks get the overrides that describe a run, these say how many views each rank has.
     new_launch = begun is not None and read_torchrun_rank() is not None and bool(choices["task"] or choices["scene"])
     if begun is not None:
-        choices = resumed_config_choices(begun, choices)
+        choices = stored_choices(begun, choices, resumed=True)
     elif stored is not None:
         choices = stored_choices(stored, choices)
     values = [a for a in assignments if a.key not in CHOICES]

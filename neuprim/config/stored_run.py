@@ -43,15 +43,26 @@ def read_stored_config(path: Path) -> RunConfig:
     return RunConfig.from_yaml(path)
 
 
-def stored_choices(stored: RunConfig, typed: Choices) -> dict[str, str | None]:
-    """Return task, scene and preset: the typed scene, else what the run of ``--config`` had."""
+def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> dict[str, str | None]:
+    """Return task, scene, preset and level: what was typed, else what the stored run had.
+
+    A run of ``--config`` takes another scene, one that goes on (``resumed``) a level that was typed.
+
+    Raises:
+        ConfigError: a choice that contradicts the stored run.
+    """
     own = _stored_choices_of(stored)
-    for key in ("task", "preset", "effort"):
-        if _choice_differs(typed[key], own[key]):
-            has = "the level" if own[key] is None else f"{key} {own[key]}"
-            raise ConfigError(
-                f"{key}={typed[key]}: the file of --config says every setting of {has}; expected no {key}= beside it"
-            )
+    for key in ("task", "scene", "preset") if resumed else ("task", "preset", "effort"):
+        if typed[key] is None or split_plugin_name(str(typed[key]))[1] == split_plugin_name(own[key] or "")[1]:
+            continue
+        if key == "task" and resumed:
+            TASKS.find(str(typed[key]))  # a typing error is no other task
+        if resumed:
+            raise _resumed_config_error(stored, key, typed[key], own[key])
+        has = "the level" if own[key] is None else f"{key} {own[key]}"
+        raise ConfigError(
+            f"{key}={typed[key]}: the file of --config says every setting of {has}; expected no {key}= beside it"
+        )
     return {key: typed[key] or own[key] for key in CHOICES}
 
 
@@ -97,10 +108,6 @@ def _stored_choices_of(stored: RunConfig) -> dict[str, str | None]:
     }
 
 
-def _choice_differs(typed: str | None, own: str | None) -> bool:
-    return typed is not None and split_plugin_name(typed)[1] != split_plugin_name(own or "")[1]
-
-
 # ---------------------------------------------------------------- resume=true
 
 
@@ -142,17 +149,6 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
             f"expected a run's directory{hint}"
         )
     return None
-
-
-def resumed_config_choices(begun: RunConfig, typed: Choices) -> dict[str, str | None]:
-    """Return task, scene and preset of a run that goes on, which may not change, and the level that was typed."""
-    own = _stored_choices_of(begun)
-    for key in ("task", "scene", "preset"):
-        if _choice_differs(typed[key], own[key]):
-            if key == "task":
-                TASKS.find(str(typed[key]))  # a typing error is no other task
-            raise _resumed_config_error(begun, key, typed[key], own[key])
-    return {key: typed[key] or own[key] for key in CHOICES}
 
 
 def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:

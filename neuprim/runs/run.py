@@ -32,7 +32,6 @@ from neuprim.runs.sweep import LaunchedRun, LaunchRecord, launch_missing_runs, r
 from neuprim.runs.training import (
     BetweenSteps,
     count_run_finetune_steps,
-    do_nothing_between_run_steps,
     make_run_finetune_trainer,
     train_in_directory,
 )
@@ -55,7 +54,7 @@ class ChunksMissing(NeuprimError):
 def run(
     config: RunConfig,
     events: Events = ignore_run_event,
-    between: BetweenSteps = do_nothing_between_run_steps,
+    between: BetweenSteps = lambda fitted, stop: None,
     group: ProcessGroup | None = None,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Path:
@@ -164,7 +163,7 @@ def train_in_chunks(
     config: RunConfig,
     events: Events = ignore_run_event,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
-    between: BetweenSteps = do_nothing_between_run_steps,
+    between: BetweenSteps = lambda fitted, stop: None,
 ) -> tuple[Fitted, bool]:
     """Fit the chunks that ``scene.chunks`` asks for, join them and train what they make together; as
     :func:`~neuprim.runs.training.train_in_directory`, where ``auto`` finds one run better.

@@ -74,16 +74,12 @@ BetweenSteps = Callable[[Fitted, threading.Event], None]
 ends the training as Ctrl-C does. It may read the state, save it and wait, and must not change it."""
 
 
-def do_nothing_between_run_steps(fitted: Fitted, stop: threading.Event) -> None:
-    """Do nothing."""
-
-
 def train_in_directory(
     config: RunConfig,
     events: Events = ignore_run_event,
     dataset: Dataset | None = None,
     hold_out: int = 0,
-    between: BetweenSteps = do_nothing_between_run_steps,
+    between: BetweenSteps = lambda fitted, stop: None,
     group: ProcessGroup | None = None,
     make: TrainerFactory | None = None,
 ) -> tuple[Fitted, bool]:

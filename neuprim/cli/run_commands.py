@@ -153,7 +153,7 @@ def _list_printed_target_lines(record: TargetRecord) -> list[str]:
     found = record.achieved
     lines = [
         f"predicted {format_target_forecast(name, value, doubt)}; held out {found['held_out'][name]:.4g}; "
-        f"test views {found['test'][name]:.4g}, {found['test_before_storing'][name]:.4g} before storing"
+        f"test views {found['test'][name]:.4g}"
         for name, (value, doubt) in found["predicted"].items()
     ]
     files = f"{found['file']} {found['packed_bytes']:,} bytes, model.safetensors {found['model_bytes']:,} bytes"

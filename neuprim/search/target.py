@@ -157,14 +157,13 @@ class _TargetResult:
 
     Attributes:
         run_dir: the run directory, or that of the pruned model in it.
-        held: PSNR and SSIM of held-out views; before_storing, test: of test views, by the run and now.
+        held, test: PSNR and SSIM of held-out and of test views.
         packed: bytes of the smallest file.
         facts: what the stages add to the record.
     """
 
     run_dir: Path
     held: dict[str, float]
-    before_storing: dict[str, float]
     test: dict[str, float]
     packed: int
     facts: dict[str, Any]
@@ -202,7 +201,6 @@ def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None
         "run_dir": str(result.run_dir),
         "primitives": result.facts.get("pruned", {}).get("primitives", attempt.count),
         "held_out": result.held,
-        "test_before_storing": result.before_storing,
         "test": result.test,
         "fps": 1e3 / attempt.measured("ms_per_frame"),
         "model_bytes": (result.run_dir / "model.safetensors").stat().st_size,
@@ -227,7 +225,7 @@ def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult
     dataset = replace(runner.dataset, train=fitted.dataset.train)
     metrics = evaluate_fitted(replace(fitted, config=final, dataset=dataset), folder)
     held, test = ({name: float(of(name)) for name in _MEASURES} for of in (attempt.measured, metrics.__getitem__))
-    return _TargetResult(folder, held, test, test, int(metrics["model_bytes"]), {})
+    return _TargetResult(folder, held, test, int(metrics["model_bytes"]), {})
 
 
 def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
@@ -270,7 +268,7 @@ def _prune_full_run(
         return before
     test = {name: made.after[name] for name in _MEASURES}
     facts = {"pruned": {"primitives": model.count, "bytes_usual": new, "bytes_usual_before": old}}
-    return _TargetResult(made.run_dir, held, test, test, int(made.after["bytes"]), facts)
+    return _TargetResult(made.run_dir, held, test, int(made.after["bytes"]), facts)
 
 
 def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:

@@ -215,7 +215,7 @@ def test_a_target_prints_what_came_of_it(
     first = "# target.ssim=0.9 target.megabytes=2 budget=300s; the search starts from\ntask:\n"
     assert capsys.readouterr().out.startswith(first)
     achieved: dict[str, Any] = {"predicted": {"psnr": (30.0, 0.5)}, "run_dir": "out", "file": "model.neuprim"}
-    achieved |= {key: {"psnr": 29.5} for key in ("held_out", "test", "test_before_storing")}
+    achieved |= {key: {"psnr": 29.5} for key in ("held_out", "test")}
     achieved |= dict.fromkeys(("primitives", "packed_bytes", "model_bytes", "seconds", "fps"), 1234)
     record = SimpleNamespace(achieved=achieved, asked={"budget": 300.0}, why=["enough"], warning="psnr is missed")
     monkeypatch.setattr("neuprim.search.target.run_target", lambda *args, **options: record)

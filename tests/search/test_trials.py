@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import signal
 from dataclasses import replace
@@ -14,7 +13,6 @@ import neuprim.runs.fit as fitting
 from neuprim.config import Job, RunConfig, compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import DataError
-from neuprim.core.io.files import write_json
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.runs.fit import Event, Note, Step, fit
 from neuprim.runs.measure import evaluate_run
@@ -113,23 +111,6 @@ def test_views_that_judge_are_not_learned_from(scene: Path, tmp_path: Path) -> N
     assert outcome.psnr != pytest.approx(fitted.metrics()["psnr"], abs=1e-6), "the test views do not judge"
 
 
-def test_a_task_that_knows_its_test_views_is_not_asked_about_others(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """Films and facts are those of the data as they came; indices of the test split would mean other views."""
-    from neuprim.core.data import Clip
-
-    mine = replace(
-        TASK,
-        clips=lambda dataset: [Clip("all", [0, 1])],
-        metrics=lambda dataset, index, rendered, truth: pytest.fail("asked"),
-    )
-    monkeypatch.setattr("neuprim.tasks.static.TASK", mine)
-    assert run_trial(Trial(config_of(scene, tmp_path / "t"), hold_out=6)).psnr > 5, (
-        "one view is held out, and the film has two"
-    )
-
-
 class Halting(Trainer):
     """Presses Ctrl-C in the 15th step."""
 
@@ -172,14 +153,6 @@ def test_a_damaged_record_is_refused(scene: Path, tmp_path: Path, text: str) -> 
     (tmp_path / TRIAL_FILE).write_text(text)
     with pytest.raises(DataError, match=r"trial\.json: .*delete its folder to train anew"):
         run_trial(Trial(config_of(scene, tmp_path)))
-
-
-@pytest.mark.parametrize("change", [{"psnr": "much"}, {"pace": []}, {"bytes": None}])
-def test_a_damaged_outcome_is_refused(done: tuple[Path, Outcome], tmp_path: Path, change: dict[str, object]) -> None:
-    record = json.loads((done[0] / TRIAL_FILE).read_text())
-    write_json(tmp_path / TRIAL_FILE, {**record, "outcome": {**record["outcome"], **change}})
-    with pytest.raises(DataError, match=r"trial\.json: .*delete its folder"):
-        read_trial(tmp_path)
 
 
 @posix

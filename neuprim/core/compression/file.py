@@ -139,13 +139,13 @@ def is_compressed(path: Path) -> bool:
 
 def read_model_header(path: Path) -> dict[str, Any]:
     """Return the header without reading a section, or raise CheckpointError."""
-    with _open_model_file(path) as file:
+    with _open_compressed_file(path) as file:
         return _read_compressed_head(path, file).header
 
 
 def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str | None]:
     """Return header, float32 tensors by name and the run's configuration (or None), or raise CheckpointError."""
-    with _open_model_file(path) as file:
+    with _open_compressed_file(path) as file:
         head = _read_compressed_head(path, file)
         tensors: dict[str, Tensor] = {}
         masks: list[np.ndarray] = []
@@ -173,7 +173,7 @@ def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str 
     return head.header, tensors, config
 
 
-def _open_model_file(path: Path) -> BinaryIO:
+def _open_compressed_file(path: Path) -> BinaryIO:
     try:
         return io.BytesIO(path.read_bytes())  # one snapshot: size and content agree
     except FileNotFoundError:

@@ -24,19 +24,10 @@ from neuprim.core import checkpoint
 from neuprim.core.compression import CONFIG, LEVELS, CompressedSection, is_compressed, write_compressed
 from neuprim.core.errors import CheckpointError
 from neuprim.tasks.static import TASK
-from tests.compressing import FIELDS, example, without_pieces
+from tests.compressing import FIELDS, example
 from tests.systems import posix
 
 CONFIG_TEXT = "task: static\nnote: naïve\n"
-
-
-@pytest.fixture(scope="module", params=["whole", "pruned"])
-def whole(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> bytes:
-    """A file of a static model, and of one of which every other primitive does without something."""
-    path, model = tmp_path_factory.mktemp("whole") / "m.neuprim", example("static", 50)[1]
-    model = model if request.param == "whole" else without_pieces(model)
-    checkpoint.save_compressed(path, model, "static", {"note": "naïve"}, LEVELS[3], CONFIG_TEXT)
-    return path.read_bytes()
 
 
 def refused(path: Path, *words: str) -> str:
@@ -311,6 +302,7 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
     "too many planes": (lambda: by_hand(b2={"planes": 2**60}),
         ("planes of 1152921504606846976 bytes; expected at most 6",)),
     "size": (lambda: by_hand(b2={"size": 2**60}), ("stored in 1152921504606846976 bytes",)),
+    "check sum": (lambda: by_hand(b2={"crc": 0}), ("section 'b2' is damaged: its check sum is", "expected 00000000")),
     "no zstd": (lambda: by_hand(packing=1), ("section 'means' is damaged: zstd",)),
     "zstd states more": (
         lambda: by_hand(sections={"b2": (1, (1,), RECORD, BOMB)}, b2={"packing": 1, "planes": 2}),
@@ -373,9 +365,9 @@ def test_lies_take_no_memory(tmp_path: Path) -> None:
 # ---------------------------------------------------------------- writing
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, whole: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "m"
-    path.write_bytes(whole)
+    path.write_bytes(by_hand())
 
     def full(*places: Path) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
@@ -385,7 +377,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, whole: bytes, monkeypat
         checkpoint.save_compressed(path, example("static", 9)[1], "static", {}, LEVELS[3])
     monkeypatch.undo()
     assert str(path) in str(caught.value)
-    assert path.read_bytes() == whole and [p.name for p in tmp_path.iterdir()] == ["m"]
+    assert path.read_bytes() == by_hand() and [p.name for p in tmp_path.iterdir()] == ["m"]
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1, 1), (2**20 + 1,), (2**10, 2**11)])

@@ -186,6 +186,12 @@ def test_a_header_that_claims_more_than_there_is(tmp_path: Path) -> None:
         archive.writestr("a.npy", array)
     with pytest.raises(DataError, match=r"a claims shape \(9000000000, 3\), and has \d+ bytes"):
         read_npz_arrays(file, {"a": WANTED["a"]})
+    stored = bytearray(file.read_bytes())
+    at = stored.index(b"PK\x01\x02") + 24  # the size in the archive's list of files
+    stored[at : at + 4] = (4_000_000_000).to_bytes(4, "little")
+    file.write_bytes(stored)
+    with pytest.raises(DataError, match=r"a claims 4000000000 bytes of a file of"):
+        read_npz_arrays(file, {"a": WANTED["a"]})
     with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
         archive.writestr("a.npy", array + bytes(10**7))
     with pytest.raises(DataError, match=r"a claims 10,?\d+ bytes of a file of"):

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.conformance.task_under_test import EXACT, TaskUnderTest
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import View
 from neuprim.core.model.fields import ColourField, Conditions, Shading
 from neuprim.core.model.geometry import Geometry, PrimitiveChords

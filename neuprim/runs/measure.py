@@ -26,7 +26,7 @@ from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import check_dataset_views, check_pixels
-from neuprim.core.data.ray_points import GIVE_POINTS
+from neuprim.core.data.starting_points import GIVE_POINTS
 from neuprim.core.errors import warn_once
 from neuprim.core.io import images
 from neuprim.core.metrics import mean_metrics, metric_to_json, psnr, psnr_gain, ssim, ssim_3dgs

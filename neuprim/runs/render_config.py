@@ -23,8 +23,7 @@ from torch import Tensor
 from torch.nn.functional import interpolate
 
 from neuprim.config.overrides import parse_overrides, quote_override
-from neuprim.core.cameras.pinhole import camera_exr_attributes
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera, camera_exr_attributes
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.checkpoint import read_header

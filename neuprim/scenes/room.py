@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from PIL import Image
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.data.distortion import RadialDistortion
+from neuprim.core.data.image_views import RadialDistortion
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import write_json
 from neuprim.core.io.ply import write_ply

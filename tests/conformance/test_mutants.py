@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.conformance import CHECKS, ConformanceError, named_checks
 from neuprim.conformance.task_under_test import conformance_dataset
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.densities.cosine import CosineDensity

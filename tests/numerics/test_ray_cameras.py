@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.cameras.projections import RayCamera
+from neuprim.core.cameras.pinhole import RayCamera
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
 from neuprim.core.render.reference.backend import _PreparedPrimitives, frame_rays, pixel_ray_directions

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import RayCamera
+from neuprim.core.cameras.pinhole import RayCamera
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered

@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.data import Dataset
-from neuprim.core.data.distortion import RadialDistortion, resample_image, undistortion_grid
+from neuprim.core.data.image_views import RadialDistortion, resample_image, undistortion_grid
 from neuprim.core.io.ply import read_ply
 from neuprim.core.task import SceneContext
 from neuprim.scenes.room import (

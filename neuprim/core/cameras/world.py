@@ -11,8 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.pinhole import Camera
-from neuprim.core.cameras.projections import RayCamera
+from neuprim.core.cameras.pinhole import Camera, RayCamera
 from neuprim.core.errors import DataError
 
 _ROTATION = 1e-6  # how far a matrix over its scale may be from a rotation

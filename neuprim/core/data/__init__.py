@@ -11,8 +11,8 @@ from neuprim.core.data.dataset import (
     StartingPoints,
     View,
     ViewSet,
+    camera_extent,
 )
-from neuprim.core.data.scene_frame import camera_extent
 
 __all__ = [
     "Clip",

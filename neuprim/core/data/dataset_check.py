@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.projections import AnyCamera, RayCamera
+from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, DataSource, Pixels, PointCloud, PointSamples, PointSupervision, View, ViewSet
 from neuprim.core.errors import DataError

@@ -10,10 +10,8 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from neuprim.core.data.dataset import PointCloud, ViewSet
-from neuprim.core.data.hull import hull_surface
-from neuprim.core.data.ray_points import count_seeing_views, ray_starting_points
-from neuprim.core.data.scene_frame import dataset_axes_meet, dataset_focus_point
+from neuprim.core.data.dataset import PointCloud, ViewSet, dataset_axes_meet, dataset_focus_point
+from neuprim.core.data.starting_points import count_seeing_views, hull_surface, ray_starting_points
 from neuprim.core.errors import ConfigError
 
 _FPS_WORK = 5e8  # distances that exact farthest-point sampling may evaluate (1.5 s); above, a grid thins the points
@@ -25,10 +23,10 @@ _ROUNDS = 8  # times that a box is filled, for points that cameras see
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a static scene.
 
-    Given points win. Cameras that do not look at one point start along their rays
-    (:func:`~neuprim.core.data.ray_points.ray_starting_points`). Otherwise data with alpha use the surface of the visual
-    hull, and data without use a box around the focus. Inferred points are seen by at least two cameras. Raises
-    ConfigError: ``count`` is not positive; DataError: the alpha masks have no common volume, or an image is damaged.
+    Given points win. Cameras that do not look at one point start along their rays. Otherwise data with alpha use the
+    surface of the visual hull, and data without use a box around the focus. Inferred points are seen by at least two
+    cameras. Raises ConfigError: ``count`` is not positive; DataError: the alpha masks have no common volume, or an
+    image is damaged.
     """
     check_point_count(count)
     if points is not None:

@@ -14,10 +14,9 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset, PointCloud, StartingPoints, camera_extent
-from neuprim.core.data.dataset import SceneContext
+from neuprim.core.data.dataset import SceneContext, choose_dataset_world, dataset_focus_point
 from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.initial import initial_points
-from neuprim.core.data.scene_frame import choose_dataset_world, dataset_focus_point
 from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.images import ImageInfo
 from neuprim.core.validation import Range, nonempty_text, validate_fields

@@ -23,8 +23,7 @@ from neuprim.core.cameras.intrinsics import (
     refuse_unsupported_camera_keys,
 )
 from neuprim.core.cameras.pinhole import check_viewmat
-from neuprim.core.data.distortion import Distortion, FisheyeDistortion, RadialDistortion
-from neuprim.core.data.image_views import ImageFrame, Mask, find_masks
+from neuprim.core.data.image_views import Distortion, FisheyeDistortion, ImageFrame, Mask, RadialDistortion, find_masks
 from neuprim.core.data.posed_images import (
     BadImageViews,
     FolderSettings,

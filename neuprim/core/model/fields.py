@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, Self
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.cameras.world import World
 from neuprim.core.model.forms import (  # noqa: F401 - the forms are part of this interface
     Constant,

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.checks import (
     check_active_primitive_rows,

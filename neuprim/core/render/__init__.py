@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.projections import AnyCamera, RayCamera
+from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import ConfigError, NonFiniteError

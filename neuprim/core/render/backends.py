@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import AnyCamera, RayCamera
+from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.compute import device as hardware
 from neuprim.core.errors import BackendUnavailable, ConfigError, warn_once
 from neuprim.core.model.fields import Conditions

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.projections import AnyCamera, RayCamera
+from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.compute import device
 from neuprim.core.model.checks import check_primitive_field_result
 from neuprim.core.model.primitives import LoweredPrimitives

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.settings import RenderSettings
 
 _MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # of which depths are measured

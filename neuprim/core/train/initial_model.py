@@ -11,7 +11,7 @@ from neuprim.core.data import Dataset, PointCloud
 from neuprim.core.data.dataset_check import check_points
 from neuprim.core.data.initial import draw_points, surrounding_points
 from neuprim.core.data.points_file import COMPRESSED, read_points
-from neuprim.core.data.ray_points import GIVE_POINTS, count_seeing_views
+from neuprim.core.data.starting_points import GIVE_POINTS, count_seeing_views
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives

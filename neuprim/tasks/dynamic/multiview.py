@@ -19,8 +19,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Dataset, PointCloud, ViewSet
-from neuprim.core.data.dataset import ViewSubset
-from neuprim.core.data.hull import EmptyHull, hull_surface
+from neuprim.core.data.dataset import ViewSubset, dataset_axes_meet
 from neuprim.core.data.image_views import ImageFrame
 from neuprim.core.data.initial import (
     box_starting_points,
@@ -38,8 +37,7 @@ from neuprim.core.data.posed_images import (
     assemble_dataset,
     find_data_folder,
 )
-from neuprim.core.data.ray_points import ray_starting_points
-from neuprim.core.data.scene_frame import dataset_axes_meet
+from neuprim.core.data.starting_points import EmptyHull, hull_surface, ray_starting_points
 from neuprim.core.data.transforms_json import TransformsLayout, read_image_frames, split_named_images
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import JsonReader
@@ -202,8 +200,8 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
     next, overlapping runs supply the rest.
 
     Points lie on the surfaces of these hulls, each with the "time" and the colour of one moment. Cameras without a
-    common target give points along rays (:func:`~neuprim.core.data.ray_points.ray_starting_points`). Without alpha, or
-    if every image has its own time and all hulls are empty, points fill a box in front of the cameras at random times.
+    common target give points along rays. Without alpha, or if every image has its own time and all hulls are empty,
+    points fill a box in front of the cameras at random times.
 
     Raises:
         ConfigError: ``count`` is not positive.

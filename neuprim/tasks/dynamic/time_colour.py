@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.compute import device
 from neuprim.core.model.colours import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant, read_script

@@ -19,7 +19,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.compute import device
 from neuprim.core.model.colours.sh import prunable_sh_coefficients, truncate_sh_bands
 from neuprim.core.model.cosine_sums import canonicalize_cosines, ellipsoid_cosine_mean, smaller_cosine_neuron_counts

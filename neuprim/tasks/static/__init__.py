@@ -10,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import Dataset
 from neuprim.core.errors import BackendUnavailable, ConfigError
 from neuprim.core.model.colours import sh

@@ -23,8 +23,7 @@ from neuprim.core.cameras.colmap import (
 from neuprim.core.cameras.intrinsics import is_resized_camera_size
 from neuprim.core.cameras.pinhole import check_viewmat
 from neuprim.core.data import Dataset, PointCloud
-from neuprim.core.data.distortion import Distortion
-from neuprim.core.data.image_views import ImageFrame, find_masks
+from neuprim.core.data.image_views import Distortion, ImageFrame, find_masks
 from neuprim.core.data.points_file import read_points
 from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,

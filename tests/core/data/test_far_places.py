@@ -11,8 +11,8 @@ import torch
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
 from neuprim.core.data import PointCloud, camera_extent
+from neuprim.core.data.dataset import choose_dataset_world, dataset_focus_point
 from neuprim.core.data.points_file import read_points
-from neuprim.core.data.scene_frame import choose_dataset_world, dataset_focus_point
 from neuprim.core.errors import NeuprimWarning
 from neuprim.core.io.ply import write_ply
 

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Pixels, PointCloud, View, ViewSet
-from neuprim.core.data.hull import hull_surface
+from neuprim.core.data.dataset import dataset_axes_meet, dataset_focus_point
 from neuprim.core.data.initial import (
     box_starting_points,
     farthest_points,
@@ -20,8 +20,7 @@ from neuprim.core.data.initial import (
     initial_points,
     surrounding_points,
 )
-from neuprim.core.data.ray_points import count_seeing_views
-from neuprim.core.data.scene_frame import dataset_axes_meet, dataset_focus_point
+from neuprim.core.data.starting_points import count_seeing_views, hull_surface
 from neuprim.core.errors import DataError
 
 CENTER = torch.tensor([0.3, -0.2, 0.1], dtype=torch.float64)

@@ -15,7 +15,7 @@ import torch
 import neuprim
 from neuprim.cli import main
 from neuprim.config import RunConfig, compose
-from neuprim.core.cameras.projections import AnyCamera
+from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.errors import BackendUnavailable, ConfigError, NonFiniteError
 from neuprim.core.model.fields import Constant, CustomDensity
 from neuprim.core.model.primitives import LoweredPrimitives

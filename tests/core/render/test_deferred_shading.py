@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from neuprim.core.cameras.projections import RayCamera
+from neuprim.core.cameras.pinhole import RayCamera
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render.draw import unproject_rendered_depth

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.cameras.projections import RayCamera
+from neuprim.core.cameras.pinhole import RayCamera
 from neuprim.core.render.near_plane import nearest_and_median_depth, resolve_near
 from neuprim.core.settings import RenderSettings
 

@@ -14,8 +14,8 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.data.hull import EmptyHull
 from neuprim.core.data.initial import box_starting_points
+from neuprim.core.data.starting_points import EmptyHull
 from neuprim.core.io.exr import write_exr
 from neuprim.tasks.dynamic.multiview import load_moving_multiview, sample_moving_points
 

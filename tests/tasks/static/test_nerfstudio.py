@@ -14,7 +14,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.cameras import Camera
-from neuprim.core.data.distortion import RadialDistortion, undistortion_grid
+from neuprim.core.data.image_views import RadialDistortion, undistortion_grid
 from neuprim.core.errors import NeuprimWarning
 from neuprim.tasks.static.datasets import load_nerfstudio as load
 

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.projections import AnyCamera, RayCamera
+from neuprim.core.cameras.pinhole import AnyCamera, RayCamera
 from neuprim.core.model.geometry import Geometry, PrimitiveChords, quaternion_to_matrix
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth

@@ -133,15 +133,3 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
     assert curves[0] == curves[1] and len(curves[0]) == STEPS and any("change" in line for line in curves[0])
     metrics = [json.loads((place / "metrics.json").read_text()) for place in (whole, out)]
     assert metrics[0]["psnr"] == metrics[1]["psnr"] and (out / "report.html").exists()
-
-
-def test_what_is_wrong_is_said_once(tmp_path: Path) -> None:
-    launched = torchrun(
-        ["task=static", "scene=blender", f"scene.path={tmp_path / 'gone'}", f"output_dir={tmp_path / 'out'}"]
-    )
-    _, said = launched.communicate(timeout=120)
-    assert launched.returncode != 0
-    assert errors(said) == [
-        f"neuprim: error: {tmp_path / 'gone'}: does not exist; expected the data set's folder (scene.path)"
-    ]
-    assert not (tmp_path / "out").exists()

@@ -4,7 +4,6 @@ cannot be is refused."""
 from __future__ import annotations
 
 import io
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,7 @@ from neuprim.cli.progress import RunProgress
 from neuprim.conformance import check_task
 from neuprim.core import checkpoint
 from neuprim.core.channels import read_stored_channels
-from neuprim.core.errors import CheckpointError, ConfigError, NeuprimError
+from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.io import images
 from neuprim.core.io.exr import exr_channels
 from neuprim.core.render import render
@@ -265,26 +264,3 @@ def test_a_grey_model_is_exported_as_grey(site: Path, tmp_path: Path) -> None:
     )
     colours = np.asarray(ball.visual.vertex_colors)[:, :3]
     assert (colours == colours[:, :1]).all() and colours.std() > 0
-
-
-# ---------------------------------------------------------------- refused before training
-
-
-@pytest.mark.parametrize(
-    ("words", "changes", "text"),
-    [
-        (("scene.bands=4",), {}, "ball: 4 channels; expected 5, which task 'spectral' names: 450nm, 550nm"),
-        (
-            (),
-            {"build": "lambda m, d: (TwoScales(), ShiftedSpectrum(3))"},
-            "task 'spectral' of neuprim-spectral 0.1: build: channels of the colour: found 3; expected 5, as data set "
-            "'ball' has",
-        ),
-    ],
-)
-def test_contradictions_end_before_training(
-    site: Path, tmp_path: Path, words: tuple[str, ...], changes: dict[str, str], text: str
-) -> None:
-    with pytest.raises(NeuprimError, match=re.escape(text)):
-        changed(site, tmp_path, *words, **changes)
-    assert not (tmp_path / "run").exists()

@@ -134,14 +134,6 @@ def test_the_command_prints_what_was_kept(whole: Path, tmp_path: Path, capsys: p
     assert "of its numbers are kept" in text or "all primitives:" in text
 
 
-def test_inspect_says_what_is_left(left: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["inspect", str(left), "--show", "primitives", "--out", str(tmp_path / "p.html"), "--grid", "8"]) == 0
-    text = capsys.readouterr().out
-    kept = json.loads((left / "pruned.json").read_text())["kept"]
-    partly = [name for name, share in kept.items() if share < 1]
-    assert partly and all(f"{name}: {kept[name]:.0%} of its numbers are kept" in text for name in partly)
-
-
 def test_what_is_there_is_not_replaced(whole: Path, left: Path, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="exists and is not empty"):
         prune_run(PruneRequest(whole, TOLERANCE, steps=0))

@@ -247,25 +247,6 @@ def test_impossible_settings_in_a_file(toy: Path, old: str, new: str, text: str)
 # ---------------------------------------------------------------- the static task's files
 
 
-STRATEGIES = {
-    "quick": "relocate",
-    "paper": "gradient",
-    "paper_real": "gradient",
-    "paper_200": "fixed",
-    "paper_5k": "fixed",
-}
-
-
-@pytest.mark.parametrize("preset", STRATEGIES)
-def test_static_compositions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: str) -> None:
-    monkeypatch.chdir(tmp_path)
-    c = compose(["scene=blender", f"preset={preset}", "scene.path=data"])
-    assert (c.task, c.scene_name, c.preset) == ("static", "blender", preset)
-    gain = {"log_gain"} if preset == "quick" else set()
-    assert set(c.train.rates) == {"means", "log_scales", "quats", "W1", "b1", "w2", "b2", "sh_dc", "sh_rest"} | gain
-    assert c.train.population.strategy == STRATEGIES[preset]
-
-
 def test_a_preset_starts_from_others(toy: Path) -> None:
     folder = toy / "conf" / "preset" / "toy"
     (folder / "longer.yaml").write_text("defaults: [long, _self_]\ntrain: {iterations: 800}\n")

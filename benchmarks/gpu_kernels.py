@@ -33,7 +33,7 @@ from shared.cubins import compile_kernel, read_resources
 from shared.tables import DOCS, RESULTS, Table, between_markers, make_table, read_record
 
 from neuprim.core.compute.warp import BLOCK
-from neuprim.core.model.colours import sh_warp
+from neuprim.core.model import sh_warp
 from neuprim.core.render.cuda import backend, binning, colour_net, float64, forward, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import KernelForm

@@ -27,7 +27,7 @@ from shared.tables import DOCS, RESULTS, Record, between_markers, make_table, re
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count, cpu_name
-from neuprim.core.train.distributed.process_group import ProcessGroup, read_torchrun_rank
+from neuprim.core.train.process_group import ProcessGroup, read_torchrun_rank
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import compile_run_kernels, fit, prepare_training, use_one_torch_thread_for_run
 

@@ -23,7 +23,7 @@ import torch
 
 import neuprim
 from neuprim.core.cameras import look_at
-from neuprim.core.model.densities.cosine import OMEGA0, cosine_density
+from neuprim.core.model.cosine import OMEGA0, cosine_density
 from neuprim.core.model.edge import EDGES, NORMS, edge_profile, edge_weight
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry

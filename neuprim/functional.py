@@ -11,7 +11,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, check_viewmat
 from neuprim.core.errors import BackendUnavailable, ConfigError, DataError, NonFiniteError, nearest
-from neuprim.core.model.densities.cosine import apply_density_gain
+from neuprim.core.model.cosine import apply_density_gain
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives

@@ -8,9 +8,9 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compression import BitTable, Quantizers, canonical_model, fit_quantizers, storage_order
-from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import ColourField, DensityField, prunable_units_of_model
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import PrunableUnit, zero_units
 from neuprim.core.model.schema import InitContext

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from tests import scenes

@@ -12,7 +12,7 @@ import torch
 import torch.distributed as dist
 from torch import Tensor
 
-from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
+from neuprim.core.train.process_group import ProcessGroup, TorchrunRank
 
 T = TypeVar("T")
 

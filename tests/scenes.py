@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.model.densities.cosine import apply_density_gain
+from neuprim.core.model.cosine import apply_density_gain
 from neuprim.core.model.fields import Constant, Cosine, LoweredColour, RayNet
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives

@@ -91,8 +91,7 @@ CORE: dict[str, set[str]] = {
         "volumes",
     },
     "render": {"cameras", "compute", "errors", "metrics", "model", "settings"},
-    "train": {"validation", "compute", "data", "errors", "model", "render", "task", "volumes"},
-    "used_settings": {"validation", "errors", "extensions", "task", "train"},
+    "train": {"validation", "compute", "data", "errors", "extensions", "model", "render", "task", "volumes"},
 }
 """The same inside ``core``, folders and single files alike."""
 

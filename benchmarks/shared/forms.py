@@ -9,7 +9,7 @@ from functools import cache
 from pathlib import Path
 
 from neuprim.config import Job, compose
-from neuprim.core.used_settings import build_settings
+from neuprim.core.train.settings import build_settings
 from neuprim.runs.open import load_dataset
 
 

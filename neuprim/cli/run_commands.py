@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from neuprim.config import RunConfig
     from neuprim.config.command_settings import LauncherSettings, SearchTarget
     from neuprim.config.overrides import CommandLine
-    from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
+    from neuprim.core.train.process_group import ProcessGroup, TorchrunRank
     from neuprim.runs.launch.jobs import JobResult
     from neuprim.search.target_record import TargetRecord
 
@@ -87,7 +87,7 @@ def _run_command(args: argparse.Namespace) -> int:
         take_viewer_overrides,
     )
     from neuprim.config.overrides import CommandLine, drop_output_overrides
-    from neuprim.core.train.distributed.process_group import read_torchrun_rank
+    from neuprim.core.train.process_group import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
     place = read_torchrun_rank()
@@ -290,7 +290,7 @@ def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> in
         more: whether anything but one run was asked for.
     """
     from neuprim.core.compute.threads import limit_process_threads, machine_cores
-    from neuprim.core.train.distributed.process_group import ProcessGroup
+    from neuprim.core.train.process_group import ProcessGroup
 
     group = ProcessGroup(place, os.environ)
 

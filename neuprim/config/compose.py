@@ -59,8 +59,8 @@ from neuprim.config.task_files import (
 )
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.settings import MetricsSettings
-from neuprim.core.train.distributed.process_group import read_torchrun_rank
-from neuprim.core.used_settings import build_settings
+from neuprim.core.train.process_group import read_torchrun_rank
+from neuprim.core.train.settings import build_settings
 from neuprim.core.validation import (
     format_setting_value,
     infer_type_to_validate,

@@ -16,8 +16,7 @@ from neuprim.core.io.json_reader import parse_yaml_file
 from neuprim.core.render import backends
 from neuprim.core.settings import MetricsSettings, RenderSettings
 from neuprim.core.train import population
-from neuprim.core.train.settings import ModelSettings, TrainSettings
-from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.train.settings import OPTIONAL, ModelSettings, TrainSettings
 from neuprim.core.validation import Range, join_setting_key, validate_fields, validate_settings
 from neuprim.plugins.attribution import RunPlugins
 from neuprim.plugins.provenance import Provenance, load_recorded_plugin

@@ -10,7 +10,7 @@ from neuprim.config.overrides import Assignment
 from neuprim.config.run_config import RunSettings
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.model.geometry import GEOMETRY_SPECS
-from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.train.settings import OPTIONAL
 from neuprim.core.validation import (
     Option,
     field_types,

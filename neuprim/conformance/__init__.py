@@ -55,8 +55,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.task import Supervision, TaskSpec
-from neuprim.core.train.settings import ModelSettings
-from neuprim.core.used_settings import build_settings, loss_settings
+from neuprim.core.train.settings import ModelSettings, build_settings, loss_settings
 from neuprim.core.validation import validate_settings
 from neuprim.plugins.attribution import (
     ReturnError,

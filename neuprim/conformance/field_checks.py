@@ -13,8 +13,7 @@ from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import View
 from neuprim.core.model.fields import ColourField, Conditions, Shading
 from neuprim.core.model.geometry import Geometry, PrimitiveChords
-from neuprim.core.model.primitives import ActivePrimitives, Primitives
-from neuprim.core.model.reduction import reduce_model
+from neuprim.core.model.primitives import ActivePrimitives, Primitives, reduce_model
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.population import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT

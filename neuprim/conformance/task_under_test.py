@@ -24,9 +24,8 @@ from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.render.backends import REFERENCE
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.initial_model import initial_model_to_train
-from neuprim.core.train.settings import PopulationSettings, TrainSettings
+from neuprim.core.train.settings import PopulationSettings, TrainSettings, build_settings, loss_settings
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.used_settings import build_settings, loss_settings
 
 PRIMITIVES = 12
 EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, transmittance_min=0.0, depth_floor=1e-12)

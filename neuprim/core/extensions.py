@@ -201,7 +201,7 @@ class LossExtension:
         make: the settings under ``train``, and this loss's options as "options" -> the loss.
         options: name -> (default, one line of help), set as ``task.options.NAME`` while the loss is chosen; as
             :attr:`~neuprim.core.task.TaskSpec.options`.
-        uses: the settings of :data:`neuprim.core.used_settings.OPTIONAL` under ``train`` that ``make`` reads.
+        uses: the settings of :data:`neuprim.core.train.settings.OPTIONAL` under ``train`` that ``make`` reads.
     """
 
     api: int

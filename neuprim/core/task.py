@@ -112,7 +112,7 @@ class TaskSpec:
         name: what the user types after ``task=``.
         config_package: importable package with ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and ``preset/NAME/*.yaml``.
         build: (model settings, dataset) -> the density and colour fields. Of the settings in
-            :data:`neuprim.core.used_settings.OPTIONAL` it gets those that ``uses`` lists, and the task's options as
+            :data:`neuprim.core.train.settings.OPTIONAL` it gets those that ``uses`` lists, and the task's options as
             "options".
         loss: loss settings -> the training loss, which ``train.loss`` may replace. It gets ``train`` and "options".
         check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for settings that the task does
@@ -131,7 +131,7 @@ class TaskSpec:
         options: name -> (default, one line of help) of the task's own settings under ``task.options``. Values are
             converted to the default's type, or to a third entry: ``Annotated[float, Range(0, 1)]``,
             ``("soft", "hard")`` (:mod:`neuprim.core.validation`). ``task/NAME.yaml`` may have other defaults.
-        uses: the shared settings of :data:`neuprim.core.used_settings.OPTIONAL` that ``build`` (``model.…``) and
+        uses: the shared settings of :data:`neuprim.core.train.settings.OPTIONAL` that ``build`` (``model.…``) and
             ``loss`` (``train.…``) read. Setting others is an error.
         mask: (data set, index of a test view) -> (H, W) bool, the part of the view whose error is reported on its own,
             or None.

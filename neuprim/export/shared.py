@@ -13,7 +13,7 @@ from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import ExportJob, TrainedModel
-from neuprim.core.model.colours import sh
+from neuprim.core.model import sh
 from neuprim.core.model.fields import Conditions
 
 _DEGREE = 3

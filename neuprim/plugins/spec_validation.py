@@ -13,7 +13,7 @@ from neuprim.core.io.exr import exr_channel_name_error
 from neuprim.core.model.fields import ConditionSpec, Field
 from neuprim.core.render.layer_frame import COMMON, LIGHTS, LayerSpec
 from neuprim.core.task import SceneSpec, TaskSpec
-from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.train.settings import OPTIONAL
 from neuprim.core.validation import option_type_to_validate, validate_value
 
 _NESTED: dict[str, type] = {kind.__name__: kind for kind in (SceneSpec, ConditionSpec, LayerSpec)}

@@ -20,16 +20,14 @@ from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError
 from neuprim.core.metrics import psnr
 from neuprim.core.metrics.lpips import Lpips
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.reduction import reduce_fields
+from neuprim.core.model.primitives import Primitives, reduce_fields
 from neuprim.core.render import backends
 from neuprim.core.task import Loss, TaskSpec
-from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.distributed_trainer import DistributedTrainer
 from neuprim.core.train.initial_model import initial_model_to_train
-from neuprim.core.train.settings import TrainSettings
+from neuprim.core.train.process_group import ProcessGroup
+from neuprim.core.train.settings import TrainSettings, build_settings, loss_settings
 from neuprim.core.train.trainer import StepReport, Trainer
-from neuprim.core.used_settings import build_settings, loss_settings
 from neuprim.plugins.attribution import attribute_errors, call_task_clips, call_task_facts, check_fields, guard_loss
 from neuprim.plugins.registry import LOSSES
 from neuprim.runs.measure import measure_views, render_image, summarize_metrics

@@ -33,8 +33,7 @@ from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.exr import ExrChannel, write_exr_layers
 from neuprim.core.io.images import srgb_to_linear
 from neuprim.core.model.fields import Conditions
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.reduction import KINDS, reduce_model, reduction_names, validate_reduction
+from neuprim.core.model.primitives import KINDS, Primitives, reduce_model, reduction_names, validate_reduction
 from neuprim.core.render import RenderSettings, backends, render
 from neuprim.core.render.layer_frame import LIGHTS, LayerFrame, LayerSpec, select_layers
 from neuprim.core.render.near_plane import resolve_near

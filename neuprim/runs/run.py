@@ -20,7 +20,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.metrics.image import format_metrics
 from neuprim.core.task import Chunks, Loss
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
 from neuprim.runs.evaluate import evaluate_fitted

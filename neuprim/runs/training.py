@@ -26,8 +26,8 @@ from neuprim.core.errors import CheckpointError, RankError, warn_once
 from neuprim.core.io.files import write_text
 from neuprim.core.io.json_reader import load_json
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.distributed_trainer import DistributedTrainer
+from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.trainer_state import select_state_tensors
 from neuprim.plugins.attribution import call_task_facts

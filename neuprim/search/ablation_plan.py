@@ -13,8 +13,8 @@ from neuprim.config import RunConfig
 from neuprim.config.overrides import parse_overrides, quote_override
 from neuprim.core.data import Dataset
 from neuprim.core.task import TaskSpec
+from neuprim.core.train.settings import build_settings
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.used_settings import build_settings
 from neuprim.core.validation import Range
 from neuprim.plugins.attribution import call_task_tunable_settings
 from neuprim.runs.fit import compile_run_kernels, prepare_training, use_one_torch_thread_for_run

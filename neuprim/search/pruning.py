@@ -14,8 +14,7 @@ from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.files import refuse_existing, write_json, write_text
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.reduction import reduce_model
+from neuprim.core.model.primitives import Primitives, reduce_model
 from neuprim.core.task import TaskSpec
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity
 from neuprim.core.train.trainer import Trainer

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.model.fields import prunable_units_of_model
-from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.primitives import Primitives, reduce_model
 from neuprim.core.model.prunable import PrunableUnit, count_unit_numbers, primitives_with_unit, zero_units
-from neuprim.core.model.reduction import reduce_model
 from neuprim.core.train.sensitivity import Sensitivity
 from neuprim.search.model_quality import SearchQuality
 

@@ -15,7 +15,7 @@ from neuprim.config.command_settings import SearchTarget
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import TaskSpec
-from neuprim.core.used_settings import build_settings
+from neuprim.core.train.settings import build_settings
 from neuprim.plugins.attribution import call_task_tunable_settings
 from neuprim.search.size_forecast import (
     ALLOWANCE,

@@ -15,8 +15,8 @@ from neuprim.cli.run_commands import _compose_rank_arguments, _select_rank_gpu, 
 from neuprim.config import compose
 from neuprim.core.compute import threads
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError
-from neuprim.core.train.distributed import process_group
-from neuprim.core.train.distributed.process_group import ProcessGroup, TorchrunRank
+from neuprim.core.train import process_group
+from neuprim.core.train.process_group import ProcessGroup, TorchrunRank
 from tests.ranks import ThreadGroup, results, run_ranks
 
 WORDS = ["task=static", "scene=solids"]

@@ -16,9 +16,9 @@ from neuprim.conformance.task_under_test import conformance_dataset
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Conditions, ConditionSpec, Constant, Cosine, Field
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.task import SceneSpec, Supervision, TaskSpec

@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import TaskSpec
 from neuprim.tasks.static import TASK, SphericalHarmonics

@@ -15,15 +15,15 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet, camera_extent
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.distributed_trainer import DistributedTrainer
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.losses import photometric
+from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.tasks.static import SphericalHarmonics

@@ -14,8 +14,8 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.ply import read_ply
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.edge import NORMS
 from neuprim.core.model.geometry import quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives

@@ -16,8 +16,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, Shading
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.tensors import MOST_UNITS

@@ -150,7 +150,7 @@ def test_only_the_reference_draws_them() -> None:
 
 def test_a_task_s_model_through_a_fisheye() -> None:
     """``render`` lowers view-dependent colours for such a camera as for any other."""
-    from neuprim.core.model.densities.cosine import CosineDensity
+    from neuprim.core.model.cosine import CosineDensity
     from neuprim.core.model.primitives import Primitives
     from neuprim.tasks.static import SphericalHarmonics
 

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.tasks.static import SphericalHarmonics

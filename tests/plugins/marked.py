@@ -13,8 +13,8 @@ import torch
 from neuprim.config import compose
 from neuprim.core import checkpoint
 from neuprim.core.io.vdb import VdbGrid, write_vdb
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.registry import load_task
 

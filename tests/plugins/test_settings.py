@@ -15,8 +15,7 @@ from neuprim.config import RunConfig, compose
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import ConfigError
 from neuprim.core.task import Supervision
-from neuprim.core.train.settings import ModelSettings, TrainSettings
-from neuprim.core.used_settings import build_settings, loss_settings
+from neuprim.core.train.settings import ModelSettings, TrainSettings, build_settings, loss_settings
 from neuprim.plugins.registry import LOSSES, load_task
 from neuprim.tasks.static import TASK
 from tests.core import tiny

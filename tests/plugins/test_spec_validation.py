@@ -11,7 +11,7 @@ from neuprim.core.extensions import Exporter, ExportReport, Inspector, SceneExte
 from neuprim.core.model.fields import ConditionSpec, DensityField
 from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.task import SceneSpec
-from neuprim.core.used_settings import OPTIONAL
+from neuprim.core.train.settings import OPTIONAL
 from neuprim.core.validation import Range
 from neuprim.plugins.registry import LOSSES, PLUGIN_GROUPS, load_task
 from neuprim.plugins.spec_validation import validate_spec

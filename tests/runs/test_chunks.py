@@ -16,7 +16,7 @@ from neuprim.config import compose
 from neuprim.core import checkpoint
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import write_vdb
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.process_group import ProcessGroup
 from neuprim.runs import sweep
 from neuprim.runs.fit import Event, Note, Preparing, Step, fit, ignore_run_event
 from neuprim.runs.open import load_run, read_metrics

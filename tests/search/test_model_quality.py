@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuprim.core.data import Dataset, PointSamples, PointSupervision
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.train.sensitivity import inner_sensitivity, sensitivity

@@ -24,7 +24,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from neuprim.config.command_settings import ViewerSettings
 from neuprim.core.channels import Channels
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.tasks.static import TASK, SphericalHarmonics
 from neuprim.viewer.controls import SessionManager

@@ -17,7 +17,7 @@ from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.images import to_uint8
 from neuprim.core.metrics import psnr
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.runs.measure import render_image

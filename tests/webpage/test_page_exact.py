@@ -14,7 +14,7 @@ import torch
 
 from neuprim.core.cameras import Camera
 from neuprim.core.io.images import to_uint8
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.settings import RenderSettings

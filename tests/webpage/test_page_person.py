@@ -13,7 +13,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.io.images import encode_webp_data_uri
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork

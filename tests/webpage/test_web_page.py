@@ -12,9 +12,9 @@ import pytest
 import torch
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.edge import edge_profile
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.tasks.relight import visibility
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from neuprim.core.cameras.pinhole import AnyCamera
-from neuprim.core.model.colours import sh
+from neuprim.core.model import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params

@@ -12,7 +12,7 @@ from neuprim.core.data import PointCloud
 from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io import images
 from neuprim.core.io.ply import PlyVertices, read_ply
-from neuprim.core.model.colours.sh import C0
+from neuprim.core.model.sh import C0
 
 COMPRESSED = (".splat", ".spz", ".ksplat", ".sog", ".sogs", ".lcc")  # refused by name
 

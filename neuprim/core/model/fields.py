@@ -219,7 +219,7 @@ class ColourField(Field):
     channels: int
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """Return (N, C) and (N, B, C) or None for :func:`neuprim.core.model.colours.sh.sh_colors`, or None."""
+        """Return (N, C) and (N, B, C) or None for :func:`neuprim.core.model.sh.sh_colors`, or None."""
         return None
 
     @abstractmethod

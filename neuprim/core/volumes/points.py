@@ -15,11 +15,11 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.colours.sh import C0
-from neuprim.core.model.densities.cosine import cosine_density
+from neuprim.core.model.cosine import cosine_density
 from neuprim.core.model.fields import Conditions, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActivePrimitives, Primitives
+from neuprim.core.model.sh import C0
 from neuprim.core.volumes.points_cpu import NOT_FINITE, CosinePointValues, PointCells, sort_points_into_cells
 
 

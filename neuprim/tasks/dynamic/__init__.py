@@ -13,7 +13,7 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE
+from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.edge import NORMS, edge_profile
 from neuprim.core.model.fields import ColourField, ConditionSpec, Cosine, DensityField
 from neuprim.core.model.geometry import Geometry

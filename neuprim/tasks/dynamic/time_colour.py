@@ -10,7 +10,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.colours import sh
+from neuprim.core.model import sh
 from neuprim.core.model.fields import ColourField, Conditions, Constant, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit

@@ -23,12 +23,13 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.model.cosine_sums import canonicalize_cosines, prune_cosine_neurons
-from neuprim.core.model.densities.cosine import (
+from neuprim.core.model.cosine import (
     OMEGA0,
     CosineDensity,
     apply_density_gain,
+    canonicalize_cosines,
     cosine_density,
+    prune_cosine_neurons,
     split_cosine,
     split_density_scale,
 )
@@ -86,7 +87,7 @@ def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Te
 class TimeDensity(DensityField):
     """f(x~, xi) of K cosine neurons whose ``time`` parts vary (see the module); 5K + 1 parameters and the parts'.
 
-    ``init`` of the model settings: as :class:`~neuprim.core.model.densities.cosine.CosineDensity`, and
+    ``init`` of the model settings: as :class:`~neuprim.core.model.cosine.CosineDensity`, and
 
     * ``window``: half width tau of a new window, in units of the sequence;
     * ``window_frames``: largest tau in frames;

@@ -21,7 +21,7 @@ from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.metrics import mean_metrics as mean_metrics
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.lpips import flip, flip_available
-from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
+from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.layer_frame import LayerFrame, LayerSpec

@@ -21,13 +21,13 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.compute import device
-from neuprim.core.model.colours.sh import prunable_sh_coefficients, truncate_sh_bands
-from neuprim.core.model.cosine_sums import canonicalize_cosines, ellipsoid_cosine_mean, smaller_cosine_neuron_counts
+from neuprim.core.model.cosine import canonicalize_cosines, ellipsoid_cosine_mean, smaller_cosine_neuron_counts
 from neuprim.core.model.edge import sinc
 from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, RayNet, Shading, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.model.sh import prunable_sh_coefficients, truncate_sh_bands
 from neuprim.core.settings import RenderSettings
 
 FORMS = ("additive", "multiplicative")

@@ -13,10 +13,10 @@ from torch import Tensor
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import Dataset
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
-from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, Conditions, Constant, DensityField, read_script
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params

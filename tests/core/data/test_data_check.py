@@ -16,7 +16,7 @@ from neuprim.core.data import PointCloud, PointSamples
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import DatasetError, check_dataset_views, check_point_samples, check_points
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.settings import ModelSettings
@@ -170,10 +170,10 @@ def test_an_orbit_has_every_condition_of_the_training_views() -> None:
     data = tiny.two_primitives()
     plain = data.train.view
     data.train.view = lambda i: replace(
-        plain(i), conditions={"time": torch.tensor(0.1 * i), "light": torch.tensor([i, 2.0, 3.0])}
+        plain(i), conditions={"time": torch.tensor(0.2 + 0.1 * i), "light": torch.tensor([i, 2.0, 3.0])}
     )  # type: ignore[method-assign]
     views = data.orbit(3)
-    torch.testing.assert_close(torch.stack([v.conditions["time"] for v in views]), torch.tensor([0.0, 0.25, 0.5]))
+    torch.testing.assert_close(torch.stack([v.conditions["time"] for v in views]), torch.tensor([0.2, 0.45, 0.7]))
     assert [v.conditions["light"].tolist() for v in views] == [[0.0, 2.0, 3.0]] * 3
 
 

@@ -14,8 +14,8 @@ from torch import Tensor
 from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import DataError
 from neuprim.core.io.ply import read_ply, write_ply
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity, gaussian_support
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity, gaussian_support
 from neuprim.core.model.edge import EDGES
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.train.initial_model import initial_model_to_train

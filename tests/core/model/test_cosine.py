@@ -10,7 +10,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext

@@ -9,7 +9,7 @@ import torch
 
 from neuprim.conformance.field_checks import conformance_points_inside, random_chords
 from neuprim.core.errors import FormError
-from neuprim.core.model.densities.cosine import cosine_density
+from neuprim.core.model.cosine import cosine_density
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry, PrimitiveChords
 from neuprim.core.model.tensors import MOST_UNITS

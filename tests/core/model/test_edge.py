@@ -9,7 +9,7 @@ from scipy import special
 from torch import Tensor
 
 from neuprim.config import compose
-from neuprim.core.model.densities.cosine import CosineDensity, cosine_density
+from neuprim.core.model.cosine import CosineDensity, cosine_density
 from neuprim.core.model.edge import EDGES, NORMS, edge_profile, soft_edge_chord_integral, spherical_bessel
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry, PrimitiveChords

@@ -15,8 +15,8 @@ from torch import Tensor
 import neuprim.runs.run as running
 from neuprim.config import compose
 from neuprim.core import checkpoint
-from neuprim.core.model.densities.gaussian import GaussianDensity, bell_integral
 from neuprim.core.model.fields import CustomDensity
+from neuprim.core.model.gaussian import GaussianDensity, bell_integral
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext

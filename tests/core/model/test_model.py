@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext, ParameterSpec

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import cosine_density
+from neuprim.core.model.cosine import cosine_density
 from neuprim.core.model.fields import Constant, Cosine, CustomColour, CustomDensity, RayNet
 from neuprim.core.model.geometry import PrimitiveChords
 from neuprim.core.model.primitives import LoweredPrimitives

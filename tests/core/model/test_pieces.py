@@ -11,7 +11,7 @@ from safetensors.torch import save_file
 
 from neuprim.core import checkpoint
 from neuprim.core.errors import CheckpointError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Field, prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import (

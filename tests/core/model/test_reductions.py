@@ -9,11 +9,10 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.model.colours import sh
-from neuprim.core.model.cosine_sums import prune_cosine_neurons
-from neuprim.core.model.densities.cosine import OMEGA0, CosineDensity, cosine_density
-from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import OMEGA0, CosineDensity, cosine_density, prune_cosine_neurons
 from neuprim.core.model.fields import Field
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.dynamic.time_colour import TimeHarmonics

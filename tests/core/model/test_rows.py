@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import GAIN_LIMIT, apply_density_gain
+from neuprim.core.model.cosine import GAIN_LIMIT, apply_density_gain
 from neuprim.core.model.rows import take_primitive_rows
 
 pytestmark = pytest.mark.usefixtures("either_way")

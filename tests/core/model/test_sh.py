@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Constant
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
@@ -113,7 +113,7 @@ def on_blocks(
 ) -> torch.Tensor:
     """The card's kernels, on Warp's CPU blocks."""
     pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
-    from neuprim.core.model.colours.sh_warp import fused_harmonic_colors
+    from neuprim.core.model.sh_warp import fused_harmonic_colors
 
     return fused_harmonic_colors(means, dc, rest, origin, degree)
 

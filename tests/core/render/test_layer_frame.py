@@ -8,9 +8,9 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import CosineDensity
-from neuprim.core.model.densities.gaussian import GaussianDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Constant, DensityField
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.layer_frame import LayerFrame

@@ -14,7 +14,7 @@ from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera
 from neuprim.core.data import Dataset, Pixels, PointCloud, ViewSet
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.losses import photometric

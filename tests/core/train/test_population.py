@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import FormError
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions

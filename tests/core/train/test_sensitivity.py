@@ -7,7 +7,7 @@ from dataclasses import replace
 import torch
 
 from neuprim.core.data import Dataset
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import zero_units

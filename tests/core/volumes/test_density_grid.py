@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext

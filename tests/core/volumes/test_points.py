@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import NonFiniteError
-from neuprim.core.model.densities.gaussian import GaussianDensity
 from neuprim.core.model.fields import Conditions
+from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.volumes.density_grid import density_at

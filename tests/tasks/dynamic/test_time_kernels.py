@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext

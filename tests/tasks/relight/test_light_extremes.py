@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.data import Pixels, View
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import RayNet
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render

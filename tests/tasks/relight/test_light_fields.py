@@ -9,8 +9,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.colours import sh
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model import sh
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine, RayNet
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives

@@ -21,7 +21,7 @@ from neuprim.core.environment import Environment
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import read_image
-from neuprim.core.model.densities.cosine import CosineDensity
+from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.task import SceneContext

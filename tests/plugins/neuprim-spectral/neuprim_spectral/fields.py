@@ -4,7 +4,7 @@ import math
 
 import torch
 
-from neuprim.core.model.densities.cosine import cosine_density, split_cosine
+from neuprim.core.model.cosine import cosine_density, split_cosine
 from neuprim.core.model.fields import ColourField, Constant, Cosine, DensityField
 from neuprim.core.model.schema import ParameterSpec
 

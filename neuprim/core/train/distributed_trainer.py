@@ -21,7 +21,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.output import Contributions
 from neuprim.core.task import Loss
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
 from neuprim.core.train.trainer_state import hash_training_views

@@ -13,8 +13,8 @@ import torch
 from neuprim.config import compose
 from neuprim.core.data import Dataset, Pixels
 from neuprim.core.errors import ConfigError, NeuprimError, NonFiniteError, RankError
-from neuprim.core.train.distributed.distributed_trainer import DistributedTrainer
-from neuprim.core.train.distributed.process_group import ProcessGroup
+from neuprim.core.train.distributed_trainer import DistributedTrainer
+from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.runs.fit import prepare_training
 from tests.core import tiny

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.train.distributed.process_group import TorchrunRank, read_torchrun_rank
+from neuprim.core.train.process_group import TorchrunRank, read_torchrun_rank
 
 COMPLETE = {
     "RANK": "3",

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Spherical-harmonics colours on a GPU, a thread a primitive, float64 inside: the twin of ``sh_cpu``."""
+"""Spherical-harmonics colours on a GPU, a thread a primitive, float64 inside: the twin of ``model.rows``."""
 
 import functools
 from typing import Any
@@ -9,7 +9,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
-from neuprim.core.model.colours.sh_constants import C0, C1, C2, C3
+from neuprim.core.model.sh_constants import C0, C1, C2, C3
 
 d, f = wp.float64, wp.float32
 _C0, _C1 = wp.constant(d(C0)), wp.constant(d(C1))
@@ -162,6 +162,6 @@ class _HarmonicColors(torch.autograd.Function):
 
 
 def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """:func:`~neuprim.core.model.colours.sh.sh_colors` of float32 GPU tensors, degree 1..3; differentiable."""
+    """:func:`~neuprim.core.model.sh.sh_colors` of float32 GPU tensors, degree 1..3; differentiable."""
     result: Tensor = _HarmonicColors.apply(means, dc, rest, origin, degree)
     return result

@@ -1,1 +1,0 @@
-"""What built-in colours share."""

@@ -116,12 +116,7 @@ class _RenderTradeoffSession(TradeoffSession):
     """Measure points of one run within the budget."""
 
     def __init__(
-        self,
-        folder: Path,
-        request: TradeoffRequest,
-        record: TradeoffRecord,
-        progress: Progress,
-        setup: TradeoffSetup,
+        self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress, setup: TradeoffSetup
     ) -> None:
         super().__init__(folder, request, record, progress)
         self.setup = setup

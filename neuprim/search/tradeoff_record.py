@@ -254,10 +254,7 @@ class TradeoffRecord:
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
         self.left_out = [*others, LeftOutPoint(knob, words, reason)]
 
-    def find_fronts(
-        self,
-        in_size: Callable[[TradeoffPoint], bool] = lambda point: True,
-    ) -> None:
+    def find_fronts(self, in_size: Callable[[TradeoffPoint], bool] = lambda point: True) -> None:
         """Compute both fronts; that of size has the points that may be on it."""
         costs = [
             (Objectives(p.ratio, psnr := round(p.quality["psnr"], _DIGITS), p.doubt), Objectives(float(p.bytes), psnr))

@@ -15,13 +15,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.training import COOL, LEAST_START, LONG, START, make_run_finetune_trainer
-from neuprim.search.compress import (
-    QuantizationSearch,
-    TrainingData,
-    dequantize,
-    finetune_for_table,
-    search_fewest_bits,
-)
+from neuprim.search.compress import QuantizationSearch, TrainingData, dequantize, finetune_for_table, search_fewest_bits
 from neuprim.search.model_quality import SearchQuality
 from tests.core import tiny
 from tests.short_runs import fit, words

@@ -14,12 +14,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.runs.measure import evaluate_run
 from neuprim.search import render_tradeoff as engine
 from neuprim.search.render_tradeoff import measure_tradeoff
-from neuprim.search.tradeoff_measuring import (
-    TimedPoint,
-    TradeoffRequest,
-    load_tradeoff_setup,
-    time_tradeoff_points,
-)
+from neuprim.search.tradeoff_measuring import TimedPoint, TradeoffRequest, load_tradeoff_setup, time_tradeoff_points
 from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord, read_tradeoff_record
 from tests.search.tradeoff_runs import copied, tiny_run
 
@@ -42,13 +37,7 @@ def test_every_value_of_every_knob_is_measured(measured: tuple[Path, TradeoffRec
     _, record = measured
     knobs = [point.knob for point in record.points]
     counts = {name: knobs.count(name) for name in ("reference", *QUICK)}
-    assert counts == {
-        "reference": 1,
-        "alpha_min": 7,
-        "resolution": 3,
-        "colour.degree": 3,
-        "density.neurons": 4,
-    }
+    assert counts == {"reference": 1, "alpha_min": 7, "resolution": 3, "colour.degree": 3, "density.neurons": 4}
     assert "combined" in knobs and len({point.words for point in record.points}) == len(record.points)
     for point in record.points:
         assert len(point.ms) == len(point.ratios) >= 3 and min(point.ms) > 0
@@ -109,10 +98,7 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
     assert json.loads((run_dir / "tradeoff" / "tradeoff.json").read_text())["same"]["reference"] == [
         "renderer.alpha_min=0.01"
     ]
-    for more, text in (
-        (["--knobs", "alpha"], "no such knob"),
-        (["--budget", "x"], "--budget x"),
-    ):
+    for more, text in ((["--knobs", "alpha"], "no such knob"), (["--budget", "x"], "--budget x")):
         assert main(["tradeoff", str(run_dir), *more]) == 2
         assert text in capsys.readouterr().err
 

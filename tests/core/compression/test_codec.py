@@ -40,7 +40,8 @@ def angles(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
 def test_a_model_comes_back_within_its_steps(tmp_path: Path, name: str, level: int) -> None:
     task, model = example(name)
     path = tmp_path / "m.neuprim"
-    checkpoint.save_compressed(path, model, task.name, {"background": [0.5], "note": "naïve"}, LEVELS[level])
+    checkpoint.save_compressed(path, model, task.name, {"background": [0.5], "note": "naïve"}, LEVELS[level], "a: ä\n")
+    assert checkpoint.checkpoint_config(path) == "a: ä\n"
     again, header = checkpoint.load_model_checkpoint(path, task)
     assert header["note"] == "naïve" and header["primitives"] == model.count and header["background"] == [0.5]
     assert type(again.density) is type(model.density) and again.colour.settings() == model.colour.settings()

@@ -73,19 +73,15 @@ TEXTS: Any = Camera(torch.eye(4), "1", 1.0, 0.0, 0.0, N, N)  # type: ignore[arg-
 NUMPY: Any = Camera(np.eye(4), 1.0, 1.0, 0.0, 0.0, N, N)  # type: ignore[arg-type]
 FAULTS: dict[str, Callable[[Any], None]] = {
     f"train view v0: rgb is float32 (8, 9, 3); expected float32 ({N}, {N}, 3)": spoil(rgb=torch.zeros(8, 9, 3)),
-    f"rgb is float32 (3, {N}, {N}); expected": spoil(rgb=lambda x: x.permute(2, 0, 1)),
     f"rgb is uint8 ({N}, {N}, 3); expected float32": spoil(rgb=lambda x: (255 * x).to(torch.uint8)),
-    f"test view v0: rgb is float64 ({N}, {N}, 3); expected": spoil("test", rgb=lambda x: x.double()),
     "rgb is a numpy.ndarray; expected float32": spoil(rgb=lambda x: x.numpy()),
     "rgb is None; expected float32": spoil(rgb=None),
     f"alpha is float32 ({N}, {N}, 1); expected float32 ({N}, {N})": spoil(alpha=lambda x: x[..., None]),
     f"mask is float32 ({N}, {N}); expected bool ({N}, {N})": spoil(mask=torch.ones(N, N)),
-    f"mask is bool (3, {N}); expected bool": spoil(mask=torch.ones(3, N, dtype=torch.bool)),
     "rgb: found 1 values that are NaN or infinite, the first at [3, 4, 1]; expected finite": spoil(rgb=nan),
     "test view v0: alpha: found": spoil("test", alpha=lambda x: x / 0),
     "train view v0: pixels is a str; expected": lambda data: data.train.images.__setitem__(0, "png"),
     "two: background is float32 (1,); expected float32 (3,), one number": member(background=torch.ones(1)),
-    "two: background is a list; expected float32 (3,)": member(background=[1.0, 1.0, 1.0]),
     f"rgb is float32 ({N}, {N}, 3); expected float32 ({N}, {N}, 1)": member(channels=1, background=torch.ones(1)),
     "two: channels is '3'; expected a whole number": member(channels="3"),
     "two: the test split is empty": empty,
@@ -142,10 +138,7 @@ def test_conditions_that_the_task_declares(value: Any, text: str) -> None:
 
 POINTS: dict[str, dict[str, Any]] = {
     "two: starting points: colors is float32 (4, 3); expected float32 (5, 3)": {"colors": torch.zeros(4, 3)},
-    "colors is float32 (5, 1); expected float32 (5, 3)": {"colors": torch.zeros(5, 1)},
     "means is float32 (5, 2); expected float32 (5, 3)": {"means": torch.zeros(5, 2)},
-    "means is int64 (5, 3); expected float32": {"means": torch.zeros(5, 3, dtype=torch.int64)},
-    "means is a numpy.ndarray; expected float32": {"means": np.zeros((5, 3))},
     "means: found 15 values that are NaN or infinite": {"means": torch.full((5, 3), float("nan"))},
     "found 7 points; expected at most 6": {"means": torch.zeros(7, 3)},
     "quats is float32 (5, 3); expected float32 (5, 4)": {"quats": torch.zeros(5, 3)},
@@ -179,7 +172,6 @@ def test_an_orbit_has_every_condition_of_the_training_views() -> None:
 
 SAMPLES: dict[str, dict[str, Any]] = {
     "points is a list; expected float32 (4, 3)": {"points": [[0.0] * 3] * 4},
-    "points is float64 (4, 3); expected float32 (4, 3)": {"points": torch.zeros(4, 3).double()},
     "points is float32 (5, 3); expected float32 (4, 3)": {"points": torch.zeros(5, 3)},
     "sigma is float32 (0,); expected float32 ('M',), M at least 1": {"sigma": torch.zeros(0)},
     "source is float32 (4, 1); expected float32 (4, 3)": {"source": torch.zeros(4, 1)},

@@ -146,7 +146,7 @@ def test_masked_pixels_rule_nothing_out() -> None:
     assert abs(len(hull_surface(views, 32)[0]) - len(full)) < 0.2 * len(full)
 
 
-@pytest.mark.parametrize("count", [1, 300, 40_000])
+@pytest.mark.parametrize("count", [1, 40_000])
 def test_points_are_distinct_as_many_as_asked_and_reproducible(count: int) -> None:
     views = views_around(sphere(0.7), count=12)
     points = initial_points(views, None, count, rng(3))
@@ -235,10 +235,6 @@ def turned(count: int, radius: float, noise: float = 0.0) -> list[Camera]:
     return [upright_camera(radius * f + s, f) for f, s in zip(forward, spots, strict=True)]
 
 
-def array(count: int, step: float) -> list[Camera]:
-    return [upright_camera(step * torch.tensor([i, j, 0.0]), UP.roll(2)) for i in range(count) for j in range(count)]
-
-
 @pytest.mark.parametrize("scale", [1e-4, 1.0, 1e4])
 def test_outward_cameras_begin_on_the_walls(scale: float) -> None:
     views = TakenViews(turned(24, 0.7 * scale), striped_room(3 * scale))
@@ -249,7 +245,7 @@ def test_outward_cameras_begin_on_the_walls(scale: float) -> None:
     assert float(off.median()) < 0.25, "half of the points lie on the walls, up to a quarter of their distance"
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-12, 1e-7, 1e-3])
+@pytest.mark.parametrize("noise", [0.0, 1e-7, 1e-3])
 def test_a_tripod_has_no_unit(noise: float) -> None:
     """Positions that the images do not show count as one place: points begin in any unit, and far beyond the noise."""
     views = TakenViews(turned(24, 0.0, noise), striped_room(3.0))
@@ -272,13 +268,6 @@ def test_cameras_without_a_common_place_ask_for_points() -> None:
     back_to_back = [upright_camera(0.5 * ahead, ahead), upright_camera(-0.5 * ahead, -ahead)]
     with pytest.raises(DataError, match=r"model\.init\.points=FILE\.ply, or with ply_file_path"):
         initial_points(TakenViews(back_to_back, striped_room(3.0)), None, 50, rng())
-
-
-def test_which_axes_meet() -> None:
-    around = [upright_camera(4 * d / d.norm(), -d) for d in torch.randn((12, 3), generator=rng(), dtype=torch.float64)]
-    assert dataset_axes_meet(around)
-    for cameras in (array(4, 0.3), turned(12, 0.7), turned(12, 0.0, 1e-7), around[:1]):
-        assert not dataset_axes_meet(cameras)
 
 
 WALL = 4.0  # behind the origin, as the cameras at y < 0 see it

@@ -14,7 +14,7 @@ MEMORY = 4 << 30  # of the process: what a file may claim
 
 
 def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
-    """``{"frames": [...], ...}``; see :mod:`neuprim.core.cameras.usd`, which reads it."""
+    """``{"frames": [...], ...}``; see :mod:`neuprim.core.cameras.camera_files`, which reads it."""
     from pxr import Tf, Usd, UsdGeom
 
     try:

@@ -142,7 +142,7 @@ class Dataset:
     train: ViewSet
     test: ViewSet
     start: StartingPoints
-    extent: float  # size in scene units (scene_frame.camera_extent), the unit of learning rates and size limits
+    extent: float  # size in scene units (camera_extent), the unit of learning rates and size limits
     background: Tensor  # (C,) colour that evaluation composites over
     channels: int = 3
     color_space: Literal["srgb", "linear"] = "srgb"  # "srgb" as stored in PNG

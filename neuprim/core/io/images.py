@@ -194,11 +194,11 @@ def write_png(path: Path, image: Tensor) -> None:
         picture.save(temporary, format="PNG")
 
 
-def write_webp(path: Path, image: Tensor, quality: int = 90, lossless: bool = False) -> None:
+def write_webp(path: Path, image: Tensor) -> None:
     """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments and errors as in :func:`write_png`; atomic."""
     picture = pillow_image(path, image)
     with checked_atomic_path(path) as temporary:
-        picture.save(temporary, format="WEBP", quality=quality, lossless=lossless)
+        picture.save(temporary, format="WEBP", quality=90)
 
 
 def encode_webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> str:

@@ -9,8 +9,7 @@ import pytest
 import torch
 
 from neuprim.core.cameras import Camera
-from neuprim.core.cameras.camera_files import read_camera_file
-from neuprim.core.cameras.usd import is_usd, read_usd_cameras
+from neuprim.core.cameras.camera_files import is_usd, read_camera_file, read_usd_cameras
 from neuprim.core.errors import DataError
 
 pytest.importorskip("pxr", reason="needs usd-core: pip install 'neuprim[usd]'")
@@ -141,7 +140,7 @@ def test_missing_sizes_endless_ranges_and_files_of_another_kind(tmp_path: Path) 
 
 def test_a_reader_that_never_ends_or_dies(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path, script = usd(tmp_path / "a.usda"), tmp_path / "script.py"
-    monkeypatch.setattr("neuprim.core.cameras.usd._SECONDS", 1.0)
+    monkeypatch.setattr("neuprim.core.cameras.camera_files._USD_SECONDS", 1.0)
     for text, words in (
         ("import time; time.sleep(60)", "not read after 1 s"),
         ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "its reader ended by SIGKILL"),
@@ -149,6 +148,6 @@ def test_a_reader_that_never_ends_or_dies(tmp_path: Path, monkeypatch: pytest.Mo
         ("raise MemoryError", "MemoryError"),
     ):
         script.write_text(text)
-        monkeypatch.setattr("neuprim.core.cameras.usd.usd_stage.__file__", str(script))
+        monkeypatch.setattr("neuprim.core.cameras.camera_files.usd_stage.__file__", str(script))
         with pytest.raises(DataError, match=words):
             read_usd_cameras(path, "", (64, 48))

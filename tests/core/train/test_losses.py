@@ -10,7 +10,6 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.data import View
-from neuprim.core.metrics import ssim
 from neuprim.core.task import Supervision
 from neuprim.core.train.losses import photometric, photometric_reference, scale_anisotropy
 
@@ -49,21 +48,6 @@ def test_fused_equals_kornia(size: tuple[int, int], channels: int, weight: float
     assert fused[2] == pytest.approx(exact[2], abs=1e-6)
     assert (fused[1].double() - exact[1]).abs().max() <= 1e-5 * exact[1].abs().max()
     assert exact[0] > 0.05
-
-
-def test_the_parts_are_what_their_names_say() -> None:
-    rendered, truth = pair(30, 40, 3)
-    value, parts = photometric({"ssim_weight": 0.3})(rendered, truth, FRAME)
-    assert parts["l1"] == pytest.approx((rendered - truth).abs().mean().item(), rel=1e-5)
-    assert parts["ssim"] == pytest.approx(ssim(rendered, truth), abs=1e-5)
-    assert value.item() == pytest.approx(0.7 * parts["l1"] + 0.3 * (1 - parts["ssim"]), abs=1e-6)
-
-
-def test_equal_images_cost_nothing() -> None:
-    _, truth = pair(20, 25, 3)
-    value, grad, _ = value_and_grad(photometric({"ssim_weight": 0.2}), truth, truth)
-    assert abs(value) < 1e-6
-    assert grad.abs().max() < 1e-6
 
 
 def test_flat_images_stay_finite() -> None:

@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import FormError
+from neuprim.core.errors import ConfigError, FormError
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
@@ -342,6 +342,11 @@ def test_due() -> None:
     population.observe(m, stats(torch.ones(COUNT)))
     assert population.intervene(m, 1.0) is None and population.state() == {}
     assert isinstance(make_population(PopulationSettings(strategy="fixed")), FixedPopulation)
+
+
+def test_a_wrong_name_is_told_the_strategies() -> None:
+    with pytest.raises(ConfigError, match=r"train\.population\.strategy='grow': expected fixed, relocate or gradient$"):
+        make_population(PopulationSettings(strategy="grow"))
 
 
 # ---------------------------------------------------------------- fields whose methods return something else

@@ -5,7 +5,7 @@ shared memory, code.
     --check | --from-record]
 
 Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour
-networks of 8 units, those that every frame needs, and those beside frames: of training, of volumes, of lights. No
+networks of 8 units, those that every frame needs, and those beside frames: of training and lights. No
 driver is needed. A stack of a frame's kernel means spilled registers, but for kernels in float64, which keep their
 neurons there; one at K <= 8 exits with status 1. Beside frames it means lists of arguments (Adam) and cosines of large
 angles (grid). "Capped" are kernels that ask for fewer registers than they could use, as more warps hide more.
@@ -39,8 +39,6 @@ from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import KernelForm
 from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import kernels_warp
-from neuprim.core.volumes import density_grid_warp
-from neuprim.tasks.dynamic.volume import raymarch_warp
 
 RECORD = RESULTS / "gpu_kernels.json"
 PAGE = DOCS / "gpu.md"
@@ -74,8 +72,6 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
             ("harmonics", sh_warp._harmonic_kernels(3)),
             ("Adam", kernels_warp.adam_kernels()),
             ("SSIM", kernels_warp.ssim_loss_kernels()),
-            ("grid", (density_grid_warp._density_grid_kernel(),)),
-            ("rays of volumes", (raymarch_warp._march_image_kernel(), raymarch_warp._march_depth_kernel())),
         ):
             for number, kernel in enumerate(made, 1):
                 yield f"{title} {number}" if len(made) > 1 else title, kernel, BLOCK

@@ -30,13 +30,3 @@ def either_way(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     if request.param == "twin":
         monkeypatch.setattr(device, "on_numba", lambda *tensors: False)
     return str(request.param)
-
-
-@pytest.fixture(params=["processor", "card"])
-def either_kernel(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
-    """Once by the processor's kernels, once by those of a card, on Warp's CPU blocks: where both begin and end in the
-    processor's memory."""
-    if request.param == "card":
-        pytest.importorskip("warp", reason="the kernels of a card are written in Warp: pip install 'neuprim[cuda]'")
-        monkeypatch.setattr(device, "has_warp", lambda where: True)
-    return str(request.param)

@@ -12,13 +12,11 @@ from tests import scenes
 COUNT = 30
 
 
-def model(
-    time: str, neurons: int = 4, count: int = COUNT, dtype: torch.dtype = torch.float64, divide_above: float = 0.0
-) -> Primitives:
+def model(time: str, neurons: int = 4, count: int = COUNT, dtype: torch.dtype = torch.float64) -> Primitives:
     """Random primitives whose every time parameter is at work."""
     generator = torch.Generator().manual_seed(7)
     t = scenes.tensors(count, neurons, seed=3, dtype=dtype)
-    density, colour = TimeDensity(neurons, time, divide_above), TimeHarmonics(1)
+    density, colour = TimeDensity(neurons, time), TimeHarmonics(1)
     params = {k: v for k, v in t.items() if k != "colors"}
     for spec in (*density.parameters(), *colour.parameters()):
         if spec.name not in params:

@@ -248,13 +248,6 @@ def check_split_conformance(t: TaskUnderTest) -> None:
         t.require_layout("density.on_split", child, parents)
         t.require_layout("colour.on_split", model.colour.on_split(dict(colours), old, new), colours)
         children.append((child, new))
-    divided = model.density.divide(parents, old)
-    if divided is not None:
-        mask, halves, place = divided
-        fine = mask.dtype == torch.bool and mask.shape == (model.count,)
-        t.require(fine, "density.divide: mask", mask.dtype, "bool (N,)")
-        t.require(place.count == 2 * model.count, "density.divide: geometry", f"{place.count} rows", 2 * model.count)
-        t.require_layout("density.divide", halves, {k: torch.cat([v, v]) for k, v in parents.items()})
     if not model.density.exact_split:
         _require_conforming_masses(t, model, children)
         return

@@ -37,7 +37,6 @@ from neuprim.core.io import images
 from neuprim.core.io.files import atomic_path
 from neuprim.core.model.fields import Conditions
 from neuprim.core.render import render
-from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.export.shared import (
@@ -146,9 +145,9 @@ def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int)
         raise ConfigError(f"grid={count}: {math.prod(shape)} voxels; expected at most {_MOST_VOXELS}")
     matrix = np.diag([step, step, step, 1.0])
     matrix[:3, 3] = low - 3 * step
-    size, settings = (shape[0], shape[1], shape[2]), job.run.settings
-    place, device = (torch.from_numpy(matrix), size), computing_device(settings)
-    return density_grid(job.run.model, conditions, *place, settings.threads, device).numpy(), matrix
+    size = (shape[0], shape[1], shape[2])
+    grid = density_grid(job.run.model, conditions, torch.from_numpy(matrix), size, job.run.settings.threads)
+    return grid.numpy(), matrix
 
 
 def find_export_surface_level(sigma: np.ndarray, step: float) -> float:

@@ -31,7 +31,6 @@ from neuprim.core.extensions import Exporter, ExportJob, ExportReport
 from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, vdb_scale_transform, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.backends import computing_device
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import (
@@ -310,7 +309,6 @@ class _VdbExportSampler(NamedTuple):
     ) -> Iterator[VdbGrid]:
         """Yield sparse grids of blocks of bounded memory, each a multiple of 8 along the first two axes."""
         settings = self.job.run.settings
-        where = computing_device(settings)
         rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
         planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
         for x in range(0, int(size[0]), planes):
@@ -320,7 +318,7 @@ class _VdbExportSampler(NamedTuple):
                 shifted = scene_from_index.copy()
                 shifted[:3, 3] += shifted[:3, :3] @ corner
                 matrix = torch.from_numpy(shifted)
-                sigma = density_grid(self.model, conditions, matrix, shape, settings.threads, where).numpy()
+                sigma = density_grid(self.model, conditions, matrix, shape, settings.threads).numpy()
                 values = sigma * np.float32(self.factor)
                 values[values < self.threshold] = 0.0
                 yield VdbGrid.from_dense(self.name, values, lower=corner.tolist())
@@ -339,9 +337,7 @@ def _measure_vdb_errors(
     settings = job.run.settings
     component = None if source.placement.exact else source.placement.component
     part: dict[str, str] = {} if component is None else {"component": component}
-    found = measure_density_errors(
-        job.run.model, frame.conditions, source, frame.source, settings.threads, computing_device(settings), **part
-    )
+    found = measure_density_errors(job.run.model, frame.conditions, source, frame.source, settings.threads, **part)
     place = source.points(frame.source)
     if found is None or place is None:
         return {}

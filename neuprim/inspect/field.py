@@ -15,7 +15,6 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
-from neuprim.core.compute.device import HOST
 from neuprim.core.conditions import Warn, condition_flag, read_conditions
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.vdb import VdbGrid, write_vdb
@@ -62,7 +61,6 @@ class InspectionFrame:
     truth: Callable[[], np.ndarray] | None = None
     truth_name: str = ""
     numbers: Mapping[str, float] | None = None
-    device: torch.device = HOST
     side: str = "model"
     _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
@@ -96,8 +94,7 @@ class InspectionFrame:
         """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below, or of the truth."""
         if self.side not in self._grids:
             if self.side == "model":
-                place = (self.scene_from_index, self.shape)
-                grid = density_grid(self.model, self.conditions, *place, where=self.device).numpy()
+                grid = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
             elif self.truth is None:
                 raise ConfigError("there is no ground truth to show; give --against")
             else:

@@ -18,7 +18,6 @@ from neuprim.core.io import images
 from neuprim.core.io.files import refuse_existing
 from neuprim.core.io.images import write_animation
 from neuprim.core.model.fields import Conditions
-from neuprim.core.render.backends import computing_device
 from neuprim.core.volumes.density_grid import POINTS_LIMIT, box_lattice, density_grid
 from neuprim.core.volumes.density_truth import DensityTruth, measure_density_errors
 from neuprim.inspect.field import (
@@ -172,7 +171,7 @@ class _RunFrames:
 
     def __init__(self, request: InspectRequest, events: Events) -> None:
         run = open_run(request.run)
-        self.model, self.device, self.world = run.model, computing_device(run.settings), run.world
+        self.model, self.world = run.model, run.world
         self.truth: DensityTruth | None = None
         self.channels = run.channels
         up = request.up or run.scene.get("up")
@@ -212,7 +211,7 @@ class _RunFrames:
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
-        numbers = measure_density_errors(self.model, conditions, self.truth, number, where=self.device)
+        numbers = measure_density_errors(self.model, conditions, self.truth, number)
         words = "nothing to compare with" if numbers is None else "  ".join(f"{k} {v:.4f}" for k, v in numbers.items())
         events(Note(f"{self.truth.frames[number].name}  {describe_inspected_conditions(conditions)}  {words}"))
         return numbers
@@ -222,7 +221,7 @@ class _RunFrames:
         matrix, shape = box_lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
-            grids = [density_grid(self.model, conditions, matrix, shape, where=self.device).numpy()]
+            grids = [density_grid(self.model, conditions, matrix, shape).numpy()]
             if self.truth is not None:
                 grids.append(self.truth.grid(number, matrix, shape).numpy())
             total += grids[-1]
@@ -256,7 +255,6 @@ class _RunFrames:
             truth=None if truth is None else lambda: truth.grid(number, self.matrix, self.shape).numpy(),
             truth_name="" if truth is None else truth.frames[number].name,
             numbers=self.numbers[index],
-            device=self.device,
         )
 
 

@@ -31,7 +31,7 @@ from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import count_unit_numbers, primitives_with_unit
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.backends import best_render_backend_device, computing_device, with_available_render_backend
+from neuprim.core.render.backends import best_render_backend_device, with_available_render_backend
 from neuprim.core.task import SceneContext, TaskSpec
 from neuprim.core.volumes.density_truth import DensityGridSource
 from neuprim.plugins.attribution import attribute_errors
@@ -118,7 +118,7 @@ def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContex
         (:mod:`neuprim.config.stored_run`).
     """
     refuse_untrusted_settings(config)
-    return SceneContext(config.seed, cache_directory() / "scenes", progress, computing_device(config.renderer))
+    return SceneContext(config.seed, cache_directory() / "scenes", progress)
 
 
 def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:

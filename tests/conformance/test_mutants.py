@@ -137,7 +137,6 @@ FoldsAway = variant("FoldsAway", canonicalize=lambda self, params: {**params, "w
 FoldsOn = variant("FoldsOn", canonicalize=lambda self, p: {**p, "b1": p["b1"] + 2 * math.pi / self.omega0})
 Copies = variant("Copies", on_split=lambda self, params, old, new: dict(params))
 Spills = variant("Spills", GaussianDensity, on_split=lambda self, params, old, new: dict(params))
-HalfDivides = variant("HalfDivides", divide=lambda self, p, g: (torch.ones(g.count, dtype=torch.bool), dict(p), g))
 Grey = colours("Grey", lambda rgb, conditions: rgb.mean(-1, keepdim=True))
 FirstThree = colours("FirstThree", lambda rgb, conditions: rgb[:, :3])
 Uphill = colours("Uphill", lambda rgb, conditions: 2 * rgb.detach() - rgb)
@@ -286,7 +285,6 @@ MUTANTS: list[tuple[str, str, TaskSpec]] = [
     ("scaling", "density.scale_density: w2: found changed in place", using(InPlace)),
     ("split", "density.on_split: density of a child inside it, primitive", using(Copies)),
     ("split", "density.on_split: mass of both children of primitive", using(Spills)),
-    ("split", "density.divide: geometry: found 12 rows; expected 24", using(HalfDivides)),
     ("reductions", "found (0, 1); expected whole numbers from 0, the largest first", using(less_of((0, 1)))),
     ("reductions", "found CosineDensity; expected a field that Task", unlisted(less_of((1,), lambda f, p: (f, p)))),
     ("reductions", "reduce('neurons', 1)", using(less_of((1,), lambda f, p: (f, {**p, "b2": p["b2"] * math.nan})))),

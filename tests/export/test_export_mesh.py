@@ -8,11 +8,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import torch
 
-from neuprim.core.compute import device
 from neuprim.core.errors import BackendUnavailable, ConfigError
-from neuprim.export import mesh, shared
+from neuprim.export import shared
 from neuprim.export.mesh import find_export_surface_level
 from neuprim.runs.export import export_run
 from tests.plugins import marked
@@ -112,14 +110,3 @@ def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:
     # the second primitive lives from 0.1 on and grows denser
     assert np.linalg.norm(late.vertices - corner, axis=1).min() < 0.25
     assert late.bounds[1][2] > early.bounds[1][2] + 0.02
-
-
-def test_extinction_is_computed_where_the_run_draws(
-    run_dir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pytest.importorskip("pyvista", exc_type=ImportError)
-    asked: list[torch.device] = []
-    monkeypatch.setattr(device, "has_warp", lambda where: bool(asked.append(where)))
-    monkeypatch.setattr(mesh, "computing_device", lambda settings: torch.device("meta"))
-    export_run(run_dir, "mesh", tmp_path / "m.ply", ["grid=32"])
-    assert set(asked) == {torch.device("meta")}

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.vdb import VdbGrid, read_grid
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import DENSITY_ERRORS
 from neuprim.export import vdb as exporter
 from neuprim.runs.export import export_run
-from neuprim.runs.inspect import InspectRequest, inspect_run
 from neuprim.runs.open import open_run
 from tests.plugins import marked
-from tests.pretend_card import CARD, pretended
 
 
 def centre_of(grid: VdbGrid, near: tuple[float, float, float], radius: float) -> np.ndarray:
@@ -106,28 +102,6 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
         # on the very voxels of the file: missing in it is what is faint, above the source's peak or outside its bounds
         assert report.errors[f"{name}.file_relative_l2"] <= entry["relative_l2"] + 1e-3
         assert report.errors[f"{name}.file_max_error"] <= entry["max_error"] + 1e-3
-
-
-def test_extinction_is_computed_where_the_run_draws(
-    moving: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The model's and the files', exported and looked into; the numbers are the processor's."""
-    own = tmp_path / "run"
-    shutil.copytree(moving, own)
-    config = (own / "config.yaml").read_text()
-    assert "backend: reference" in config
-    (own / "config.yaml").write_text(config.replace("backend: reference", "backend: auto"))
-    export_run(moving, "vdb", tmp_path / "own", ["time=0.5", "grid=24"])
-    asked: list[torch.device] = []
-    with pretended(monkeypatch):
-        monkeypatch.setattr(device, "has_warp", lambda where: bool(asked.append(where)))
-        export_run(own, "vdb", tmp_path / "there", ["time=0.5", "grid=24"])
-        assert len(asked) >= 2 and set(asked) == {CARD}
-        asked.clear()
-        inspect_run(InspectRequest(own, ("volume",), {"time": "0.5"}, 16, against="scene", out=tmp_path / "seen.vdb"))
-        assert len(asked) >= 4 and set(asked) == {CARD}
-    (here,), (there,) = (list((tmp_path / name).iterdir()) for name in ("own", "there"))
-    assert np.array_equal(read_grid(here, "density").to_dense(), read_grid(there, "density").to_dense())
 
 
 def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> None:

@@ -29,11 +29,6 @@ def on_warp(*tensors: Tensor) -> bool:
     return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
-def has_warp(where: torch.device) -> bool:
-    """Whether Warp kernels run on this device."""
-    return where.type == "cuda" and _warp()
-
-
 @functools.cache
 def cuda_unavailable() -> str | None:
     """Return why torch finds no CUDA device; None if it finds one."""

@@ -16,7 +16,6 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.cameras.world import World
 from neuprim.core.compute import device as hardware
-from neuprim.core.compute.device import HOST
 from neuprim.core.errors import ConfigError, warn_once
 from neuprim.core.model.fields import Conditions
 
@@ -292,7 +291,6 @@ class SceneContext:
     seed: int  # for generated scenes
     cache_dir: Path  # for generated data, keyed by everything they depend on
     progress: Callable[[str, float], None] = lambda text, fraction: None  # of long work: text, fraction 0..1
-    device: torch.device = HOST  # where ground truth may be computed; data sets are on the CPU
     world: World | None = None  # of the model that the scene is loaded for again; None lets the scene choose
 
 

@@ -180,24 +180,6 @@ def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) ->
     return dict(found)
 
 
-def check_divided_primitive_rows(
-    found: Any, like: Mapping[str, Tensor], place: Geometry, who: str
-) -> tuple[Tensor, dict[str, Tensor], dict[str, Tensor]]:
-    """Return what ``divide`` returned: a mask of P parents, and 2 P rows like ``like`` and ``place``."""
-    if not isinstance(found, tuple) or len(found) != 3:
-        raise FormError(f"{who} returned type {type(found).__name__}; expected (mask, tensors, Geometry) or None")
-    mask, halves, where = found
-    parents = place.count // 2
-    fits = isinstance(mask, Tensor) and mask.device == place.means.device and mask.dtype == torch.bool
-    if not fits or mask.shape != (parents,):
-        raise FormError(f"{who} returned a mask of {_describe_model_tensor(mask)}; expected torch.bool ({parents},)")
-    if not isinstance(where, Geometry):
-        raise FormError(f"{who} returned a geometry of type {type(where).__name__}; expected Geometry")
-    names = ("means", "log_scales", "quats")
-    rows, stored = ({name: getattr(g, name) for name in names} for g in (where, place))
-    return mask, check_primitive_tensors(halves, like, who), check_primitive_tensors(rows, stored, who)
-
-
 def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
     """Return the error for primitive ``row``, which is not finite or leaves the range of float32."""
     for name, value in tensors.items():

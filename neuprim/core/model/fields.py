@@ -200,18 +200,6 @@ class DensityField(Field):
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
-    def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
-        """Split along a condition instead of in space; None: never.
-
-        Args:
-            params, geometry: of P parents, one row each.
-
-        Returns:
-            (P,) bool of the parents that are better divided this way; tensors and geometry of 2 P rows, first halves
-                first.
-        """
-        return None
-
 
 class ColourField(Field):
     """What colour a primitive sends towards the camera."""

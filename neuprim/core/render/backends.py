@@ -234,15 +234,6 @@ def best_render_backend_device(
     return hardware.HOST
 
 
-def computing_device(settings: RenderSettings) -> torch.device:
-    """Return the device for ground truth and the like: a GPU if the settings allow it and there is one."""
-    kind: str = settings.device
-    if kind == AUTO:
-        kind = hardware.CUDA if settings.backend == AUTO else find_backend(settings.backend).devices[0]
-    missing = kind == hardware.CUDA and gpu_backends_unavailable() is not None
-    return hardware.current_device(hardware.CPU if missing else kind)
-
-
 def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
     """Return the backend that draws this model through this camera (None: any pinhole).
 

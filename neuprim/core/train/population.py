@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
-from neuprim.core.model.checks import check_divided_primitive_rows, check_primitive_tensors, model_method_label
+from neuprim.core.model.checks import check_primitive_tensors, model_method_label
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
@@ -41,10 +41,10 @@ def split_population(
     """Make two children per parent, all first ones then all second ones, each carrying its parent's fields unchanged.
 
     Children sit at +-shift x the longest semi-axis from the parent's centre; that axis shrinks by ``long_factor``,
-    the others by ``other_factor``. Parents that the density divides along a condition (time) stay where they are.
+    the others by ``other_factor``.
 
     Raises:
-        FormError: ``on_split`` or ``divide`` returned something of another shape.
+        FormError: ``on_split`` returned something of another shape.
     """
     rows = torch.cat([parents, parents])
     old = {n: v.detach()[rows].clone() for n, v in model.params.items()}
@@ -63,17 +63,7 @@ def split_population(
     colour = check_primitive_tensors(
         model.colour.on_split(own_colour, before, after), own_colour, model_method_label(model.colour, "on_split")
     )
-    children = {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
-    first = slice(len(parents))
-    divided = model.density.divide({k: v[first] for k, v in own.items()}, before[first])
-    if divided is not None:
-        chosen, halves, place = check_divided_primitive_rows(
-            divided, own, before, model_method_label(model.density, "divide")
-        )
-        chosen = torch.cat([chosen, chosen])
-        for name, value in {**old, **place, **halves}.items():
-            children[name][chosen] = value[chosen]
-    return children
+    return {**old, "means": after.means, "log_scales": after.log_scales, **density, **colour}
 
 
 @dataclass(frozen=True)

@@ -58,18 +58,16 @@ def density_grid(
     scene_from_index: Tensor,
     shape: tuple[int, int, int],
     threads: int = 0,
-    where: torch.device = device.HOST,
 ) -> Tensor:
     """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
-    A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores, or on a
-    GPU; any other density is evaluated in blocks on the CPU. It takes a few MB besides the grid; up to 500 MB of a GPU.
+    A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other
+    density is evaluated in blocks. It takes a few MB besides the grid.
 
     Args:
         conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
         scene_from_index: (4, 4) float64 affine map, invertible.
         threads: 0 for all cores; the result does not depend on it.
-        where: the device that computes, wherever the model is; devices differ by rounding.
 
     Raises:
         ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
@@ -89,14 +87,6 @@ def density_grid(
             _add_to_density_grid(model, conditions, ellipsoids, forward, back, grid)
             return torch.from_numpy(grid)
         neurons = (form.W1.double(), form.b1.double(), form.w2.double(), form.b2.reshape(-1).double())
-        if device.has_warp(where):
-            from neuprim.core.volumes import density_grid_warp
-
-            maps = torch.from_numpy(forward[:3]), torch.from_numpy(back[:3])
-            values = density_grid_warp.fill_density_grid(
-                ellipsoids, neurons, form.omega0, form.edge, *maps, shape, where
-            )
-            return torch.from_numpy(values)
         tensors = [x.detach().numpy() for x in (*ellipsoids, *neurons)]
     arguments = [np.ascontiguousarray(x) for x in (*tensors, forward[:3], back[:3])]
     parallel_for(_fill_density_planes, shape[0], _PLANES_PER_JOB, threads, *arguments, form.omega0, form.edge, grid)

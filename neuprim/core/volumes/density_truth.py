@@ -10,10 +10,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import torch
 from torch import Tensor
 
-from neuprim.core.compute import device
 from neuprim.core.errors import DataError
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
@@ -226,13 +224,11 @@ def measure_density_errors(
     truth: DensityTruth,
     frame: int,
     threads: int = 0,
-    where: torch.device = device.HOST,
     component: str | None = None,
 ) -> dict[str, float] | None:
     """Compare the model under ``conditions`` with a frame of the truth, see :meth:`DensityComparison.errors`.
 
     Args:
-        where: the device that computes the model's extinction.
         component: compare this part of both extinctions.
     """
     place = truth.points(frame)
@@ -242,7 +238,7 @@ def measure_density_errors(
     comparison = DensityComparison()
     for matrix, shape in split_density_grid_planes(*place):
         sigma = truth.grid(frame, matrix, shape, component).numpy()
-        comparison.add_block(sigma, density_grid(model, conditions, matrix, shape, threads, where).numpy())
+        comparison.add_block(sigma, density_grid(model, conditions, matrix, shape, threads).numpy())
     return comparison.errors()
 
 

@@ -32,7 +32,7 @@ _MIN_OPACITY = 1.0 / 255.0  # of a visible primitive
 
 
 def _check_dynamic_model(model: Mapping[str, Any]) -> None:
-    validate_choices(model["density"], "model.density", {"time": str, "divide_above": float, **DENSITY_OPTIONS})
+    validate_choices(model["density"], "model.density", {"time": str, **DENSITY_OPTIONS})
     validate_choices(model["colour"], "model.colour", {"frequencies": tuple(FREQUENCIES), "powers": int, "waves": int})
     try:
         TimeDensity(model["neurons"], **model["density"])

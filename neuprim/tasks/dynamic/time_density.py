@@ -37,7 +37,6 @@ from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_scr
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.train.population import SPLIT_LONG, SPLIT_SHIFT
 from neuprim.tasks.dynamic.time_kernels import apply_time_window, move_means, rows_in_time_window
 
 TIME_PARTS = ("phase", "offset", "window", "motion")
@@ -94,7 +93,6 @@ class TimeDensity(DensityField):
     * ``rate``: bound of U(-rate, rate), from which W_t starts.
 
     Args:
-        divide_above: windows longer than this are halved by population control; 0: none.
         seams: :data:`ChunkOverlaps` of a model joined from chunks; empty for others.
         components: names of the source grids whose share of the extinction each primitive stores.
     """
@@ -105,7 +103,6 @@ class TimeDensity(DensityField):
         self,
         neurons: int = 8,
         time: str = "phase",
-        divide_above: float = 0.0,
         omega0: float = OMEGA0,
         edge: int = 0,
         gain: bool = False,
@@ -115,7 +112,7 @@ class TimeDensity(DensityField):
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
         if not isinstance(time, str) or any(p not in TIME_PARTS for p in parts) or len(set(parts)) != len(parts):
             raise ValueError(f"{time!r}: expected none or some of {', '.join(TIME_PARTS)} joined by +")
-        self.static, self.divide_above = CosineDensity(neurons, omega0, edge, gain), divide_above
+        self.static = CosineDensity(neurons, omega0, edge, gain)
         self.exact_split = self.static.exact_split
         self.time, self.parts = "+".join(p for p in TIME_PARTS if p in parts) or "none", frozenset(parts)
         self.seams = validate_time_chunk_overlaps(seams)
@@ -222,26 +219,6 @@ class TimeDensity(DensityField):
             return self.static.canonicalize(params)
         rates = ("W1", "W_t") if "phase" in self.parts else ("W1",)
         return canonicalize_cosines(params, rates, "b1", "w2", self.static.omega0)
-
-    def divide(self, params: Params, geometry: Geometry) -> tuple[Tensor, dict[str, Tensor], Geometry] | None:
-        """Halve windows longer than ``divide_above``; the halves overlap, as windows fade at their ends.
-
-        Halves lie along time as the children of a split lie along the longest axis of space.
-        """
-        if "window" not in self.parts or self.divide_above <= 0:
-            return None
-        tau = params["log_window"].double().exp()
-        later = torch.cat([-SPLIT_SHIFT * tau, SPLIT_SHIFT * tau]).float()
-        halves = {name: torch.cat([value, value]) for name, value in params.items()}
-        halves["window_center"] = halves["window_center"] + later
-        halves["log_window"] = halves["log_window"] + math.log(SPLIT_LONG)
-        means = torch.cat([geometry.means, geometry.means])
-        if "motion" in self.parts:
-            velocity, acceleration = halves["velocity"], halves["acceleration"]
-            means = means + (velocity + acceleration * later) * later
-            halves["velocity"] = velocity + 2 * acceleration * later
-        rows = Geometry(means, *(torch.cat([x, x]) for x in (geometry.log_scales, geometry.quats)))
-        return tau[:, 0] > self.divide_above, halves, rows
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         return self.static.from_gaussians(alphas)

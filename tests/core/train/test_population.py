@@ -376,37 +376,14 @@ def changed(method: str, **to: Any) -> dict[str, Any]:
     return {method: wrong}
 
 
-def dividing(change: Any) -> dict[str, Any]:
-    def divide(self: CosineDensity, params: Any, geometry: Geometry) -> Any:
-        twice = {k: torch.cat([v, v]) for k, v in params.items()}
-        place = Geometry(*(torch.cat([v, v]) for v in (geometry.means, geometry.log_scales, geometry.quats)))
-        return change(torch.ones(geometry.count, dtype=torch.bool), twice, place)
-
-    return {"divide": divide}
-
-
 @pytest.mark.parametrize(
     ("act", "methods", "message"),
     [
         (splits, changed("on_split", b2=lambda v: v[:, 0]), r"on_split: b2 has shape \(10,\); expected \(10, 1\)"),
         (splits, {"on_split": lambda self, p, old, new: {"W1": p["W1"]}}, r"on_split returned tensors \['W1'\]"),
         (clones, changed("scale_density", w2=lambda v: v.T), r"scale_density: w2 has shape \(4, 20\)"),
-        (
-            splits,
-            dividing(lambda mask, halves, place: (mask[:2], halves, place)),
-            r"divide returned a mask of .*\(2,\)",
-        ),
-        (splits, dividing(lambda mask, halves, place: (mask, halves, place[:5])), r"divide: means has shape \(5, 3\)"),
-        (splits, dividing(lambda mask, halves, place: (mask, halves)), r"divide returned type tuple"),
     ],
 )
 def test_what_a_method_returns_is_checked_by_name(act: Any, methods: dict[str, Any], message: str) -> None:
     with pytest.raises(FormError, match=f"^density field Waves: {message}"):
         act(of_waves(**methods))
-
-
-def test_a_right_division_is_taken() -> None:
-    m = of_waves(**dividing(lambda mask, halves, place: (mask, halves, place)))
-    change = relocate(m, torch.arange(1.0, COUNT + 1), torch.arange(1.0, COUNT + 1))
-    for name, value in change.params.items():
-        assert torch.equal(value, m.params[name].detach()[change.origin]), name

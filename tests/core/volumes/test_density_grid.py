@@ -17,8 +17,6 @@ from neuprim.tasks.static import SphericalHarmonics
 from tests import timed_models
 from tests.cosine_models import model
 
-pytestmark = pytest.mark.usefixtures("either_kernel")
-
 SHAPE = (13, 9, 11)
 
 

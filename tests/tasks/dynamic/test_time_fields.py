@@ -190,27 +190,6 @@ def test_a_split_carries_the_field_at_all_times(time: str) -> None:
         assert torch.allclose(sigma(m, children, rows, x, t), before, rtol=1e-9, atol=1e-9)
 
 
-def test_a_window_divides_into_halves_that_stay_on_its_path() -> None:
-    m = model("window+motion", divide_above=0.3)
-    parents = torch.arange(COUNT)
-    tau = m.params["log_window"].detach().exp()[:, 0]
-    children = split_population(m, parents, 0.5, 0.6, 0.9)
-    long = tau > 0.3
-    assert bool(long.any()) and not bool(long.all())
-    for half, sign in ((0, -0.5), (COUNT, 0.5)):
-        rows = slice(half, half + COUNT)
-        center = m.params["window_center"].detach()[:, 0] + sign * tau
-        assert torch.allclose(children["window_center"][rows][long, 0], center[long], atol=1e-6)
-        assert torch.allclose(children["log_window"][rows][long, 0].exp(), 0.6 * tau[long])
-        assert torch.allclose(children["log_scales"][rows][long], m.params["log_scales"].detach()[long])
-        assert not torch.allclose(children["log_scales"][rows][~long], m.params["log_scales"].detach()[~long])
-        own = {s.name: children[s.name][rows] for s in m.density.parameters()}
-        shape = Geometry(*(children[n][rows] for n in ("means", "log_scales", "quats")))
-        place = m.density.move(own, shape, at(0.6)).means
-        whole = m.density.move({k: v.detach() for k, v in m.of(m.density).items()}, m.geometry, at(0.6)).means
-        assert torch.allclose(place[long], whole[long], atol=1e-6)  # children move as their parent did
-
-
 @pytest.mark.parametrize("time", VARIANTS)
 def test_a_clone_halves_the_density_at_all_times(time: str) -> None:
     m = model(time)

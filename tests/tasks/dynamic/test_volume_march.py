@@ -12,8 +12,6 @@ import torch
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from tests.tasks.dynamic.volumes import box, camera, grey, march_slowly, ragged, sheet
 
-pytestmark = pytest.mark.usefixtures("either_kernel")
-
 
 def along_z(size: int = 9, far: float = 1e4) -> object:
     """A camera so far up that all rays are parallel to z; its image is a little wider than a unit box."""

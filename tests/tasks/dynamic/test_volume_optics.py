@@ -49,7 +49,6 @@ def test_black_body_chromaticity(kelvin: float, x: float, y: float) -> None:
 # ---------------------------------------------------------------- shadows
 
 
-@pytest.mark.usefixtures("either_kernel")
 @pytest.mark.parametrize("seed", range(2))
 def test_transmittance_against_brute_force(seed: int) -> None:
     medium = ragged(seed, (6, 8, 7), 20.0)

@@ -21,7 +21,6 @@ import numpy as np
 import torch
 
 from neuprim.core.cameras import Camera, look_at
-from neuprim.core.compute import device as hardware
 from neuprim.core.data.dataset import DatasetImages
 from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
@@ -54,7 +53,6 @@ class Capture:
         frames: the files, in order.
         cameras: all of them, those held out included; ``samples``: rays per pixel side.
         bounds: (2, 3) box around all matter, scene units.
-        device: what renders. Images of a GPU have their own folder, as their last bits differ.
         ends: frame numbers whose times are 0 and 1; None: the first and the last frame's.
         measured: frame number -> extent of its extinction grid; empty if unknown.
     """
@@ -66,7 +64,6 @@ class Capture:
     samples: int
     normalisation: CaptureNormalisation
     bounds: np.ndarray
-    device: torch.device = hardware.HOST
     ends: tuple[int, int] | None = None
     measured: Mapping[int, GridExtent] = field(default_factory=dict)
 
@@ -95,7 +92,6 @@ class Capture:
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
         optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
         parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation]
-        parts += [self.device.type] * hardware.has_warp(self.device)
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def medium(self, frame: VdbFrame) -> Medium:
@@ -105,7 +101,7 @@ class Capture:
             return Medium.without_voxels()
         optics = replace(self.optics, extinction_grids=(self.reader.extinction,))
         try:
-            return build_medium(grids, optics, self.normalisation.matrix(), self.device)
+            return build_medium(grids, optics, self.normalisation.matrix())
         except DataError as error:
             raise DataError(f"{frame.path}: {error}") from error
 
@@ -161,7 +157,7 @@ class Capture:
         medium = self.medium(frame)
         brightest = 0.0
         for c, camera in enumerate(self.cameras):
-            rgba = render_medium(medium, camera, self.samples, where=self.device)
+            rgba = render_medium(medium, camera, self.samples)
             peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
             if not np.isfinite(peak):
                 raise DataError(

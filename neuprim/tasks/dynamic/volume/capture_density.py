@@ -108,7 +108,7 @@ def compare_capture_extinction(model: Primitives, capture: Capture, times: list[
         entries: list[dict[str, Any]] = []
         for t in sorted({int((i + 0.5) * count / compared) for i in range(compared)}):
             conditions = {"time": torch.tensor(times[t])}
-            errors = measure_density_errors(model, conditions, truth, t, where=capture.device, component=component)
+            errors = measure_density_errors(model, conditions, truth, t, component=component)
             if errors is not None:
                 entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **errors})
         name = component or "sigma"

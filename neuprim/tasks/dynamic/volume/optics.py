@@ -9,10 +9,8 @@ from functools import cache
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-import torch
 from scipy import ndimage
 
-from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, VdbGrid
 from neuprim.core.validation import Accepts, Range, Unbounded, field_types, validate_fields, validate_setting_names
@@ -210,9 +208,7 @@ def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
 _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
 
 
-def build_medium(
-    grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray, where: torch.device = device.HOST
-) -> Medium:
+def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray) -> Medium:
     """Build the medium of one frame on the voxels of its extinction grid.
 
     Other grids are sampled at those voxels' centres, trilinearly unless their transform is the same. If flames absorb,
@@ -221,7 +217,6 @@ def build_medium(
     Args:
         grids: by meaning; those that the optics do not use are ignored.
         scene_from_world: (4, 4) float64.
-        where: device for the light's transmittance.
 
     Raises:
         DataError: none of the extinction grids is there, one has the wrong number of channels, the box is too large, or
@@ -251,7 +246,7 @@ def build_medium(
     arriving: np.ndarray = np.array(optics.ambient, np.float32)
     if optics.light is not None:
         padded = Medium.padded(values, scene_from_index)
-        lit = light_transmittance(padded, optics.light.direction, where)[1:-1, 1:-1, 1:-1]
+        lit = light_transmittance(padded, optics.light.direction)[1:-1, 1:-1, 1:-1]
         irradiance = np.array(optics.light.irradiance, np.float32) / np.float32(4.0 * math.pi)
         arriving = arriving + lit[..., None] * irradiance.astype(np.float32)
     albedo = _scattering_albedo(grids, optics, base.transform, box, scene_from_index)

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -23,7 +23,6 @@ from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute import device
 from neuprim.core.compute.kernels import inline, kernel
 from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import DataError
@@ -57,7 +56,6 @@ class Medium:
     values: np.ndarray
     scene_from_index: np.ndarray
     scattering: np.ndarray | None = None
-    _on_device: dict[torch.device, tuple[Tensor, Tensor]] = field(default_factory=dict, init=False, repr=False)
 
     @staticmethod
     def padded(values: np.ndarray, scene_from_index: np.ndarray, scattering: np.ndarray | None = None) -> Medium:
@@ -82,13 +80,6 @@ class Medium:
         """No voxels, or not enough for a cell between them."""
         return min(self.values.shape[:3]) < 2
 
-    def to_device(self, where: torch.device) -> tuple[Tensor, Tensor]:
-        """``values`` and ``skips`` as tensors on a device; cached for further cameras."""
-        if where not in self._on_device:
-            values, skips = (device.copy_to_device(torch.from_numpy(x), where) for x in (self.values, self.skips))
-            self._on_device[where] = values, skips
-        return self._on_device[where]
-
     @cached_property
     def index_from_scene(self) -> np.ndarray:
         """(4, 4) float64 inverse of ``scene_from_index``."""
@@ -112,36 +103,27 @@ class Medium:
         return np.minimum(ndimage.distance_transform_cdt(~filled, "chessboard"), 255).astype(np.uint8)
 
 
-def render_medium(
-    medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1, where: torch.device = device.HOST
-) -> Tensor:
-    """Render a medium: (H, W, 4) float32 linear premultiplied RGBA without a background, on the CPU.
+def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1) -> Tensor:
+    """Render a medium: (H, W, 4) float32 linear premultiplied RGBA without a background.
 
-    Alpha is exact up to rounding, radiance of fourth order. A ray ends where T < 1e-4. Devices differ by rounding.
+    Alpha is exact up to rounding, radiance of fourth order. A ray ends where T < 1e-4.
 
     Args:
         camera: pinhole, scene units.
         samples: rays per pixel side, on a regular grid.
         subdivisions: sub-intervals per cell; more than 1 only to verify the error.
-        where: the device that computes.
     """
     if medium.empty or medium.skips.min() > 0:
         return torch.zeros(camera.height, camera.width, 4)
     pose = (medium.index_from_scene @ np.linalg.inv(camera.viewmat.detach().double().cpu().numpy()))[:3]
     lens = np.array([camera.fx, camera.fy, camera.cx, camera.cy], np.float64)
-    if device.has_warp(where):
-        from neuprim.tasks.dynamic.volume import raymarch_warp
-
-        place, lenses = (device.copy_to_device(torch.from_numpy(np.ascontiguousarray(x)), where) for x in (pose, lens))
-        size = (camera.width, camera.height)
-        return raymarch_warp.march_images(*medium.to_device(where), place, lenses, size, samples, subdivisions).cpu()
     image = np.zeros((camera.height, camera.width, 4), np.float32)
     rays = (np.ascontiguousarray(pose), lens, camera.width, samples, subdivisions)
     parallel_for(_march_image_rows, camera.height, _ROWS_PER_JOB, 0, medium.values, medium.skips, *rays, image)
     return torch.from_numpy(image)
 
 
-def light_transmittance(medium: Medium, direction: Sequence[float], where: torch.device = device.HOST) -> np.ndarray:
+def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
     """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light, exact up to rounding.
 
     ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction get 1 without a ray.
@@ -151,11 +133,6 @@ def light_transmittance(medium: Medium, direction: Sequence[float], where: torch
         towards = np.array(direction, np.float64)
         way = medium.index_from_scene[:3, :3] @ (towards / float(np.linalg.norm(towards)))
         sigma = np.ascontiguousarray(medium.values[..., 0])
-        if device.has_warp(where):
-            from neuprim.tasks.dynamic.volume import raymarch_warp
-
-            inputs = (device.copy_to_device(torch.from_numpy(x), where) for x in (sigma, medium.skips, way))
-            return np.exp(-raymarch_warp.march_depths(*inputs).cpu().numpy())
         rx, ry, rz = way.tolist()
         parallel_for(_march_depths, len(sigma), _SLICES_PER_JOB, 0, sigma, medium.skips, rx, ry, rz, result)
     return np.exp(-result)

@@ -256,7 +256,7 @@ def _prepare_vdb_scene(
         options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
     )
     views = ([*train, *test], options.samples)
-    capture = Capture(frames, reader, optics, *views, normalisation, bounds, context.device, measured=measured)
+    capture = Capture(frames, reader, optics, *views, normalisation, bounds, measured=measured)
     source: DataSource = "simulated" if options.vdb is None else "real"
     return _PreparedVdbScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 

@@ -34,7 +34,7 @@ from shared.tables import DOCS, RESULTS, Table, between_markers, make_table, rea
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model import sh_warp
-from neuprim.core.render.cuda import backend, binning, colour_net, float64, forward, prepare, prepare_backward
+from neuprim.core.render.cuda import backward, binning, colour_net, float64, forward, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import KernelForm
 from neuprim.core.render.cuda.projection import PER_BLOCK
@@ -63,8 +63,8 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         yield "network units", colour_net._colour_net_kernels(False)[0], PER_BLOCK
         yield "emit", binning._binning_kernels()[0], PER_BLOCK
         yield "list", binning._binning_kernels()[1], BLOCK
-        yield "spans", backend.row_spans, BLOCK
-        yield "sums", backend.sum_pairs, BLOCK
+        yield "spans", binning.row_spans, BLOCK
+        yield "sums", backward.sum_pairs, BLOCK
         yield "float64 pairs", float64.float64_opacity_kernel(False), L.WARP
         return
     if name == BESIDE:
@@ -78,14 +78,14 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         return
     form = FORMS[name]
     yield "forward", forward.forward_kernel(form, True, False), L.PIXELS
-    yield "pixels", backend.pixels_kernel(form, False), L.PIXELS
+    yield "pixels", backward.pixels_kernel(form, False), L.PIXELS
     if form.hidden > 0:
-        yield "network pairs", backend.net_pairs_kernel(form), L.WARP
+        yield "network pairs", colour_net.rasterizer_net_gradient_kernel(form), L.WARP
         return
-    yield "pairs", backend.pairs_kernel(form, False), L.WARP
-    yield "composite by entry", backend.composite_kernel(form, False), BLOCK
-    yield "uncomposite by entry", backend.uncomposite_kernel(form, False), BLOCK
-    yield "float64 pairs, backward", backend.float64_pairs_kernel(form, False), L.WARP
+    yield "pairs", backward.pairs_kernel(form, False), L.WARP
+    yield "composite by entry", forward.composite_kernel(form, False), BLOCK
+    yield "uncomposite by entry", backward.uncomposite_kernel(form, False), BLOCK
+    yield "float64 pairs, backward", float64.float64_pairs_kernel(form, False), L.WARP
 
 
 def measure(archs: list[int], forms: list[str], names: list[str] | None = None) -> Iterator[Row]:

@@ -23,8 +23,7 @@ from neuprim.core.compute import device
 from neuprim.core.render import backends
 from neuprim.core.render.backends import Backend
 from neuprim.core.render.cpu.backend import render as draw_on_processor
-from neuprim.core.render.draw import Draw, draw_on_device
-from neuprim.core.render.output import RenderOutput
+from neuprim.core.render.output import Draw, RenderOutput, draw_on_device
 
 __all__ = ["CARD", "Card", "pretended"]
 

@@ -17,7 +17,7 @@ from neuprim.core.model.fields import CustomColour
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.backends import REFERENCE
 from neuprim.core.render.output import Contributions
-from neuprim.core.render.reference.backend import pixel_ray_directions
+from neuprim.core.render.reference import pixel_ray_directions
 from tests import scenes
 from tests.backends import by
 from tests.numerics.cases import Case

@@ -42,10 +42,8 @@ def by_hand(t: dict[str, Tensor], camera: Camera, s: RenderSettings) -> tuple[Te
         ]
     )
     z = entries(by_centre, camera, s.near)
-    rgb, alpha = (
-        torch.zeros(camera.height, camera.width, 3, dtype=torch.float64),
-        torch.zeros(camera.height, camera.width).double(),
-    )
+    rgb = torch.zeros(camera.height, camera.width, 3, dtype=torch.float64)
+    alpha = torch.zeros(camera.height, camera.width).double()
     for y in range(camera.height):
         for x in range(camera.width):
             T = 1.0
@@ -115,11 +113,9 @@ def test_chords_that_the_near_plane_cuts_keep_the_order_of_centres(backend: str)
     fourth = {
         k: torch.cat([v, v[:1]]) for k, v in t.items()
     }  # a small sphere in front of all their centres, not cut, comes last
-    fourth["means"][3], fourth["log_scales"][3], fourth["colors"][3] = (
-        torch.tensor([0.0, 0.0, -2.5]),
-        math.log(0.2),
-        torch.ones(3),
-    )
+    fourth["means"][3] = torch.tensor([0.0, 0.0, -2.5])
+    fourth["log_scales"][3] = math.log(0.2)
+    fourth["colors"][3] = torch.ones(3)
     fourth["b2"][3] = 50.0
     out = render(fourth, camera, ENTRY, backend).rgb[10, 10]
     alone = render(t, camera, ENTRY, backend)

@@ -12,7 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.reference.backend import pixel_ray_directions, screen_boxes
+from neuprim.core.render.reference import pixel_ray_directions, screen_boxes
 from tests import scenes
 from tests.backends import FAST, by
 

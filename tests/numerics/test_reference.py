@@ -9,15 +9,12 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.pinhole import RayCamera
-from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
-from neuprim.core.render.reference.backend import pixel_ray_directions
+from neuprim.core.render.reference import pixel_ray_directions
 from tests import scenes
 from tests.backends import BACKENDS, by
 from tests.numerics.cases import case
-
-OPAQUE = CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)
 
 
 @pytest.mark.parametrize(
@@ -105,17 +102,6 @@ def test_a_colour_network_is_its_formula(sort: str) -> None:
     a, b = render_lowered(low, rays, near).rgb, render_lowered(low, camera, near).rgb
     # ray cameras order by distance and pinholes by depth, which few pixels tell apart
     assert ((a - b).abs().amax(-1) < 1e-12).double().mean() > (0.98 if sort == "entry" else 0.9)
-
-
-def test_forms_without_a_kernel_go_to_the_reference() -> None:
-    low, net = scenes.lowered(scenes.tensors(3)), scenes.lowered(scenes.tensors(3, hidden=2))
-    assert choose_backend(low, RenderSettings()).name == choose_backend(net, RenderSettings()).name == "cpu"
-    assert choose_backend(replace(low, density=OPAQUE), RenderSettings()).name == "reference"
-    colour = CustomColour(lambda prim, x, d: x, 3)
-    assert choose_backend(replace(low, colour=colour), RenderSettings()).name == "reference"
-    for form, named in ((low, "CustomDensity density"), (net, "CustomDensity density, RayNet colour")):
-        with pytest.raises(BackendUnavailable, match=named):
-            render_lowered(replace(form, density=OPAQUE), scenes.camera(8, 8), RenderSettings(backend="cpu"))
 
 
 def test_silhouettes_of_soft_edges_need_no_floor() -> None:

@@ -51,10 +51,8 @@ def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
     assert (plain.rgb - out.rgb).abs().max() > 0.02, "edges must be smoother than with one ray"
     weight = torch.randn(15, 20, 3, generator=torch.Generator().manual_seed(0))
     error = torch.rand(15, 20, generator=torch.Generator().manual_seed(1))
-    a, b = (
-        out.request_contributions(error),
-        fine.request_contributions(error.repeat_interleave(n, 0).repeat_interleave(n, 1)),
-    )
+    a = out.request_contributions(error)
+    b = fine.request_contributions(error.repeat_interleave(n, 0).repeat_interleave(n, 1))
     (out.rgb * weight).sum().backward()
     (rgb * weight).sum().backward()
     for k in first:
@@ -68,10 +66,8 @@ def test_means_of_a_finer_image(backend: str, sort: str, n: int) -> None:
 def test_only_what_is_watched_is_summed(backend: str) -> None:
     """A tally is zeros until the backward pass; a second one takes the place of the first."""
     out = frame(leaves(), replace(SETTINGS, **by(backend), samples=2))
-    first, second = (
-        out.request_contributions(torch.ones(15, 20)),
-        out.request_contributions(torch.full((15, 20), 0.25, requires_grad=True)),
-    )
+    first = out.request_contributions(torch.ones(15, 20))
+    second = out.request_contributions(torch.full((15, 20), 0.25, requires_grad=True))
     assert second.weight.shape == second.error_weight.shape == (40,) and second.weight.abs().max() == 0
     out.rgb.sum().backward()
     assert first.weight.abs().max() == 0 and second.weight.max() > 1

@@ -18,9 +18,15 @@ from neuprim.core.model.fields import Constant, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
-from neuprim.core.render.draw import draw_on_device, draw_pixel_samples, draw_shaded_view
 from neuprim.core.render.near_plane import resolve_near
-from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
+from neuprim.core.render.output import (
+    Contributions,
+    RenderOutput,
+    RenderStats,
+    draw_on_device,
+    draw_pixel_samples,
+    draw_shaded_view,
+)
 from neuprim.core.settings import RenderSettings
 
 __all__ = [

@@ -19,7 +19,7 @@ from neuprim.core.errors import BackendUnavailable, ConfigError, warn_once
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.forms import Constant, Cosine, RayNet
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
-from neuprim.core.render.draw import Draw
+from neuprim.core.render.output import Draw
 from neuprim.core.settings import RenderSettings
 
 AUTO = "auto"  # takes the first backend of the table that can draw the frame
@@ -42,7 +42,7 @@ class Backend:
     """One way to draw; ``name`` is of the setting ``renderer.backend``."""
 
     name: str
-    load: Callable[[], Draw]  # imports it and returns its :data:`~neuprim.core.render.draw.Draw`
+    load: Callable[[], Draw]  # imports it and returns its :data:`~neuprim.core.render.output.Draw`
     unsupported: Callable[[LoweredPrimitives, AnyCamera | None], str | None] = _no_backend_fault
     """What it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
     "cannot draw"; None if it can."""
@@ -103,9 +103,9 @@ def _cuda_backend_name() -> str:
     return "cuda (no GPU)" if hardware.cuda_unavailable() else f"cuda ({torch.cuda.get_device_name()})"
 
 
-def _backend_loader(folder: str, function: str = "render") -> Callable[[], Any]:
+def _backend_loader(module: str, function: str = "render") -> Callable[[], Any]:
     def load() -> Any:
-        return getattr(importlib.import_module(f"neuprim.core.render.{folder}.backend"), function)
+        return getattr(importlib.import_module(f"neuprim.core.render.{module}"), function)
 
     return load
 
@@ -113,20 +113,20 @@ def _backend_loader(folder: str, function: str = "render") -> Callable[[], Any]:
 TABLE: tuple[Backend, ...] = (
     Backend(
         "cuda",
-        _backend_loader("cuda"),
+        _backend_loader("cuda.backend"),
         unsupported_by_kernels,
         _cuda_backend_name,
         _cuda_backend_missing,
         checks=True,
         devices=(hardware.CUDA, hardware.CPU),
-        slabs=_backend_loader("cuda", "render_slabs"),
+        slabs=_backend_loader("cuda.backend", "render_slabs"),
     ),
     Backend(
         "cpu",
-        _backend_loader("cpu"),
+        _backend_loader("cpu.backend"),
         unsupported_by_kernels,
         checks=True,
-        slabs=_backend_loader("cpu", "render_slabs"),
+        slabs=_backend_loader("cpu.backend", "render_slabs"),
     ),
     Backend(REFERENCE, _backend_loader("reference"), differentiates_intrinsics=True),
 )

@@ -17,7 +17,7 @@ from neuprim.core.errors import ConfigError, FormError
 from neuprim.core.model.fields import Conditions, Constant, LoweredColour
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
-from neuprim.core.render.draw import unproject_rendered_depth
+from neuprim.core.render.output import unproject_rendered_depth
 
 _CLEAR = 2e-4  # a transmittance above has no clamped primitive: one, at alpha_max = 0.9999, would halve it
 _WEAKEN = 1 / 8

@@ -53,11 +53,7 @@ def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> 
 
 
 def density_grid(
-    model: Primitives,
-    conditions: Conditions,
-    scene_from_index: Tensor,
-    shape: tuple[int, int, int],
-    threads: int = 0,
+    model: Primitives, conditions: Conditions, scene_from_index: Tensor, shape: tuple[int, int, int], threads: int = 0
 ) -> Tensor:
     """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 

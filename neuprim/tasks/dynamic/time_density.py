@@ -19,10 +19,13 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import apply_kernel_operation
 from neuprim.core.model.cosine import (
     OMEGA0,
     CosineDensity,
@@ -33,11 +36,12 @@ from neuprim.core.model.cosine import (
     split_cosine,
     split_density_scale,
 )
+from neuprim.core.model.edge import edge_weight
 from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
+from neuprim.core.model.rows import cosine_gain_backward
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.tasks.dynamic.time_kernels import apply_time_window, move_means, rows_in_time_window
 
 TIME_PARTS = ("phase", "offset", "window", "motion")
 """What may vary in time."""
@@ -100,15 +104,9 @@ class TimeDensity(DensityField):
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
 
     def __init__(
-        self,
-        neurons: int = 8,
-        time: str = "phase",
-        omega0: float = OMEGA0,
-        edge: int = 0,
-        gain: bool = False,
-        seams: Sequence[Sequence[float]] = (),
-        components: Sequence[str] = (),
-    ) -> None:
+        self, neurons: int = 8, time: str = "phase", omega0: float = OMEGA0, edge: int = 0, gain: bool = False,
+        seams: Sequence[Sequence[float]] = (), components: Sequence[str] = (),
+    ) -> None:  # fmt: skip
         parts = time.split("+") if isinstance(time, str) and time != "none" else []
         if not isinstance(time, str) or any(p not in TIME_PARTS for p in parts) or len(set(parts)) != len(parts):
             raise ValueError(f"{time!r}: expected none or some of {', '.join(TIME_PARTS)} joined by +")
@@ -139,9 +137,8 @@ class TimeDensity(DensityField):
         if "phase" in self.parts:
             specs.append(ParameterSpec("W_t", (K,), 3e-3, lambda c: c.uniform(K, bound=c.number("rate", 0.1))))
         if "offset" in self.parts:
-            specs += [
-                ParameterSpec(name, (OFFSET_TERMS,), 3e-3, _zero_time_parameters(OFFSET_TERMS)) for name in _OFFSETS
-            ]
+            zero = _zero_time_parameters(OFFSET_TERMS)
+            specs += [ParameterSpec(name, (OFFSET_TERMS,), 3e-3, zero) for name in _OFFSETS]
         if "window" in self.parts:
             specs.append(ParameterSpec("window_center", (1,), 3e-3, _initial_time_window_center))
             specs.append(ParameterSpec("log_window", (1,), 1e-2, _initial_log_time_window))
@@ -177,9 +174,8 @@ class TimeDensity(DensityField):
         if "motion" not in self.parts:
             return geometry
         center = params["window_center"] if "window" in self.parts else torch.full_like(geometry.means[:, :1], 0.5)
-        means = move_means(
-            geometry.means, params["velocity"], params["acceleration"], center, get_frame_time(conditions)
-        )
+        motion = (params["velocity"], params["acceleration"], center)
+        means = move_means(geometry.means, *motion, get_frame_time(conditions))
         return Geometry(means, geometry.log_scales, geometry.quats)
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> Cosine:
@@ -301,13 +297,11 @@ def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float
     cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of e^(i xi a). A window leaves its mean
     factor, a motion its mean position. The dropped part's own tensors are still in the result.
     """
-    changes = {
-        "phase": _mean_phase_over_time,
-        "offset": _mean_offset_over_time,
-        "window": _mean_time_window,
-        "motion": _mean_motion_over_time,
-    }
-    return {**params, **changes[part](params, geometry, omega0)}
+    if part == "phase":
+        return {**params, **_mean_phase_over_time(params, omega0)}
+    if part == "offset":
+        return {**params, **_mean_offset_over_time(params)}
+    return {**params, **(_mean_time_window if part == "window" else _mean_motion_over_time)(params, geometry)}
 
 
 def _sequence_mean_times(like: Tensor) -> Tensor:
@@ -334,7 +328,7 @@ def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
     return list(zip(times, weights, strict=True))
 
 
-def _mean_phase_over_time(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+def _mean_phase_over_time(params: Params, omega0: float) -> dict[str, Tensor]:
     advance = omega0 * params["W_t"].double()
     real, imaginary = torch.zeros_like(advance), torch.zeros_like(advance)
     for xi, weight in _time_weights(params):
@@ -345,7 +339,7 @@ def _mean_phase_over_time(params: Params, geometry: Geometry, omega0: float) -> 
     return {"b1": b1.to(params["b1"]), "w2": w2.to(params["w2"])}
 
 
-def _mean_offset_over_time(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+def _mean_offset_over_time(params: Params) -> dict[str, Tensor]:
     cosines, sines = params["offset_cos"].double(), params["offset_sin"].double()
     order = math.pi * torch.arange(1, cosines.shape[1] + 1, dtype=torch.float64, device=cosines.device)
     b2 = params["b2"].double()
@@ -354,24 +348,103 @@ def _mean_offset_over_time(params: Params, geometry: Geometry, omega0: float) ->
     return {"b2": b2.to(params["b2"])}
 
 
-def _mean_time_window(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
+def _mean_time_window(params: Params, geometry: Geometry) -> dict[str, Tensor]:
     mean = torch.stack([_time_window_factor(params, xi) for xi in _sequence_mean_times(params["b1"])]).mean(0)
     names = [name for name in ("w2", "b2", *_OFFSETS) if name in params]
     faded = {name: (params[name].double() * mean).to(params[name]) for name in names}
     if "velocity" not in params:
         return faded
     later = _MIDDLE - params["window_center"].double()
-    velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
-    means = geometry.means.double() + (velocity + acceleration * later) * later
-    moved = (velocity + 2 * acceleration * later).to(params["velocity"])
+    means = geometry.means.double() + (params["velocity"].double() + params["acceleration"].double() * later) * later
+    moved = (params["velocity"].double() + 2 * params["acceleration"].double() * later).to(params["velocity"])
     return {**faded, "means": means.to(geometry.means), "velocity": moved}
 
 
-def _mean_motion_over_time(params: Params, geometry: Geometry, omega0: float) -> dict[str, Tensor]:
-    velocity, acceleration = params["velocity"].double(), params["acceleration"].double()
+def _mean_motion_over_time(params: Params, geometry: Geometry) -> dict[str, Tensor]:
     center = params["window_center"].double() if "window_center" in params else _MIDDLE
     means = geometry.means.double()
     for xi, weight in _time_weights(params):
         later = xi - center
-        means = means + weight * (velocity + acceleration * later) * later
+        means = means + weight * (params["velocity"].double() + params["acceleration"].double() * later) * later
     return {"means": means.to(geometry.means)}
+
+
+WINDOW_EDGE = 2  # exponent of the window in time
+
+
+def rows_in_time_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
+    """Ascending int64 rows of (N, 1) tensors with abs(xi - center) < exp(log_window), in float64; no gradient."""
+    tau = log_window.detach()[:, 0].double().exp()
+    return ((xi - center.detach()[:, 0].double()).abs() < tau).nonzero()[:, 0]
+
+
+class _TimeWindow(torch.autograd.Function):
+    @staticmethod
+    def forward(
+        ctx: Any, w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor
+    ) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        tau = log_window.exp()
+        u = (xi.to(b2) - center) / tau
+        weight = edge_weight(u.square(), WINDOW_EDGE)
+        ctx.save_for_backward(w2, b2, tau, u, weight)
+        return w2 * weight, b2 * weight
+
+    @staticmethod
+    def backward(ctx: Any, p_w2: Tensor, p_b2: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        w2, b2, tau, u, weight = ctx.saved_tensors
+        g_w2, g_b2, pulled = (torch.empty(x.shape, dtype=x.dtype) for x in (w2, b2, weight))
+        given = (x.detach().contiguous().numpy() for x in (w2, b2, weight, p_w2, p_b2))
+        cosine_gain_backward(*given, g_w2.numpy(), g_b2.numpy(), pulled.numpy())
+        g_u = pulled.mul_(edge_weight(u.square(), WINDOW_EDGE - 1)).mul_(u).mul_(-2.0 * WINDOW_EDGE)
+        return g_w2, g_b2, -g_u / tau, -g_u * u, None
+
+
+def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
+    """(w2, b2) (N, K) and (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
+
+    ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
+    """
+    if not device.on_numba(w2, b2, center, log_window):
+        weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
+        return w2 * weight, b2 * weight
+    result: tuple[Tensor, Tensor] = apply_kernel_operation(_TimeWindow, w2, b2, center, log_window, xi)
+    return result
+
+
+@exact_kernel
+def _move_in_time_backward(velocity, acceleration, since, pulled, g_velocity, g_acceleration, g_center):  # type: ignore[no-untyped-def]
+    for n in range(since.shape[0]):
+        total = 0.0
+        for j in range(3):
+            g_velocity[n, j] = pulled[n, j] * since[n, 0]
+            g_acceleration[n, j] = g_velocity[n, j] * since[n, 0]
+            total += np.float64(pulled[n, j]) * (velocity[n, j] + 2.0 * acceleration[n, j] * since[n, 0])
+        g_center[n, 0] = -total
+
+
+class _MoveInTime(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:  # type: ignore[override]
+        since = xi.to(velocity) - center
+        ctx.save_for_backward(velocity, acceleration, since)
+        return means + (velocity + acceleration * since) * since
+
+    @staticmethod
+    def backward(ctx: Any, pulled: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        velocity, acceleration, since = ctx.saved_tensors
+        made = [torch.empty(x.shape, dtype=x.dtype) for x in (velocity, acceleration, since)]
+        given = (x.detach().contiguous().numpy() for x in (velocity, acceleration, since, pulled))
+        _move_in_time_backward(*given, *(x.numpy() for x in made))
+        return pulled, *made, None
+
+
+def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
+    """(N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
+
+    ``center`` is (N, 1); all are of one dtype. No gradient for the time ``xi`` ().
+    """
+    if not device.on_numba(means, velocity, acceleration, center):
+        since = xi.to(velocity.dtype) - center
+        return means + (velocity + acceleration * since) * since
+    moved: Tensor = apply_kernel_operation(_MoveInTime, means, velocity, acceleration, center, xi)
+    return moved

@@ -15,7 +15,7 @@ from neuprim.core.model.geometry import Geometry, quaternion_to_matrix
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.reference.backend import pixel_ray_directions
+from neuprim.core.render.reference import pixel_ray_directions
 from neuprim.core.train.population import split_population
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes

@@ -21,8 +21,8 @@ from neuprim.core.model.fields import Constant, CustomDensity
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderOutput, RenderSettings, backends, render_lowered
 from neuprim.core.render.backends import Backend, choose_backend
-from neuprim.core.render.draw import Draw
-from neuprim.core.render.reference.backend import render as reference
+from neuprim.core.render.output import Draw
+from neuprim.core.render.reference import render as reference
 from tests import scenes
 from tests.core import tiny
 from tests.short_runs import words

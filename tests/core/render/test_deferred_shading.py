@@ -10,7 +10,7 @@ import torch
 from neuprim.core.cameras.pinhole import RayCamera
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.core.render.draw import unproject_rendered_depth
+from neuprim.core.render.output import unproject_rendered_depth
 from tests import scenes
 from tests.backends import BACKENDS, by
 

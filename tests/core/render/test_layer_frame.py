@@ -8,12 +8,13 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Constant, DensityField
 from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.layer_frame import LayerFrame
+from neuprim.core.render.layer_frame import COMMON, LayerFrame, LayerSpec, select_layers
 from neuprim.tasks.static import SphericalHarmonics
 from tests import scenes
 from tests.chords import chords
@@ -79,3 +80,28 @@ def test_other_colours_depth_and_alpha() -> None:
     depth = torch.where(alpha > 0, (found.weight * found.middle).sum(0) / alpha.clamp_min(1e-30), 0.0)
     clear = alpha > 1e-3  # a mean over next to nothing has no digits
     assert off(torch.where(clear, one.drawn.depth, 0.0), torch.where(clear, depth, 0.0)) < 1e-4
+
+
+HEAT = LayerSpec("heat", "temperature, kelvin", lambda frame: None, ("K",))
+GLOW = LayerSpec("glow", "light of the glow", lambda frame: None)
+USUAL = ["beauty", "alpha", "depth", "density"]
+
+
+def names(text: str | None, several: bool = False) -> list[str]:
+    return [spec.name for spec in select_layers(text, (HEAT, GLOW), several)]
+
+
+def test_all_without_a_word_and_in_one_order_with() -> None:
+    assert [spec.name for spec in COMMON] == USUAL
+    assert names(None) == [*USUAL, "heat", "glow"] and names(None, several=True) == [*USUAL, "glow"]
+    assert names("glow, depth ,beauty") == ["beauty", "depth", "glow"]
+    assert names("beauty,lights", several=True) == ["beauty"], "lights are drawn beside the others"
+
+
+@pytest.mark.parametrize(
+    ("text", "several"),
+    [("depht", False), ("lights", False), ("heat", True), ("", False), (",", False), ("beauty depth", False)],
+)
+def test_other_names_are_refused_with_those_that_there_are(text: str, several: bool) -> None:
+    with pytest.raises(ConfigError, match=r"--layers .*; expected some of beauty, alpha, depth, density, .*glow"):
+        select_layers(text, (HEAT, GLOW), several)

@@ -16,7 +16,7 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.volumes.density_grid import density_at
 from neuprim.core.volumes.points import find_point_pairs, volume_values_at
 from neuprim.core.volumes.points_cpu import sort_points_into_cells
-from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import SphericalHarmonics
 from tests.cosine_models import model as cosine_model
@@ -227,9 +227,7 @@ def test_what_is_not_finite_is_named(name: str, value: float, message: str) -> N
         volume_values_at(model, {}, cloud())
 
 
-def test_colour_is_left_out_where_it_is_not_requested_or_depends_on_direction(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_colour_is_left_out_where_it_is_not_requested_or_depends_on_direction(monkeypatch: pytest.MonkeyPatch) -> None:
     model, x = static(2, 1), cloud()
     sigma, source = volume_values_at(model, {}, x, colour=False)[:2]
     monkeypatch.setattr(SphericalHarmonics, "harmonics", lambda self, params, conditions: None)

@@ -186,11 +186,9 @@ def mp_integral(
             return [M(float(x)) for x in tensor.detach().double().flatten()]
 
         view = [numbers(r) for r in camera.viewmat[:3]]
-        mean, s, q = (
-            numbers(t["means"][row]),
-            [mpmath.exp(x) for x in numbers(t["log_scales"][row])],
-            numbers(t["quats"][row]),
-        )
+        mean = numbers(t["means"][row])
+        s = [mpmath.exp(x) for x in numbers(t["log_scales"][row])]
+        q = numbers(t["quats"][row])
         m = max(s)
         local = _rotation(q)
         e = [(M(px) + M(0.5) - M(camera.cx)) / M(camera.fx), (M(py) + M(0.5) - M(camera.cy)) / M(camera.fy), M(1)]

@@ -54,14 +54,6 @@ def test_shares_add_up_to_one_at_every_time_and_at_most_two_count() -> None:
         assert float(own.sum()) == pytest.approx(1.0, abs=1e-15) and int((own > 0).sum()) <= 2
 
 
-def test_a_chunk_is_all_or_nothing_at_the_frames_beside_a_seam() -> None:
-    for (begin, end), chunk in zip(SEAMS, range(2), strict=True):
-        for time, expected in ((begin, chunk), (end, chunk + 1)):
-            weights = time_chunk_weights(CHUNKS, SEAMS, torch.tensor(time))[:, 0].tolist()
-            assert weights == [float(c == expected) for c in range(3)]
-    assert time_chunk_weights(CHUNKS, SEAMS, torch.tensor(0.3125))[:, 0].tolist() == [0.5, 0.5, 0.0]
-
-
 @pytest.mark.parametrize(
     "wrong", [[(0.5, 0.5)], [(0.5, 0.4)], [(0.1, 0.3), (0.2, 0.4)], [(0.1,)], [("a", 0.2)], [(0.1, float("nan"))], 3]
 )

@@ -19,8 +19,7 @@ from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import RelocatePopulation, split_population
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.tasks.dynamic import TASK, invisible_fraction_over_time
-from neuprim.tasks.dynamic.time_colour import TimeHarmonics
+from neuprim.tasks.dynamic import TASK, TimeHarmonics, invisible_fraction_over_time
 from neuprim.tasks.dynamic.time_density import TIME_PARTS, TimeDensity
 from tests import scenes
 from tests.backends import BACKENDS, by
@@ -145,14 +144,6 @@ def test_gradients_of_time_parameters_are_the_derivatives(time: str) -> None:
         return m.density.density(own, m.geometry, torch.arange(4), m.params["means"].detach() + 0.02, at(0.5))
 
     assert torch.autograd.gradcheck(field, [m.params[n] for n in names])
-
-
-def test_motion_is_a_parabola_about_the_middle_of_life() -> None:
-    m = model("window+motion")
-    own = m.of(m.density)
-    since = 0.75 - own["window_center"]
-    moved = m.density.move(own, m.geometry, at(0.75)).means
-    assert torch.allclose(moved, m.params["means"] + own["velocity"] * since + own["acceleration"] * since**2)
 
 
 # ---------------------------------------------------------------- colour

@@ -10,8 +10,7 @@ from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext
-from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.tasks.dynamic.time_kernels import apply_time_window, move_means, rows_in_time_window
+from neuprim.tasks.dynamic.time_density import TimeDensity, apply_time_window, move_means, rows_in_time_window
 
 pytestmark = pytest.mark.usefixtures("either_way")
 
@@ -106,18 +105,6 @@ def test_rows_in_their_windows(dtype: torch.dtype) -> None:
             assert rows.dtype == torch.int64 and rows.tolist() == wanted
     assert rows_in_time_window(center[:2], log_window[:2], torch.tensor(0.25)).tolist() == [1]
     assert rows_in_time_window(center[:0], log_window[:0], torch.tensor(0.25)).tolist() == []
-
-
-def test_without_a_gradient_the_same_numbers() -> None:
-    xi = torch.tensor(0.37, dtype=torch.float64)
-    for operation, widths in ((apply_time_window, (2, 1, 1, 1)), (move_means, (3, 3, 3, 1))):
-        plain = draw(4, torch.float32, *widths)
-        asked = operation(*[x.clone().requires_grad_() for x in plain], xi)  # type: ignore[operator]
-        with torch.no_grad():
-            silent = operation(*[x.clone().requires_grad_() for x in plain], xi)  # type: ignore[operator]
-        for found in (silent, operation(*plain, xi)):  # type: ignore[operator]
-            for a, b in zip(found, asked, strict=True):
-                assert torch.equal(a, b) and not a.requires_grad and b.requires_grad
 
 
 @pytest.mark.parametrize("parts", ["window", "motion", "window+motion", "phase+offset+window+motion"])

@@ -15,7 +15,6 @@ from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import list_vdb_files, read_grid, vdb_scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_capture_cameras
 from neuprim.tasks.dynamic.volume.optics import (
-    EMBERGEN_FIRE,
     OPTICS_PRESETS,
     Axis,
     Light,
@@ -26,7 +25,6 @@ from neuprim.tasks.dynamic.volume.optics import (
 )
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
-from tests.core.io.vdb.vdb_bytes import real_folder
 from tests.tasks.dynamic.volumes import grid_of, march_slowly, ragged, rotation
 
 SAME = np.eye(4)
@@ -182,23 +180,6 @@ def test_extinction_is_per_scene_unit() -> None:
 
 
 # ---------------------------------------------------------------- a real fire
-
-
-def test_a_real_fire_converges() -> None:
-    fire = list_vdb_files(real_folder("embergen_fire_a"))
-    position = [f.number for f in fire.frames].index(40)
-    grids = {n: read_grid(fire.frames[position].path, n) for n in ("temperature", "flames")}
-    boxes = [g.world_bounds() for g in grids.values() if g is not None]
-    norm = CaptureNormalisation.from_bounds(
-        np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)])
-    )  # type: ignore[index]
-    medium = build_medium({n: g for n, g in grids.items() if g is not None}, EMBERGEN_FIRE, norm.matrix())
-    view = hemisphere_capture_cameras(96)[1][0]
-    images = [render_medium(medium, view, subdivisions=n) for n in (1, 2, 4)]
-    peak = images[-1][..., :3].max()
-    assert (images[0] - images[1]).abs().max() < 5e-4 * peak and (images[1] - images[2]).abs().max() < 2e-4 * peak
-    lit = images[0][images[0][..., 3] > 0.5]
-    assert len(lit) > 500 and (lit[:, 0] >= lit[:, 2] - 1e-6).all() and 0.2 < peak < 2.1
 
 
 @pytest.mark.parametrize("up", ["y", "z"])

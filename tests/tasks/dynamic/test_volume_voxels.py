@@ -110,14 +110,6 @@ def test_a_chunk_of_a_sequence_and_frames_left_out(files: Path, tmp_path: Path) 
     assert set(every_other) == {"frame_0001", "frame_0003", "frame_0005"}
 
 
-def test_the_generator_alone_decides(files: Path, tmp_path: Path) -> None:
-    points = supervision(files, tmp_path)
-    generators = [torch.Generator().manual_seed(1) for _ in range(2)]
-    made = [[points.draw(50, g) for _ in range(6)] for g in generators]
-    for a, b in zip(*made, strict=True):
-        assert a.name == b.name and torch.equal(a.points, b.points) and torch.equal(a.sigma, b.sigma)
-
-
 def test_voxels_are_read_once_kept_beside_the_images_and_bounded(
     files: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -10,8 +10,8 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.fields import RayNet
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.draw import unproject_rendered_depth
 from neuprim.core.render.layer_frame import LayerFrame
+from neuprim.core.render.output import unproject_rendered_depth
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.relight.visibility import _visibility_kernel, light_visibility, sample_visibility

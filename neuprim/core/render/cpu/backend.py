@@ -18,7 +18,7 @@ from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.backward import ImageGradient, backward_tiles, sum_tile_pair_gradients
-from neuprim.core.render.cpu.binning import TileLists, bin_primitives
+from neuprim.core.render.cpu.chord import EDGE_TYPES
 from neuprim.core.render.cpu.colour_net import ColourNet, colour_net_backward, prepare_rasterizer_colour_net
 from neuprim.core.render.cpu.entry import backward_tiles_by_entry, composite_tiles_by_entry
 from neuprim.core.render.cpu.forward import SavedForBackward, TileImage, composite_tiles
@@ -30,8 +30,7 @@ from neuprim.core.render.cpu.prepare import (
     prepare_primitives,
     prepare_wide,
 )
-from neuprim.core.render.cpu.tiles import FrameArrays
-from neuprim.core.render.cpu.trigonometry import EDGE_TYPES
+from neuprim.core.render.cpu.tiles import FrameArrays, TileLists, bin_primitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.rasterize import (
     NET,
@@ -105,10 +104,8 @@ def _prepare_frame(
     parameters = PrimitiveArrays(*(arrays[name] for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
     projected = Projected.allocate(count, K)
-    view, least = (
-        _rasterizer_view(camera, viewmat, settings.near_plane, request.turns),
-        P.min_visible_depth(settings.alpha_min),
-    )
+    view = _rasterizer_view(camera, viewmat, settings.near_plane, request.turns)
+    least = P.min_visible_depth(settings.alpha_min)
     parallel_for(
         prepare_primitives, count, _PRIMITIVES_PER_CHUNK, threads, parameters, view, request.edge, least, projected
     )
@@ -257,7 +254,7 @@ def _float32_render_image(tensor: Tensor) -> Array:
 def render(
     lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw a frame; see :data:`neuprim.core.render.draw.Draw`."""
+    """Draw a frame; see :data:`neuprim.core.render.output.Draw`."""
     return rasterize(_Rasterize, "cpu", lowered, camera, background, settings)
 
 

@@ -22,6 +22,7 @@ from neuprim.core.compute.kernels import (
 )
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.chord import one_minus_exp
 from neuprim.core.render.cpu.colour_net import ray_colour_gradient, ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.gradients import (
@@ -40,7 +41,6 @@ from neuprim.core.render.cpu.tiles import (
     prefetch_pair,
     row_spans,
 )
-from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first

@@ -16,8 +16,8 @@ from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.chord import TAU, cos_turns, sinc_turns
 from neuprim.core.render.cpu.float64 import chord_phase_float64
-from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns
 
 f = np.float32
 _TURNS = 1.0 / (2.0 * np.pi)

@@ -17,7 +17,7 @@ import numpy as np
 from neuprim.core.compute.kernels import compile_dispatch_by_length, inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, dsinc_turns, sinc_turns
+from neuprim.core.render.cpu.chord import TAU, cos_turns, dsinc_turns, sinc_turns
 
 f = np.float32
 _PI2 = 2.0 * np.pi

@@ -14,6 +14,7 @@ import numpy as np
 from neuprim.core.compute.kernels import borrow_array, borrow_arrays, inline, kernel, release_array
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.chord import one_minus_exp
 from neuprim.core.render.cpu.colour_net import ray_colours
 from neuprim.core.render.cpu.float64 import FLOAT64_SCRATCH
 from neuprim.core.render.cpu.tiles import (
@@ -25,7 +26,6 @@ from neuprim.core.render.cpu.tiles import (
     prefetch_pair,
     row_spans,
 )
-from neuprim.core.render.cpu.trigonometry import one_minus_exp
 
 f = np.float32
 index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
@@ -201,7 +201,7 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
         colors: (N, C) colours, or the bases of the networks' colours.
         net: :class:`~neuprim.core.render.cpu.colour_net.ColourNet`; None leaves no trace in the compiled kernel.
-        edge: one of :data:`~neuprim.core.render.cpu.trigonometry.EDGE_TYPES`.
+        edge: one of :data:`~neuprim.core.render.cpu.chord.EDGE_TYPES`.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     live, first_lane = borrow_array(live), borrow_array(first_lane)
@@ -218,11 +218,9 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
         scratch = L.BACKWARD_SCRATCH + 2 * C * L.LANES
         waves = aligned_tile_zeros(net.hidden * L.NET_SCRATCH).reshape((net.hidden, L.NET_SCRATCH))
     lanes, wide_lanes = aligned_tile_zeros(scratch + 1024), np.zeros(FLOAT64_SCRATCH, np.float64)
-    pixels, weights, lives = (
-        aligned_tile_zeros((4 + C) * P.PIXELS + 2 * P.TILE),
-        aligned_tile_zeros(P.TILE),
-        aligned_tile_zeros(P.TILE),
-    )
+    pixels = aligned_tile_zeros((4 + C) * P.PIXELS + 2 * P.TILE)
+    weights = aligned_tile_zeros(P.TILE)
+    lives = aligned_tile_zeros(P.TILE)
     ends, begins = np.zeros(2 * P.TILE, np.int32), np.zeros(P.TILE, np.int32)
     S, D, state, w = borrow_array(lanes), borrow_array(wide_lanes), borrow_array(pixels), borrow_array(weights)
     bounds, offset, rows_live = borrow_array(ends), borrow_array(begins), borrow_array(lives)

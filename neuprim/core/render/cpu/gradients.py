@@ -12,18 +12,23 @@ from neuprim.core.compute.kernels import inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import (
+    TAU,
     add_ray_gradient,
     chord_backward,
     chord_edge_fade,
+    cos_turns,
     half_chord_slope,
     intersect_chord,
     load_ray,
+    sinc_turns,
+    slopes_fast,
+    slopes_medium,
+    slopes_slow,
     store_ray_gradient,
     zero_ray_sums,
 )
 from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.tiles import lane_chords
-from neuprim.core.render.cpu.trigonometry import TAU, cos_turns, sinc_turns, slopes_fast, slopes_medium, slopes_slow
 
 f = np.float32
 AT_ONCE = 2  # neurons, at most, whose sums stay in registers beside those of the chord
@@ -142,11 +147,9 @@ def _gradients_of_two_neurons(products):  # type: ignore[no-untyped-def]
     return gradients
 
 
-_with_two_slow, _with_two_medium, _with_two_fast = (
-    _gradients_of_two_neurons(_slow),
-    _gradients_of_two_neurons(_medium),
-    _gradients_of_two_neurons(_fast),
-)
+_with_two_slow = _gradients_of_two_neurons(_slow)
+_with_two_medium = _gradients_of_two_neurons(_medium)
+_with_two_fast = _gradients_of_two_neurons(_fast)
 
 
 @inline
@@ -231,11 +234,9 @@ def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
     return add
 
 
-_two_slow, _two_medium, _two_fast = (
-    _two_neuron_lane_gradients(_slow),
-    _two_neuron_lane_gradients(_medium),
-    _two_neuron_lane_gradients(_fast),
-)
+_two_slow = _two_neuron_lane_gradients(_slow)
+_two_medium = _two_neuron_lane_gradients(_medium)
+_two_fast = _two_neuron_lane_gradients(_fast)
 _two_float64 = _two_neuron_lane_gradients(None)
 
 

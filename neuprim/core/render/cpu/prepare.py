@@ -332,18 +332,12 @@ def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type
             _cross_product(ey, e0, tmp)
             for j in range(3):
                 kb[j] += tc * tmp[j]
-            q0, q1 = (
-                square * _dot_product(e0, e0) - _dot_product(k0, k0),
-                square * _dot_product(e0, ex) - _dot_product(k0, ka),
-            )
-            q2, q3 = (
-                square * _dot_product(e0, ey) - _dot_product(k0, kb),
-                square * _dot_product(ex, ex) - _dot_product(ka, ka),
-            )
-            q4, q5 = (
-                square * _dot_product(ex, ey) - _dot_product(ka, kb),
-                square * _dot_product(ey, ey) - _dot_product(kb, kb),
-            )
+            q0 = square * _dot_product(e0, e0) - _dot_product(k0, k0)
+            q1 = square * _dot_product(e0, ex) - _dot_product(k0, ka)
+            q2 = square * _dot_product(e0, ey) - _dot_product(k0, kb)
+            q3 = square * _dot_product(ex, ex) - _dot_product(ka, ka)
+            q4 = square * _dot_product(ex, ey) - _dot_product(ka, kb)
+            q5 = square * _dot_product(ey, ey) - _dot_product(kb, kb)
             d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
             if q3 < 0.0 and d2 < 0.0:
                 yc = -d1 / d2

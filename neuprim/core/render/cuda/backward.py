@@ -10,9 +10,25 @@ of 128, so over the neurons nothing is kept that a few operations give again.
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
-from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Shorts2d, Vec2s, Vec4s2d, wp
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.warp import (
+    FAST,
+    Floats,
+    Floats2d,
+    Ints,
+    Longs,
+    Shorts2d,
+    Vec2s,
+    Vec4s2d,
+    array,
+    launch_kernel,
+    wp,
+)
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import (
@@ -27,17 +43,30 @@ from neuprim.core.render.cuda.block_ops import (
     span_of,
 )
 from neuprim.core.render.cuda.chord import (
+    TAU,
     chord_backward,
+    chord_edge_profiles,
+    cos_turns,
     intersect_chord,
     load_ray,
     neuron_phase,
     pixel_of_lane,
     pixel_of_slot,
+    sin_turns,
     slot_of_pixel,
     xyz,
 )
+from neuprim.core.render.cuda.colour_net import (
+    ColourNet,
+    float64_net_kernel,
+    net_gradient_row_width,
+    rasterizer_net_gradient_kernel,
+)
+from neuprim.core.render.cuda.float64 import float64_pairs_kernel
+from neuprim.core.render.cuda.forward import CompositedFrame, KernelArrays, warp_array
 from neuprim.core.render.cuda.layout import KernelForm
-from neuprim.core.render.cuda.trigonometry import TAU, chord_edge_profiles, cos_turns, sin_turns
+from neuprim.core.render.cuda.prepare import Frame
+from neuprim.core.settings import RenderSettings
 
 
 @functools.cache
@@ -256,3 +285,114 @@ def sum_pairs(
     for k in range(first[i], first[i + 1]):
         total += pair_rows[slots[k], c]
     grads[i, c] = total
+
+
+@functools.cache
+def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
+    """Back to front: (alpha, T) becomes (dL/dI, weight), as in ``pixels_kernel``."""
+    C, H = form.channels, form.hidden
+    colours = L.rasterizer_colour_column(form.neurons)
+
+    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
+    def uncomposite(
+        rows: Vec4s2d, ids: Ints, order: Longs, begins: Ints, owners: Ints, limits: wp.vec4, transmittance: Floats,
+        g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats, hues: Floats2d, hits: Vec2s,
+    ):  # fmt: skip
+        n = wp.tid()
+        behind = transmittance[n] * g_transmittance[n]
+        first = begins[n]
+        count = begins[n + 1] - first
+        for back in range(count):
+            slot = int(order[first + count - 1 - back])
+            hit = hits[slot]
+            alpha = hit[0]
+            out = wp.vec2()
+            if alpha > 0.0:
+                weight = alpha * hit[1]
+                by_weight = float(0.0)
+                hue = wp.vec4()
+                for c in range(wp.static(C)):
+                    if wp.static(H >= 0):
+                        by_weight += wp.max(hues[slot, c], 0.0) * g_rgb[n, c]
+                    else:
+                        if wp.static(c % 4 == 0):
+                            hue = rows[ids[owners[slot]], wp.static(colours + c // 4)]
+                        by_weight += hue[wp.static(c % 4)] * g_rgb[n, c]
+                if wp.static(depth):
+                    by_weight += g_z[n] * depths[slot]
+                slope = float(0.0)
+                if alpha < limits[1]:
+                    slope = (1.0 - alpha) * hit[1] * by_weight - behind
+                behind += weight * by_weight
+                out = wp.vec2(slope, weight)
+            hits[slot] = out
+
+    return uncomposite
+
+
+# ---------------------------------------------------------------- a frame
+
+
+@dataclass
+class ImageGradient:
+    """Gradients of an image, float32 and contiguous, and the error of each pixel for the contributions."""
+
+    rgb: Tensor  # (H W, C)
+    transmittance: Tensor  # (H W,), with the background's share
+    z: Tensor | None  # (H W,)
+    error: Tensor  # (H W,)
+
+
+def rasterizer_gradient_rows(
+    frame: Frame,
+    form: KernelForm,
+    net: ColourNet | None,
+    drawn: CompositedFrame,
+    settings: RenderSettings,
+    gradient: ImageGradient,
+) -> tuple[Tensor, Tensor | None]:
+    """Return (N, gradient_width) rows, and (N, net_gradient_row_width) of networks; uses up the slots' contents."""
+    lists, device, depth = frame.lists, frame.device, gradient.z is not None
+    pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
+    a = KernelArrays(frame, net, settings, drawn.spans, drawn.offsets)
+    g_z = warp_array(torch.empty(0, device=device) if gradient.z is None else gradient.z)
+    g_rgb, g_T, error = warp_array(gradient.rgb), warp_array(gradient.transmittance), warp_array(gradient.error)
+    hits, reached, T = array(drawn.hits, wp.vec2), warp_array(drawn.reached), warp_array(drawn.transmittance)
+    depths, hues, floor = warp_array(drawn.depths), warp_array(drawn.hues), settings.depth_floor
+    if drawn.order is None or drawn.begins is None or drawn.owners is None:
+        tile = (a.rows, a.starts, a.ids, a.spans, a.offsets, a.limits, a.size)
+        images = (T, reached, g_rgb, g_T, g_z, depths, hues, hits)
+        launch_kernel(pixels_kernel(form, depth), (tiles, L.PIXELS), (*tile, *images), device, L.PIXELS)
+    else:
+        sorted_hits = (warp_array(drawn.order), warp_array(drawn.begins), warp_array(drawn.owners))
+        inputs = (a.rows, a.ids, *sorted_hits, a.limits, T, g_rgb, g_T, g_z, depths, hues, hits)
+        launch_kernel(uncomposite_kernel(form, depth), len(drawn.transmittance), inputs, device)
+    few, which = (len(drawn.in_float64), L.WARP), warp_array(drawn.in_float64)
+    width = L.gradient_width(form.neurons, form.channels)
+    pair_rows = torch.empty(pairs, width, dtype=torch.float32, device=device)
+    out, flat_rgb = warp_array(pair_rows.view(-1)), warp_array(gradient.rgb.view(-1))
+    inputs = (a.rows, *a.covered, a.lens, floor, a.size, reached, hits, flat_rgb, g_z, error, out)
+    launch_kernel(pairs_kernel(form, depth), (pairs, L.WARP), inputs, device, L.WARP)
+    if len(drawn.in_float64):
+        view = (a.lens, floor, a.size, form.neurons)
+        inputs = (which, a.wide, a.slots, *a.covered, *view, reached, hits, g_rgb, g_z, error, out)
+        launch_kernel(float64_pairs_kernel(form, depth), few, inputs, device, L.WARP)
+    grads = _sum_pair_rows(frame, pair_rows)
+    if net is None:
+        return grads, None
+    net_rows = torch.empty(pairs, net_gradient_row_width(form), device=device)
+    slots = (reached, hits, hues, g_rgb, warp_array(net_rows.view(-1)))
+    inputs = (a.rows, a.units, *a.covered, floor, a.size, *slots)
+    launch_kernel(rasterizer_net_gradient_kernel(form), (pairs, L.WARP), inputs, device, L.WARP)
+    if len(drawn.in_float64):
+        weights = (which, a.wide, array(net.wide, wp.vec4d), a.units, net.hidden, a.slots)
+        launch_kernel(float64_net_kernel(form), few, (*weights, *a.covered, floor, a.size, *slots), device, L.WARP)
+    return grads, _sum_pair_rows(frame, net_rows)
+
+
+def _sum_pair_rows(frame: Frame, pair_rows: Tensor) -> Tensor:
+    """(N, width) sums of the rows of each primitive's pairs."""
+    grads = torch.empty(frame.rows.shape[0], pair_rows.shape[1], dtype=torch.float32, device=frame.device)
+    lists = (warp_array(frame.lists.first), warp_array(frame.lists.slots_of))
+    launch_kernel(sum_pairs, grads.shape, (*lists, warp_array(pair_rows), warp_array(grads)), frame.device)
+    return grads

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Tile lists on the device, and the pixels of each pair; the twin of :mod:`neuprim.core.render.cpu.binning`.
+"""Silhouettes, tile lists on the device, and the pixels of each pair; the twin of :mod:`neuprim.core.render.cpu.tiles`.
 
 Everything is counted before it is written, and sorted by integers: a rerun gives the same bits. The host waits once.
 """
@@ -27,12 +27,24 @@ from neuprim.core.compute.warp import (
     wp,
 )
 from neuprim.core.errors import BackendUnavailable
+from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK
-from neuprim.core.render.layout import HX, HY, SKEW, UNBOUNDED, XC, YC
+from neuprim.core.render.cuda.projection import (
+    EXACT,
+    PER_BLOCK,
+    ProjectedPrimitive,
+    Ray,
+    View,
+    round_projected_to_float32,
+)
+from neuprim.core.render.layout import FLOAT64_RADII, HX, HY, MIN_RIM_SHARES, RIM_POWERS, SKEW, UNBOUNDED, XC, YC
 
 d = wp.float64
 _E0, _EX, _TILE, _UNBOUNDED = L.E0, L.EX, L.TILE, wp.constant(d(UNBOUNDED))
+_RADII = wp.constant(d(FLOAT64_RADII))
+(_N0, _N1, _N2), (_P0, _P1, _P2), (_W0, _W1, _W2) = (
+    [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, RIM_POWERS, MIN_RIM_SHARES)
+)
 _MARGIN, _ROUNDING = 2e-3, 4e-7  # pixels, and per pixel of the ellipse; a pixel too many is rejected by its own D
 _MOST = 2**31  # indices of pairs are int32
 
@@ -75,6 +87,122 @@ def count_tiles(counts: Tensor, bad: Tensor) -> TileCounts:
             f"primitives reach {pairs} tiles in all; the cuda backend counts to {_MOST - 1}: render a smaller image"
         )
     return TileCounts(pairs, in_float64, first_bad if first_bad < counts.shape[1] else -1, ends)
+
+
+@wp.func
+def projected_covariance(p: ProjectedPrimitive, i: int, j: int):
+    """Entry (i, j) of the covariance in camera axes, in units of m^2."""
+    return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
+
+
+@wp.func
+def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
+    """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels."""
+    z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
+    sii, siz = square * projected_covariance(p, axis, axis), square * projected_covariance(p, axis, 2)
+    D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
+    root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - szz
+    return wp.vec2d(
+        v.focal[axis] * (mid - root) / den + v.centre[axis], v.focal[axis] * (mid + root) / den + v.centre[axis]
+    )
+
+
+@wp.struct
+class SilhouetteSpans:
+    """A silhouette's row spans; whether it is an ellipse, and too coarse for float32."""
+
+    skew: wp.float64
+    xc: wp.float64
+    yc: wp.float64
+    hx: wp.float64
+    hy: wp.float64
+    in_float64: wp.int32
+
+
+@wp.func
+def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
+    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, as row spans: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
+    o = SilhouetteSpans()
+    o.hx = _UNBOUNDED
+    o.hy = _UNBOUNDED
+    k0 = wp.cross(r.xa, r.e0)
+    ka = wp.cross(r.xa, r.ex) + r.tc * wp.cross(r.ex, r.e0)
+    kb = wp.cross(r.xa, r.ey) + r.tc * wp.cross(r.ey, r.e0)
+    q0, q1 = square * wp.dot(r.e0, r.e0) - wp.dot(k0, k0), square * wp.dot(r.e0, r.ex) - wp.dot(k0, ka)
+    q2, q3 = square * wp.dot(r.e0, r.ey) - wp.dot(k0, kb), square * wp.dot(r.ex, r.ex) - wp.dot(ka, ka)
+    q4, q5 = square * wp.dot(r.ex, r.ey) - wp.dot(ka, kb), square * wp.dot(r.ey, r.ey) - wp.dot(kb, kb)
+    d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
+    if q3 < d(0.0) and d2 < d(0.0):
+        yc = -d1 / d2
+        peak = d0 + d1 * yc
+        if peak > d(0.0):
+            o.skew = round_projected_to_float32(-q4 / q3)
+            o.xc = round_projected_to_float32(-(q1 + q4 * yc) / q3)
+            o.yc = round_projected_to_float32(yc)
+            o.hx = round_projected_to_float32(wp.sqrt(peak) / -q3)
+            o.hy = round_projected_to_float32(wp.sqrt(-peak / d2))
+            # the pixel offsets that meet the silhouette on the screen
+            ux, uy, half = p.anchor[1], p.anchor[2], d(0.5)
+            tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
+            broad = wp.abs(o.xc) + wp.abs(o.skew) * (wp.abs(yc) + o.hy) + o.hx
+            broad = wp.min(broad, wp.max(wp.abs(half - ux), wp.abs(d(width) - half - ux)))
+            # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
+            # each is many radii of its thin axis, and they cancel
+            slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
+            if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
+                o.in_float64 = 1
+            xu, xv = r.tc * r.ex + r.tu * r.e0, r.tc * r.ey + r.tv * r.e0
+            for a in range(3):
+                if wp.abs(xu[a]) * broad + wp.abs(xv[a]) * tall > _RADII:
+                    o.in_float64 = 1
+    return o
+
+
+@wp.func
+def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
+    """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes."""
+    bound, one = d(1.0), d(1.0)
+    if r.tc != d(0.0):
+        z = p.centre[2]
+        slope_x, slope_y, wide = wp.abs(p.centre[0] / z), wp.abs(p.centre[1] / z), p.m / (z - reach)
+        du, dv = wide * (one + slope_x), wide * (one + slope_y)
+        least = (
+            wp.sqrt(wp.dot(r.e0, r.e0))
+            - v.focal[0] * du * wp.sqrt(wp.dot(r.ex, r.ex))
+            - v.focal[1] * dv * wp.sqrt(wp.dot(r.ey, r.ey))
+        )
+        most = wp.sqrt(one + (slope_x + du) * (slope_x + du) + (slope_y + dv) * (slope_y + dv))
+        if least > most:
+            bound = most / least
+    return bound
+
+
+@wp.func
+def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
+    """An array would be a stack: its index is not known to the compiler."""
+    number = hard
+    if edge == 1:
+        number = one
+    if edge == 2:
+        number = two
+    return number
+
+
+@wp.func
+def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
+    """Whether no chord can reach the depth ``least``, however long."""
+    return most <= d(0.0) or most * _chord_bound_by_edge(edge, _N0, _N1, _N2) <= least
+
+
+@wp.func
+def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
+    """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
+    square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
+    if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
+        square = d(1.0)
+    elif share < d(1.0):
+        square = round_projected_to_float32(d(1.0) - wp.exp(wp.log(share) * _chord_bound_by_edge(edge, _P0, _P1, _P2)))
+    return square
 
 
 @wp.struct

@@ -37,12 +37,21 @@ from neuprim.core.compute.warp import (
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.block_ops import gradient_row_sums, gradient_row_type
-from neuprim.core.render.cuda.chord import chord_backward, intersect_chord, load_ray, neuron_phase, pixel_of_slot, xyz
+from neuprim.core.render.cuda.chord import (
+    TAU,
+    chord_backward,
+    cos_turns,
+    intersect_chord,
+    load_ray,
+    neuron_phase,
+    pixel_of_slot,
+    sin_turns,
+    xyz,
+)
 from neuprim.core.render.cuda.float64 import chord_backward64, intersect_chord64
 from neuprim.core.render.cuda.layout import KernelForm
 from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
-from neuprim.core.render.cuda.trigonometry import TAU, cos_turns, sin_turns
 
 FIRST_COLOUR = L.G_NEURONS
 """Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the
@@ -232,7 +241,7 @@ def net_gradient_row_width(form: KernelForm) -> int:
 
 
 @functools.cache
-def net_pairs_kernel(form: KernelForm) -> Any:
+def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
     """A warp a pair: gradients of its network, and the ray's share through the chord's middle."""
     C, H, P = form.channels, form.hidden, form.edge
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
@@ -339,7 +348,7 @@ def float64_hues_kernel(channels: int) -> Any:
 
 @functools.cache
 def float64_net_kernel(form: KernelForm) -> Any:
-    """:func:`net_pairs_kernel` for in_float64 pairs, in float64."""
+    """:func:`rasterizer_net_gradient_kernel` for in_float64 pairs, in float64."""
     C = form.channels
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

@@ -9,15 +9,46 @@ there beforehand (:mod:`~neuprim.core.render.cuda.float64`).
 from __future__ import annotations
 
 import functools
+from dataclasses import dataclass
 from typing import Any
 
-from neuprim.core.compute.warp import FAST, Floats, Floats2d, Ints, Longs, Shorts2d, Vec2s, Vec4s2d, wp
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.warp import (
+    FAST,
+    Floats,
+    Floats2d,
+    Ints,
+    Longs,
+    Shorts2d,
+    Vec2s,
+    Vec4s2d,
+    array,
+    launch_kernel,
+    wp,
+)
+from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.binning import row_spans
 from neuprim.core.render.cuda.block_ops import any_tile_thread, int_at, pixel_hit_at, set_pixel_hit, span_of
-from neuprim.core.render.cuda.chord import intersect_chord, load_ray, neuron_phase, pixel_of_lane, slot_of_pixel, xyz
+from neuprim.core.render.cuda.chord import (
+    chord_edge_profiles,
+    cos_turns,
+    intersect_chord,
+    load_ray,
+    neuron_phase,
+    opacity_of_depth,
+    pixel_of_lane,
+    slot_of_pixel,
+    xyz,
+)
+from neuprim.core.render.cuda.colour_net import ColourNet, float64_hues_kernel
+from neuprim.core.render.cuda.float64 import float64_opacity_kernel
 from neuprim.core.render.cuda.layout import CUT_AT, KernelForm
-from neuprim.core.render.cuda.trigonometry import chord_edge_profiles, cos_turns, opacity_of_depth
+from neuprim.core.render.cuda.prepare import Frame
+from neuprim.core.settings import RenderSettings
 
 
 @wp.func
@@ -256,44 +287,152 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
     return composite
 
 
-@functools.cache
-def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Back to front: (alpha, T) becomes (dL/dI, weight), as in ``pixels_kernel``."""
-    C, H = form.channels, form.hidden
-    colours = L.rasterizer_colour_column(form.neurons)
+# ---------------------------------------------------------------- a frame
 
-    @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
-    def uncomposite(
-        rows: Vec4s2d, ids: Ints, order: Longs, begins: Ints, owners: Ints, limits: wp.vec4, transmittance: Floats,
-        g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats, hues: Floats2d, hits: Vec2s,
-    ):  # fmt: skip
-        n = wp.tid()
-        behind = transmittance[n] * g_transmittance[n]
-        first = begins[n]
-        count = begins[n + 1] - first
-        for back in range(count):
-            slot = int(order[first + count - 1 - back])
-            hit = hits[slot]
-            alpha = hit[0]
-            out = wp.vec2()
-            if alpha > 0.0:
-                weight = alpha * hit[1]
-                by_weight = float(0.0)
-                hue = wp.vec4()
-                for c in range(wp.static(C)):
-                    if wp.static(H >= 0):
-                        by_weight += wp.max(hues[slot, c], 0.0) * g_rgb[n, c]
-                    else:
-                        if wp.static(c % 4 == 0):
-                            hue = rows[ids[owners[slot]], wp.static(colours + c // 4)]
-                        by_weight += hue[wp.static(c % 4)] * g_rgb[n, c]
-                if wp.static(depth):
-                    by_weight += g_z[n] * depths[slot]
-                slope = float(0.0)
-                if alpha < limits[1]:
-                    slope = (1.0 - alpha) * hit[1] * by_weight - behind
-                behind += weight * by_weight
-                out = wp.vec2(slope, weight)
-            hits[slot] = out
+_MAX_HITS = 2**31
 
-    return uncomposite
+_NUMBERS = {
+    torch.float32: wp.float32,
+    torch.float64: wp.float64,
+    torch.int32: wp.int32,
+    torch.int64: wp.int64,
+    torch.int16: wp.uint16,
+}
+
+
+@dataclass
+class CompositedFrame:
+    """What a forward pass leaves."""
+
+    rgb: Tensor  # (H W, C)
+    transmittance: Tensor  # (H W,)
+    zsum: Tensor  # (H W,) sum of w z, empty if no depth is wanted
+    spans: Tensor  # (pairs, 16) int16, which with the offsets say the pixels of each pair, see row_spans
+    offsets: Tensor  # (pairs + 1,) int32
+    hits: Tensor  # (slots, 2) opacity and transmittance before it, if they were kept
+    depths: Tensor  # (slots,) camera-z, if wanted
+    hues: Tensor  # (slots, C) colours before max(0, .), of colour networks
+    reached: Tensor  # (tiles,) int32, the pairs before it were composited
+    in_float64: Tensor  # (D,) int32, the pairs that are drawn in float64, rising
+    # where hits were sorted by entry:
+    order: Tensor | None = None  # (slots,) int64 slots by pixel and entry
+    begins: Tensor | None = None  # (H W + 1,) int32, first of each pixel
+    owners: Tensor | None = None  # (slots,) int32, pair of each slot
+
+
+def warp_array(tensor: Tensor) -> Any:
+    return array(tensor, _NUMBERS[tensor.dtype])
+
+
+class KernelArrays:
+    """Arrays and numbers of a frame as the kernels take them."""
+
+    def __init__(
+        self, frame: Frame, net: ColourNet | None, settings: RenderSettings, spans: Tensor, offsets: Tensor
+    ) -> None:
+        camera, device = frame.projection.camera, frame.device
+        self.rows = array(frame.rows, wp.vec4)
+        self.wide, self.slots = warp_array(frame.wide), warp_array(frame.slots)
+        lists = (frame.lists.starts, frame.lists.ids, frame.lists.tile_of)
+        self.starts, self.ids, self.tile_of = (warp_array(x) for x in lists)
+        self.spans, self.offsets = warp_array(spans), warp_array(offsets)
+        units = torch.empty(1, 1, 4, device=device) if net is None or not net.hidden else net.rows
+        self.units = array(units, wp.vec4)
+        self.lens = wp.vec4(camera.fx, camera.fy, camera.cx, camera.cy)
+        self.size = wp.vec2i(camera.width, camera.height)
+        self.limits = wp.vec4(settings.alpha_min, settings.alpha_max, settings.transmittance_min, 0.0)
+
+    @property
+    def covered(self) -> tuple[Any, ...]:
+        """Primitive, tile, and pixels of every pair."""
+        return self.ids, self.tile_of, self.spans, self.offsets
+
+
+def _marked_pairs(marked: Tensor, count: int) -> Tensor:
+    """(count,) int32, where a mask with so many is set; the host does not wait."""
+    place = torch.where(marked, torch.cumsum(marked, 0) - 1, count)
+    numbers = torch.arange(marked.shape[0], dtype=torch.int32, device=marked.device)
+    return torch.empty(count + 1, dtype=torch.int32, device=marked.device).index_copy_(0, place, numbers)[:count]
+
+
+def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
+    """Number of slots, (pairs + 1,) first slot of each pair, float64 pairs; waits. BackendUnavailable: too many."""
+    in_float64 = torch.empty(0, dtype=torch.int32, device=frame.device)
+    offsets = torch.zeros(len(counts) + 1, dtype=torch.int32, device=frame.device)
+    ends = torch.cumsum(counts, 0, dtype=torch.int64)
+    offsets[1:] = ends
+    if frame.wide.shape[0] > 0:
+        marked = frame.slots[frame.lists.ids] >= 0
+        total, few = torch.stack((ends[-1], marked.sum())).tolist()
+        in_float64 = _marked_pairs(marked, few)
+    else:
+        total = int(ends[-1])
+    if total >= _MAX_HITS:
+        raise BackendUnavailable(
+            f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
+            f"image"
+        )
+    return total, offsets, in_float64
+
+
+def composite_frame(
+    frame: Frame,
+    form: KernelForm,
+    net: ColourNet | None,
+    background: Tensor,
+    settings: RenderSettings,
+    differentiable: bool,
+    images: int = 1,
+) -> CompositedFrame:
+    """Draw; several ``images`` without gradients, sorted by centres. The host waits where slots are kept."""
+    lists, device, camera = frame.lists, frame.device, frame.projection.camera
+    pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    spans, counts = empty(pairs, L.TILE, dtype=torch.int16), empty(pairs, dtype=torch.int32)
+    offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
+    a = KernelArrays(frame, net, settings, spans, offsets)
+    silhouettes = (warp_array(frame.spans), array(frame.boxes, wp.vec4i))
+    inputs = (a.rows, *silhouettes, a.ids, a.tile_of, a.size, a.spans, warp_array(counts))
+    launch_kernel(row_spans, pairs, inputs, device)
+    sorts = settings.sort == "entry"
+    keep = differentiable or sorts or frame.wide.shape[0] > 0
+    total, in_float64 = 0, empty(0, dtype=torch.int32)
+    if keep and pairs:
+        total, offsets, in_float64 = _count_slots(frame, counts)
+        a.offsets = warp_array(offsets)
+    hits, depths = empty(total, 2), empty(total if settings.depth else 0)
+    hues = empty(total if net is not None else 0, form.channels)
+    if len(in_float64):
+        few, which = (len(in_float64), L.WARP), warp_array(in_float64)
+        kept = (array(hits, wp.vec2), warp_array(depths))
+        wide = (which, a.wide, a.slots, *a.covered, a.lens, a.limits, a.size, form.neurons, form.edge, *kept)
+        launch_kernel(float64_opacity_kernel(settings.depth), few, wide, device, L.WARP)
+        if net is not None and net.hidden:
+            units = (array(net.wide, wp.vec4d), a.units, a.rows, L.rasterizer_colour_column(form.neurons), net.hidden)
+            wide = (which, a.wide, *units, a.slots, *a.covered, a.size, warp_array(hues))
+            launch_kernel(float64_hues_kernel(form.channels), few, wide, device, L.WARP)
+    pixels = images * camera.width * camera.height
+    rgb, T, z = empty(pixels, form.channels), empty(pixels), empty(pixels if settings.depth else 0)
+    reached = empty(tiles, dtype=torch.int32)
+    keys, owners = empty(total if sorts else 0, dtype=torch.int64), empty(total if sorts else 0, dtype=torch.int32)
+    drawn = CompositedFrame(rgb, T, z, spans, offsets, hits, depths, hues, reached, in_float64)
+    image = (warp_array(rgb), warp_array(T), warp_array(z))
+    slots = (array(hits, wp.vec2), warp_array(depths), warp_array(hues))
+    tile = (a.rows, a.units, a.starts, a.ids, a.spans, a.offsets, a.lens, a.limits, warp_array(background), a.size)
+    listed = (warp_array(keys), warp_array(owners))
+    kernel = forward_kernel(form, keep, settings.depth, sorts, images > 1)
+    launch_kernel(kernel, (tiles, L.PIXELS), (*tile, *image, *slots, warp_array(reached), *listed), device, L.PIXELS)
+    if not sorts:
+        return drawn
+    keys, order = torch.sort(keys, stable=True)
+    begins = torch.empty(pixels + 1, dtype=torch.int32, device=device)
+    begins[pixels] = torch.searchsorted(keys, pixels << 32)
+    sorted_hits = (a.rows, a.ids, warp_array(keys), warp_array(order), total, warp_array(owners), a.limits)
+    written = (*reversed(slots), *image, warp_array(begins))
+    inputs = (*sorted_hits, warp_array(background), *written)
+    launch_kernel(composite_kernel(form, settings.depth), pixels, inputs, device)
+    drawn.order, drawn.begins, drawn.owners = order, begins, owners
+    return drawn

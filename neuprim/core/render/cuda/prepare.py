@@ -1,44 +1,71 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The per-primitive stage, one thread a primitive, float64 inside: the twin of :mod:`neuprim.core.render.cpu.prepare`.
+"""A frame on the device, and the per-primitive stage that fills it: one thread a primitive, float64 inside.
 
-Rows are float4 with the colours in them, and neurons stay in the model's order. It also counts each primitive's tiles.
+The twin of :mod:`neuprim.core.render.cpu.prepare`. Rows are float4 with the colours in them, and neurons stay in the
+model's order. Each primitive's tiles are counted, too.
 """
 
 import functools
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
-from neuprim.core.compute.warp import Bools, Bytes, Doubles, Doubles2d, Floats2d, Ints, Ints2d, Vec4is, Vec4s2d, wp
-from neuprim.core.model.edge import NORMS
+import torch
+from torch import Tensor
+
+from neuprim.core.cameras import Camera
+from neuprim.core.compute.warp import (
+    Bools,
+    Bytes,
+    Doubles,
+    Doubles2d,
+    Floats2d,
+    Ints,
+    Ints2d,
+    Vec4is,
+    Vec4s2d,
+    array,
+    launch_kernel,
+    wp,
+)
 from neuprim.core.render import layout as W
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.binning import silhouette_ellipse, tile_range
+from neuprim.core.render.cuda.binning import (
+    SilhouetteSpans,
+    TileLists,
+    bin_primitives,
+    count_tiles,
+    is_too_faint_to_draw,
+    longest_half_chord,
+    projected_covariance,
+    silhouette_ellipse,
+    silhouette_screen_extent,
+    silhouette_spans,
+    tile_range,
+    visible_square,
+)
 from neuprim.core.render.cuda.projection import (
     EXACT,
+    PER_BLOCK,
     ProjectedPrimitive,
-    Ray,
-    View,
     load_projection_view,
     project_primitive,
-    round_projected_to_float32,
     whiten_rays,
 )
+from neuprim.core.render.layout import SPAN_WIDTH, min_visible_depth
+from neuprim.core.render.rasterize import RasterRequest
 
 d, f = wp.float64, wp.float32
-_VISIBLE, _CULLED, _NON_FINITE = (
-    wp.constant(wp.uint8(W.VISIBLE)),
-    wp.constant(wp.uint8(W.CULLED)),
-    wp.constant(wp.uint8(W.NON_FINITE)),
-)
+_VISIBLE = wp.constant(wp.uint8(W.VISIBLE))
+_CULLED = wp.constant(wp.uint8(W.CULLED))
+_NON_FINITE = wp.constant(wp.uint8(W.NON_FINITE))
 _FLOAT32_MAX, _CUT = wp.constant(d(W.FLOAT32_MAX)), wp.constant(d(W.CUT))
-_RADII, _TURNS = wp.constant(d(W.FLOAT64_RADII)), wp.constant(d(W.FLOAT64_TURNS))
+_TURNS = wp.constant(d(W.FLOAT64_TURNS))
 _ANCHOR, _PIXELS = wp.constant(d(W.FLOAT64_ANCHOR**2)), wp.constant(d(W.FLOAT64_PIXELS))
 _RATIO, _RATIO_NEAR = wp.constant(d(W.FLOAT64_RATIO)), wp.constant(d(W.FLOAT64_RATIO_NEAR))
 _UNBOUNDED = wp.constant(d(W.UNBOUNDED))
 _E0, _EX, _EY, _XA, _XU, _XV, _REST, _NEURONS = L.E0, L.EX, L.EY, L.XA, L.XU, L.XV, L.REST, L.NEURONS
 _TILE = L.TILE
-(_N0, _N1, _N2), (_P0, _P1, _P2), (_W0, _W1, _W2) = (
-    [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, W.RIM_POWERS, W.MIN_RIM_SHARES)
-)
 
 _STORE = """
 #if defined(__CUDA_ARCH__)
@@ -65,126 +92,10 @@ def _largest_ray_component(v: wp.vec3d):
 
 
 @wp.func
-def _projected_covariance(p: ProjectedPrimitive, i: int, j: int):
-    """Entry (i, j) of the covariance in camera axes, in units of m^2."""
-    return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
-
-
-@wp.func
-def _silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
-    """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels."""
-    z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
-    sii, siz = square * _projected_covariance(p, axis, axis), square * _projected_covariance(p, axis, 2)
-    D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
-    root, mid, den = wp.sqrt(wp.max(D, d(0.0))), ci * z - siz, z * z - szz
-    return wp.vec2d(
-        v.focal[axis] * (mid - root) / den + v.centre[axis], v.focal[axis] * (mid + root) / den + v.centre[axis]
-    )
-
-
-@wp.struct
-class SilhouetteSpans:
-    """A silhouette's row spans; whether it is an ellipse, and too coarse for float32."""
-
-    skew: wp.float64
-    xc: wp.float64
-    yc: wp.float64
-    hx: wp.float64
-    hy: wp.float64
-    in_float64: wp.int32
-
-
-@wp.func
-def _silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, as row spans: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
-    o = SilhouetteSpans()
-    o.hx = _UNBOUNDED
-    o.hy = _UNBOUNDED
-    k0 = wp.cross(r.xa, r.e0)
-    ka = wp.cross(r.xa, r.ex) + r.tc * wp.cross(r.ex, r.e0)
-    kb = wp.cross(r.xa, r.ey) + r.tc * wp.cross(r.ey, r.e0)
-    q0, q1 = square * wp.dot(r.e0, r.e0) - wp.dot(k0, k0), square * wp.dot(r.e0, r.ex) - wp.dot(k0, ka)
-    q2, q3 = square * wp.dot(r.e0, r.ey) - wp.dot(k0, kb), square * wp.dot(r.ex, r.ex) - wp.dot(ka, ka)
-    q4, q5 = square * wp.dot(r.ex, r.ey) - wp.dot(ka, kb), square * wp.dot(r.ey, r.ey) - wp.dot(kb, kb)
-    d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
-    if q3 < d(0.0) and d2 < d(0.0):
-        yc = -d1 / d2
-        peak = d0 + d1 * yc
-        if peak > d(0.0):
-            o.skew = round_projected_to_float32(-q4 / q3)
-            o.xc = round_projected_to_float32(-(q1 + q4 * yc) / q3)
-            o.yc = round_projected_to_float32(yc)
-            o.hx = round_projected_to_float32(wp.sqrt(peak) / -q3)
-            o.hy = round_projected_to_float32(wp.sqrt(-peak / d2))
-            # the pixel offsets that meet the silhouette on the screen
-            ux, uy, half = p.anchor[1], p.anchor[2], d(0.5)
-            tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
-            broad = wp.abs(o.xc) + wp.abs(o.skew) * (wp.abs(yc) + o.hy) + o.hx
-            broad = wp.min(broad, wp.max(wp.abs(half - ux), wp.abs(d(width) - half - ux)))
-            # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
-            # each is many radii of its thin axis, and they cancel
-            slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
-            if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
-                o.in_float64 = 1
-            xu, xv = r.tc * r.ex + r.tu * r.e0, r.tc * r.ey + r.tv * r.e0
-            for a in range(3):
-                if wp.abs(xu[a]) * broad + wp.abs(xv[a]) * tall > _RADII:
-                    o.in_float64 = 1
-    return o
-
-
-@wp.func
 def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
     """A neuron's frequencies on whitened axes, in turns."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
-
-
-@wp.func
-def _longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
-    """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes."""
-    bound, one = d(1.0), d(1.0)
-    if r.tc != d(0.0):
-        z = p.centre[2]
-        slope_x, slope_y, wide = wp.abs(p.centre[0] / z), wp.abs(p.centre[1] / z), p.m / (z - reach)
-        du, dv = wide * (one + slope_x), wide * (one + slope_y)
-        least = (
-            wp.sqrt(wp.dot(r.e0, r.e0))
-            - v.focal[0] * du * wp.sqrt(wp.dot(r.ex, r.ex))
-            - v.focal[1] * dv * wp.sqrt(wp.dot(r.ey, r.ey))
-        )
-        most = wp.sqrt(one + (slope_x + du) * (slope_x + du) + (slope_y + dv) * (slope_y + dv))
-        if least > most:
-            bound = most / least
-    return bound
-
-
-@wp.func
-def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
-    """An array would be a stack: its index is not known to the compiler."""
-    number = hard
-    if edge == 1:
-        number = one
-    if edge == 2:
-        number = two
-    return number
-
-
-@wp.func
-def _is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
-    """Whether no chord can reach the depth ``least``, however long."""
-    return most <= d(0.0) or most * _chord_bound_by_edge(edge, _N0, _N1, _N2) <= least
-
-
-@wp.func
-def _visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
-    square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
-    if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
-        square = d(1.0)
-    elif share < d(1.0):
-        square = round_projected_to_float32(d(1.0) - wp.exp(wp.log(share) * _chord_bound_by_edge(edge, _P0, _P1, _P2)))
-    return square
 
 
 @functools.cache
@@ -208,7 +119,7 @@ def project_primitives_kernel(double: bool) -> Any:
         most = d(b2[i])
         for k in range(neurons):
             most += d(wp.abs(w2[i, k]))
-        if _is_too_faint_to_draw(most, edge, least):  # whatever its place
+        if is_too_faint_to_draw(most, edge, least):  # whatever its place
             state = int(_CULLED)
             given, turn = wp.vec3d(means[i]) + wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
             given_sum = most + given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
@@ -239,11 +150,8 @@ def project_primitives_kernel(double: bool) -> Any:
             total += r.e0[a] + r.ex[a] + r.ey[a] + r.xa[a]
         fastest = d(0.0)
         for k in range(neurons):
-            wave, phase, amplitude = (
-                _projected_frequency(wp.vec3d(W1[i, k]), p, turns),
-                turns * d(b1[i, k]),
-                d(w2[i, k]),
-            )
+            wave = _projected_frequency(wp.vec3d(W1[i, k]), p, turns)
+            phase, amplitude = turns * d(b1[i, k]), d(w2[i, k])
             speed = wp.sqrt(wp.dot(wave, wave))
             fastest = wp.max(fastest, speed)
             biggest = wp.max(biggest, wp.max(speed, wp.abs(amplitude)))
@@ -280,7 +188,7 @@ def project_primitives_kernel(double: bool) -> Any:
         if forced:
             if forced[i]:
                 in_float64 = 1
-        s22 = _projected_covariance(p, 2, 2)
+        s22 = projected_covariance(p, 2, 2)
         reach = wp.sqrt(m * m * s22)
         if edge > 0 and z - reach < near + _CUT * reach:  # only there are integrals of cut chords with a soft edge
             in_float64 = 1
@@ -299,21 +207,17 @@ def project_primitives_kernel(double: bool) -> Any:
                 o.hx = _UNBOUNDED
                 o.hy = _UNBOUNDED
                 if z - reach > d(1e-3) * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
-                    half, one, square = (
-                        d(0.5),
-                        d(1.0),
-                        _visible_square(most, _longest_half_chord(p, r, v, reach), edge, least),
-                    )
+                    half = d(0.5)
+                    one = d(1.0)
+                    square = visible_square(most, longest_half_chord(p, r, v, reach), edge, least)
                     if square == d(0.0):
                         x1 = x0  # nothing can be seen of it
                     else:
-                        across, down = (
-                            _silhouette_screen_extent(p, v, 0, s22, square),
-                            _silhouette_screen_extent(p, v, 1, s22, square),
-                        )
+                        across = silhouette_screen_extent(p, v, 0, s22, square)
+                        down = silhouette_screen_extent(p, v, 1, s22, square)
                         x0, x1 = wp.max(x0, wp.ceil(across[0] - half)), wp.min(x1, wp.floor(across[1] - half) + one)
                         y0, y1 = wp.max(y0, wp.ceil(down[0] - half)), wp.min(y1, wp.floor(down[1] - half) + one)
-                        o = _silhouette_spans(p, r, width, height, square)
+                        o = silhouette_spans(p, r, width, height, square)
                         if o.in_float64 > 0:
                             in_float64 = 1
                 if x1 > x0 and y1 > y0:
@@ -394,3 +298,120 @@ def wide_kernel(double: bool) -> Any:
             wide[n, column + W.AMPLITUDE] = d(w2[i, k])
 
     return prepare_wide
+
+
+class NotFinitePrimitive(ValueError):
+    """Primitive ``row`` is not finite, or outside float32; the caller says which of its numbers."""
+
+    def __init__(self, row: int) -> None:
+        super().__init__(f"primitive {row} is not finite")
+        self.row = row
+
+
+@dataclass(frozen=True)
+class Projection:
+    """A view as the kernels take it."""
+
+    matrix: Tensor  # (16,) float64 on the device, world to camera
+    camera: Camera  # focal lengths and centre in pixels, size
+    near: float  # of the near plane, in scene units
+    turns: float  # omega0 / 2 pi
+
+    @property
+    def intrinsics(self) -> Any:
+        return wp.vec4d(self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy)
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Device arrays of one view; :mod:`neuprim.core.render.cuda.layout` names the columns."""
+
+    projection: Projection  # the view
+    parameters: tuple[Tensor, ...]  # tensors of PARAMETERS, contiguous, all float32 or all float64
+    rows: Tensor  # (N, columns(K, C), 4) float32
+    wide: Tensor  # (M, wide_width(K)) float64, rows of the primitives in float64, columns of layout
+    slots: Tensor  # (N,) int32, row in wide, or -1
+    which: Tensor  # (M,) int32, primitive of each row of wide, rising
+    spans: Tensor  # (N, 8) float32, silhouettes
+    boxes: Tensor  # (N, 4) int32, pixel boxes x0, y0, x1, y1
+    depth: Tensor  # (N,) float64, camera z of the centres
+    status: Tensor  # (N,) uint8, VISIBLE or CULLED
+    lists: TileLists  # which primitives reach which tile
+
+    @property
+    def device(self) -> torch.device:
+        return self.rows.device
+
+    @property
+    def neurons(self) -> int:
+        return int(self.parameters[3].shape[1])
+
+    @property
+    def double(self) -> bool:
+        return self.parameters[0].dtype == torch.float64
+
+    @property
+    def inputs(self) -> tuple[Any, ...]:
+        """The parameters as Warp arrays."""
+        return rasterizer_parameter_arrays(self.parameters)
+
+
+def rasterizer_parameter_arrays(parameters: Sequence[Tensor]) -> tuple[Any, ...]:
+    """Return parameters, or their gradients, as Warp arrays of numbers and vectors."""
+    double = parameters[0].dtype == torch.float64
+    real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
+    return tuple(array(x, kind) for x, kind in zip(parameters, (vec3, vec3, vec4, vec3, real, real, real), strict=True))
+
+
+def prepare_frame(
+    request: RasterRequest,
+    viewmat: Tensor,
+    palette: Tensor,
+    tensors: Sequence[Tensor],
+    forced: Tensor | None = None,
+    images: tuple[Tensor, int] | None = None,
+) -> Frame:
+    """Return everything that the pixel kernels read of one view; the host waits for the device once.
+
+    Args:
+        palette: (N, C) colours.
+        tensors: those of :data:`~neuprim.core.render.rasterize.PARAMETERS`, all on one device.
+        forced: (N,) bool, primitives to draw in float64 whatever this stage finds.
+        images: (N,) int32, the image of each primitive, and their number; None for one.
+
+    Raises NotFinite, or BackendUnavailable where primitives reach 2^31 tiles or more.
+    """
+    # float64 where any is, else float32; the kernels compute in float64 in any case
+    dtype = torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
+    parameters = tuple(x.detach().to(dtype).contiguous() for x in tensors)
+    device, (N, K, _), C = parameters[0].device, parameters[3].shape, palette.shape[1]
+    double, camera, settings = dtype == torch.float64, request.camera, request.settings
+    # a plain copy would wait
+    matrix = viewmat.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()
+    projection = Projection(matrix, camera, settings.near_plane, request.turns)
+
+    def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
+        return torch.empty(shape, dtype=dtype, device=device)
+
+    rows, spans = empty(N, L.rasterizer_row_columns(K, C), 4), empty(N, SPAN_WIDTH)
+    boxes = empty(N, 4, dtype=torch.int32)
+    depth, status, counts = empty(N, dtype=torch.float64), empty(N, dtype=torch.uint8), empty(2, N, dtype=torch.int32)
+    bad = torch.full((1,), N, dtype=torch.int32, device=device)
+    inputs, colours = rasterizer_parameter_arrays(parameters), array(palette.detach().float().contiguous(), wp.float32)
+    view = (array(matrix, wp.float64), projection.intrinsics)
+    least = min_visible_depth(settings.alpha_min)
+    size = (camera.width, camera.height, projection.near, projection.turns, request.edge, least, K, C)
+    lists = (array(status, wp.uint8), array(counts, wp.int32), array(bad, wp.int32))
+    silhouettes = (array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i))
+    filled = (array(rows, wp.vec4), *silhouettes, array(depth, wp.float64), *lists)
+    asked = None if forced is None else array(forced.contiguous(), wp.bool)
+    arguments = (*inputs, colours, asked, *view, *size, *filled)
+    launch_kernel(project_primitives_kernel(double), N, arguments, device, PER_BLOCK)
+    counted = count_tiles(counts, bad)
+    if counted.bad >= 0:
+        raise NotFinitePrimitive(counted.bad)
+    tile_lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera, images)
+    wide = empty(counted.in_float64, L.wide_width(K), dtype=torch.float64)
+    wanted = (array(which, wp.int32), *inputs, *view, projection.near, projection.turns, K, array(wide, wp.float64))
+    launch_kernel(wide_kernel(double), counted.in_float64, wanted, device, PER_BLOCK)
+    return Frame(projection, parameters, rows, wide, slots, which, spans, boxes, depth, status, tile_lists)

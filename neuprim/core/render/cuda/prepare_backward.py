@@ -20,7 +20,7 @@ from neuprim.core.compute.warp import (
     wp,
 )
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import Frame, rasterizer_parameter_arrays
+from neuprim.core.render.cuda.prepare import Frame, rasterizer_parameter_arrays
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, load_projection_view, project_primitive, whiten_rays
 from neuprim.core.render.layout import E0, EX, EY, XA
 
@@ -73,10 +73,8 @@ def _prepare_backward_kernel(double: bool) -> Any:
             r = whiten_rays(p, v)
             gx = _load_gradient_vector(grads, i, _XA)
             gA = wp.outer(_load_gradient_vector(grads, i, _E0), r.ref) + wp.outer(gx, r.w)
-            ge, gy = (
-                _load_gradient_vector(grads, i, _EX) / v.focal[0],
-                _load_gradient_vector(grads, i, _EY) / v.focal[1],
-            )
+            ge = _load_gradient_vector(grads, i, _EX) / v.focal[0]
+            gy = _load_gradient_vector(grads, i, _EY) / v.focal[1]
             gB, gl = wp.mat33d(), wp.vec3d()  # dL/dB, dL/d log_scales
             for a in range(3):
                 row = wp.vec3d(gA[a, 0] + ge[a], gA[a, 1] + gy[a], gA[a, 2])

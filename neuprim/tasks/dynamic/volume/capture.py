@@ -10,6 +10,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -19,6 +20,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy import ndimage
+from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data.dataset import DatasetImages
@@ -26,8 +29,17 @@ from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
-from neuprim.core.io.vdb import VdbFrame
-from neuprim.core.volumes.density_truth import DensityGridPlacement, GridExtent
+from neuprim.core.io.vdb import VdbFrame, list_vdb_files
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.volumes.density_grid import voxels_in_box
+from neuprim.core.volumes.density_truth import (
+    DENSITY_ERRORS,
+    DensityGridPlacement,
+    DensityGridSource,
+    GridExtent,
+    TruthFrame,
+    measure_density_errors,
+)
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics, build_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
@@ -167,10 +179,8 @@ class Capture:
                 )
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
-        largest, points = (
-            np.float32(medium.values[..., 0].max(initial=0.0)),
-            _sample_medium_points(medium, frame.number),
-        )
+        largest = np.float32(medium.values[..., 0].max(initial=0.0))
+        points = _sample_medium_points(medium, frame.number)
         np.savez(folder / LAST_FILE, brightest=np.float32(brightest), largest=largest, **points)
 
 
@@ -324,3 +334,104 @@ def hemisphere_capture_cameras(
         views.append(Camera(viewmat, focal, focal, size / 2, size / 2, size, size))
     held_out = {int(cameras * part) for part in _TEST_CAMERAS}
     return [v for n, v in enumerate(views) if n not in held_out], [v for n, v in enumerate(views) if n in held_out]
+
+
+THIRDS = ("early", "middle", "late")
+_COMPARED_PER_THIRD = 3  # frames
+
+
+def sample_extinction(
+    medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], part: bool = False
+) -> np.ndarray:
+    """(X, Y, Z) float32 extinction at a lattice's points, trilinear; with ``part`` only the extinction grid's part."""
+    if medium.values.size == 0:
+        return np.zeros(shape, np.float32)
+    chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
+    sigma = medium.scattering if part and medium.scattering is not None else medium.values[..., 0]
+    points = chain[:3, :3] @ np.indices(shape, dtype=np.float64).reshape(3, -1) + chain[:3, 3:]
+    values: np.ndarray = ndimage.map_coordinates(sigma, points, order=1, mode="constant", cval=0.0)
+    return values.reshape(shape).astype(np.float32)
+
+
+class CaptureDensity(DensityGridSource):
+    """The frames of ``path`` or the scene's own; grids, optics, placement and times are those of the scene.
+
+    Frames of a folder outside the scene's times are left out; a single file outside them has no time. Models are
+    compared on a frame's own voxels within the sequence's box.
+
+    Raises:
+        DataError: no file, or no frame within the scene's times.
+    """
+
+    def __init__(self, capture: Capture, path: Path | None = None) -> None:
+        self.capture, self.bounds = capture, torch.from_numpy(capture.bounds).double()
+        self.placement = capture.placement()
+        first, last = capture.clock
+        if path is None:
+            files = list(capture.frames)
+        elif path.is_dir():
+            files = [frame for frame in list_vdb_files(path).frames if first <= frame.number <= last]
+            if not files:
+                raise DataError(f"{path}: no frame from {first} to {last}, which are the scene's")
+        else:
+            numbers = re.findall(r"[0-9]{1,18}", path.stem)  # the last one counts, as in a folder
+            files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]
+        self._files = files
+        self._cached: tuple[int, Medium] | None = None
+        timed = [{"time": torch.tensor(capture.time(f))} if first <= f.number <= last else {} for f in files]
+        self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]
+
+    def medium(self, frame: int) -> Medium:
+        """The medium of a frame's file; the last one is cached, as grids are requested in parts."""
+        if self._cached is None or self._cached[0] != frame:
+            self._cached = (frame, self.capture.medium(self._files[frame]))
+        return self._cached[1]
+
+    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
+        medium = self.medium(frame)
+        if medium.empty:
+            return None
+        inside = np.array(medium.values.shape[:3]) - 2.0  # without the empty layer around it
+        ends = np.stack(np.meshgrid(*np.stack([np.ones(3), inside], -1), indexing="ij"), -1).reshape(-1, 3)
+        corners = ends @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
+        low, high = self.bounds.numpy()
+        box = np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)])
+        return voxels_in_box(box, medium.scene_from_index)
+
+    def grid(
+        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
+    ) -> Tensor:
+        return torch.from_numpy(sample_extinction(self.medium(frame), scene_from_index, shape, component is not None))
+
+    def grid_transform(self, frame: int) -> np.ndarray | None:
+        extinction = self.capture.reader.read(self._files[frame].path).get(self.capture.reader.extinction)
+        return None if extinction is None else extinction.transform
+
+    def open_files(self, path: Path) -> CaptureDensity:
+        return CaptureDensity(self.capture, path)
+
+
+def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
+    """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
+
+    ``sigma_frames`` has the numbers of every compared frame
+    (:func:`~neuprim.core.volumes.density_truth.measure_density_errors`); thirds are means over three of them, evenly
+    spaced. Frames without extinction are left out. If flames add to the extinction of a grid, the same numbers exist
+    for that grid's part: ``density_frames``, ...
+    """
+    result: dict[str, Any] = {}
+    count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD
+    for component in (None, *model.density.components(model.params)):
+        entries: list[dict[str, Any]] = []
+        for t in sorted({int((i + 0.5) * count / compared) for i in range(compared)}):
+            conditions = {"time": torch.tensor(times[t])}
+            errors = measure_density_errors(model, conditions, truth, t, component=component)
+            if errors is not None:
+                entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **errors})
+        name = component or "sigma"
+        result[f"{name}_frames"] = entries
+        for key in DENSITY_ERRORS:
+            for third in THIRDS:
+                values = [e[key] for e in entries if e["third"] == third]
+                result[f"{name}_{key}_{third}"] = float(np.mean(values)) if values else None
+    return result

@@ -318,21 +318,17 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
                 if t >= end:
                     continue
                 ix, iy, iz = _inverse_march_direction(rx), _inverse_march_direction(ry), _inverse_march_direction(rz)
-                i, j, k = (
-                    _first_march_cell(ox, rx, t, nx),
-                    _first_march_cell(oy, ry, t, ny),
-                    _first_march_cell(oz, rz, t, nz),
-                )
+                i = _first_march_cell(ox, rx, t, nx)
+                j = _first_march_cell(oy, ry, t, ny)
+                k = _first_march_cell(oz, rz, t, nz)
                 through = _ONE
                 r, g, b = _ZERO, _ZERO, _ZERO
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
-                    tx, ty, tz = (
-                        _march_cell_exit(ox, ix, i, reach),
-                        _march_cell_exit(oy, iy, j, reach),
-                        _march_cell_exit(oz, iz, k, reach),
-                    )
+                    tx = _march_cell_exit(ox, ix, i, reach)
+                    ty = _march_cell_exit(oy, iy, j, reach)
+                    tz = _march_cell_exit(oz, iz, k, reach)
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
                         o = np.uint64(i) * dx + np.uint64(j) * dy + np.uint64(4 * k)
@@ -412,11 +408,9 @@ def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignor
                 while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and depth < _DARK:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
-                    tx, ty, tz = (
-                        _march_cell_exit(ox, ix, i, reach),
-                        _march_cell_exit(oy, iy, j, reach),
-                        _march_cell_exit(oz, iz, k, reach),
-                    )
+                    tx = _march_cell_exit(ox, ix, i, reach)
+                    ty = _march_cell_exit(oy, iy, j, reach)
+                    tz = _march_cell_exit(oz, iz, k, reach)
                     out = min(tx, min(ty, tz))
                     if skip == 0 and out > t:
                         for point in range(2):

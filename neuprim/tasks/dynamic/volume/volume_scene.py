@@ -28,14 +28,13 @@ from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fiel
 from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.scenes.smoke.smoke_scenes import MAX_TIMESTEPS, Resolution, simulate_smoke
 from neuprim.tasks.dynamic.time_density import ChunkOverlaps, TimeDensity
-from neuprim.tasks.dynamic.volume.capture import Capture, CapturedVdbFrames, hemisphere_capture_cameras
+from neuprim.tasks.dynamic.volume.capture import Capture, CaptureDensity, CapturedVdbFrames, hemisphere_capture_cameras
 from neuprim.tasks.dynamic.volume.capture_dataset import (
     TRAINING_MEMORY,
     TrainingFrames,
     total_extinction_of_vdb_frame,
     volume_dataset,
 )
-from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity
 from neuprim.tasks.dynamic.volume.optics import (
     DATA_DEPENDENT,
     UP_AXES,

@@ -7,11 +7,12 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras import Camera
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.core.render import layout as L
+from neuprim.core.render.cpu.backend import _PreparedFrame
 from neuprim.core.render.layout import TILE
 from tests import scenes
-from tests.core.render.cpu.frames import frame_of
 from tests.numerics.cases import along_z
 from tests.numerics.equivalence import assert_same_frame
 
@@ -75,3 +76,13 @@ def test_it_equals_the_reference_on_either_side(radii: float, near: float) -> No
         needle(0.2, 0.1), along_z(40, 50.0, distance=radii * RADIUS), RenderSettings(depth=True, near=near)
     )
     assert slow.output.alpha.max() > 0.05 or near == 0.9
+
+
+def frame_of(t: dict[str, torch.Tensor], camera: Camera, threads: int = 1) -> _PreparedFrame:
+    leaves = {k: v.clone().requires_grad_() for k, v in t.items()}
+    node = render_lowered(scenes.lowered(leaves), camera, RenderSettings(backend="cpu", threads=threads)).rgb.grad_fn
+    while not hasattr(node, "frame"):
+        assert node is not None
+        node = node.next_functions[0][0]
+    frame: _PreparedFrame = node.frame
+    return frame

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from neuprim.core.compute.warp import array
 from neuprim.core.render import RenderSettings
-from neuprim.core.render.cuda import backend
+from neuprim.core.render.cuda import backward, forward
 from tests import scenes
 from tests.backends import by
 from tests.numerics.equivalence import draw
@@ -85,9 +85,10 @@ def intercept(
     monkeypatch: pytest.MonkeyPatch, wrapped: Callable[[Launch, Any, Any, Sequence[Any], torch.device, int], None]
 ) -> None:
     """Have every launch of the pixel kernels go through ``wrapped(launch, kernel, dim, inputs, device, block)``."""
-    genuine = backend.launch_kernel
+    genuine = forward.launch_kernel
 
     def through(kernel: Any, dim: Any, inputs: Sequence[Any], device: torch.device, block: int = 256) -> None:
         wrapped(genuine, kernel, dim, inputs, device, block)
 
-    monkeypatch.setattr(backend, "launch_kernel", through)
+    for module in (forward, backward):
+        monkeypatch.setattr(module, "launch_kernel", through)

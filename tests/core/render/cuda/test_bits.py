@@ -13,7 +13,7 @@ from torch import Tensor
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
 from neuprim.core.compute import warp
-from neuprim.core.render.cuda import backend, binning, colour_net, frame, prepare_backward
+from neuprim.core.render.cuda import backward, binning, colour_net, forward, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from tests.core.render.cuda.frames import SCENES, Args, Launch, assert_same_bits, everything, intercept
 
@@ -112,15 +112,10 @@ def test_blocks_may_be_of_any_size(
         (together if one else changed).add(called)
         warp.launch_kernel(kernel, dim, inputs, device, block if one else threads)
 
-    for module in (binning, frame, colour_net, backend, prepare_backward):
+    for module in (binning, prepare, colour_net, forward, backward, prepare_backward):
         monkeypatch.setattr(module, "launch_kernel", through)
     assert_same_bits(plain[name], everything(name))
-    assert {
-        "row_spans",
-        "sum_pairs",
-        "_binning_kernels",
-        "_prepare_backward_kernel",
-    } <= changed
+    assert {"row_spans", "sum_pairs", "_binning_kernels", "_prepare_backward_kernel"} <= changed
     assert {"forward_kernel", "pairs_kernel"} <= together
 
 
@@ -144,7 +139,7 @@ def test_what_is_read_was_written(
         def __getattr__(self, name: str) -> Any:
             return getattr(torch, name)
 
-    for module in (backend, binning, frame, colour_net):
+    for module in (forward, backward, binning, prepare, colour_net):
         monkeypatch.setattr(module, "torch", Torch())
     assert_same_bits(plain[name], everything(name))
     assert sum(filled) > 10000

@@ -9,9 +9,13 @@ import torch
 
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
+import pytest
+
+from neuprim.core.errors import BackendUnavailable
 from neuprim.core.render import layout as P
+from neuprim.core.render.cuda import binning
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.frame import Frame
+from neuprim.core.render.cuda.prepare import Frame
 from tests.core.render.cuda.twin import CASES, DEVICES, Array, both, frame_of, numpy, ulps
 
 PLACES = {
@@ -103,3 +107,25 @@ def test_forced_primitives_are_drawn_in_float64(device: str) -> None:
     assert (frame.rows[wanted][:, [L.XU, L.XV], 3] == 0).all(), "float64 does not slide"
     assert torch.equal(frame.rows[~forced], free.rows[~forced])
     assert torch.equal(frame.lists.ids, free.lists.ids)
+
+
+@pytest.mark.parametrize("device", DEVICES)
+@pytest.mark.parametrize("name", CASES)
+def test_lists_are_numbas(name: str, device: str) -> None:
+    numba, frame = both(name, device)
+    theirs, own = numba.lists, frame.lists
+    assert own.pairs == theirs.pairs > 10
+    for found, wanted in (
+        (own.starts, theirs.starts),
+        (own.ids, theirs.ids),
+        (own.first, theirs.first),
+        (own.slots_of, theirs.slots),
+        (own.tile_of, np.repeat(np.arange(len(theirs.starts) - 1), np.diff(theirs.starts))),
+    ):
+        assert found.dtype == torch.int32 and (numpy(found) == wanted).all()
+
+
+def test_more_pairs_than_their_index_can_count_are_refused() -> None:
+    counts = torch.tensor([[2**30, 2**30], [0, 0]], dtype=torch.int32)
+    with pytest.raises(BackendUnavailable, match=r"reach 2147483648 tiles"):
+        binning.count_tiles(counts, torch.tensor([2], dtype=torch.int32))

@@ -14,9 +14,9 @@ from torch import Tensor
 from neuprim.core.cameras import Camera
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu.backend import _rasterizer_view
-from neuprim.core.render.cpu.binning import TileLists, bin_primitives
 from neuprim.core.render.cpu.prepare import PrimitiveArrays, Projected, View, prepare_primitives, prepare_wide
-from neuprim.core.render.cuda.frame import Frame, prepare_frame
+from neuprim.core.render.cpu.tiles import TileLists, bin_primitives
+from neuprim.core.render.cuda.prepare import Frame, prepare_frame
 from neuprim.core.render.layout import NON_FINITE, VISIBLE, min_visible_depth
 from neuprim.core.render.output import RenderStats
 from neuprim.core.render.rasterize import PARAMETERS, RasterRequest
@@ -121,10 +121,8 @@ class Numba:
 def numba_frame(case: Case, t: dict[str, Tensor]) -> Numba:
     parameters = PrimitiveArrays(*(t[name].numpy() for name in PARAMETERS))
     count, K = parameters.W1.shape[:2]
-    projected, view = (
-        Projected.allocate(count, K),
-        _rasterizer_view(case.camera, case.camera.viewmat, case.near, case.turns),
-    )
+    projected = Projected.allocate(count, K)
+    view = _rasterizer_view(case.camera, case.camera.viewmat, case.near, case.turns)
     projected.order[:], projected.rows[:] = 0, 0  # which are not filled for what is too faint
     prepare_primitives(0, count, parameters, view, case.edge, LEAST, projected)
     which = np.flatnonzero(projected.in_float64 & (projected.status == VISIBLE))

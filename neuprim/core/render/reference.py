@@ -79,7 +79,7 @@ class _PreparedPrimitives:
 def render(
     lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw a frame in float64 and return it in the model's dtype; see :data:`neuprim.core.render.draw.Draw`."""
+    """Draw a frame in float64 and return it in the model's dtype; see :data:`neuprim.core.render.output.Draw`."""
     frame = _PreparedPrimitives(lowered, camera)
     count = lowered.geometry.count
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)

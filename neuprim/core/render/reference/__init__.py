@@ -1,1 +1,0 @@
-"""The reference backend: plain torch in float64, with autograd."""

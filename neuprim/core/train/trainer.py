@@ -35,8 +35,7 @@ from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer_state import check_state, hash_training_views, select_state_tensors
 from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_training_view, resolution_factor
 
-MIN_COOLDOWN = 0.02
-"""Smallest factor of the learning rates in a cool-down."""
+MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
 
 
 @dataclass(frozen=True)

@@ -15,7 +15,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.edge import edge_profile
 from neuprim.core.model.gaussian import GaussianDensity
-from neuprim.tasks.relight import visibility
+from neuprim.tasks.relight import colour as light_colour
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
@@ -125,6 +125,6 @@ def test_the_controls_of_conditions(tmp_path: Path) -> None:
 def test_the_script_s_shadows_are_those_of_the_model() -> None:
     """Constants that stand in both languages."""
     text = LightNetwork(2).script()
-    for name, value in (("size", visibility.SIZE), ("layers", visibility.LAYERS)):
+    for name, value in (("size", light_colour.SIZE), ("layers", light_colour.LAYERS)):
         assert f"{name}: {value}" in text
-    assert visibility.BIAS == visibility.SOFTNESS == 1 / 20 and "bias: 1 / 20, softness: 1 / 20" in text
+    assert light_colour.BIAS == light_colour.SOFTNESS == 1 / 20 and "bias: 1 / 20, softness: 1 / 20" in text

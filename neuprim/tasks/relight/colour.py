@@ -6,7 +6,7 @@
     multiplicative   c = V E max(0, albedo (1 + w_out . h))    no tinting: 91 parameters
 
 E is the light's intensity, divided by the squared distance where the dataset says so, over that of a typical training
-light. V is the visibility of the light from the primitive (:mod:`neuprim.tasks.relight.visibility`) or 1. Everything
+light. V is the visibility of the light from the primitive (:func:`light_visibility`) or 1. Everything
 but W_x x~ is constant over a primitive, so it folds into the closed form
 :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
@@ -14,20 +14,36 @@ but W_x x~ is constant over a primitive, so it folds into the closed form
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 
+from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.compute import device
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.cosine import canonicalize_cosines, ellipsoid_cosine_mean, smaller_cosine_neuron_counts
 from neuprim.core.model.edge import sinc
-from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, RayNet, Shading, read_script
+from neuprim.core.model.fields import (
+    ColourField,
+    Conditions,
+    Constant,
+    LoweredDensity,
+    RayNet,
+    Shade,
+    Shading,
+    read_script,
+)
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.model.sh import prunable_sh_coefficients, truncate_sh_bands
+from neuprim.core.render import render_slabs
 from neuprim.core.settings import RenderSettings
 
 FORMS = ("additive", "multiplicative")
@@ -87,10 +103,8 @@ class LightNetwork(ColourField):
         self.visibility, self.boost, self.falloff = visibility, float(boost), bool(falloff)
 
     def settings(self) -> dict[str, Any]:
-        return {
-            name: getattr(self, name)
-            for name in ("hidden", "channels", "form", "visibility", "boost", "falloff", "typical")
-        }
+        names = ("hidden", "channels", "form", "visibility", "boost", "falloff", "typical")
+        return {name: getattr(self, name) for name in names}
 
     def parameters(self) -> list[ParameterSpec]:
         H, C = self.hidden, self.channels
@@ -109,8 +123,6 @@ class LightNetwork(ColourField):
     ) -> Shading | None:
         if self.visibility == "none":
             return None
-        from neuprim.tasks.relight.visibility import light_visibility  # numba, loaded when first needed
-
         visible = light_visibility(geometry, density, conditions["light"], settings)
         return Shading(pixels=visible) if self.visibility == "pixel" else Shading(primitives=visible(geometry.means))
 
@@ -187,15 +199,12 @@ def prune_light_network_units(
     phase, out = boost * params["net_phase"].double(), params["net_out"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
     rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations
-    rates = ((net_x @ rotations) * semi_axes[:, None, :]).norm(dim=-1), view.norm(dim=-1), light.norm(dim=-1)
+    x_rate = ((net_x @ rotations) * semi_axes[:, None, :]).norm(dim=-1)
+    view_rate, light_rate = view.norm(dim=-1), light.norm(dim=-1)
 
     def mean_of(times: int) -> Tensor:
-        return (
-            (times * phase).cos()
-            * ellipsoid_cosine_mean(times * rates[0])
-            * sinc(times * rates[1])
-            * sinc(times * rates[2])
-        )
+        over_ellipsoid = (times * phase).cos() * ellipsoid_cosine_mean(times * x_rate)
+        return over_ellipsoid * sinc(times * view_rate) * sinc(times * light_rate)
 
     mean = mean_of(1)
     variance = (1 + mean_of(2)) / 2 - mean.square()
@@ -257,9 +266,8 @@ class LightHarmonics(ColourField):
         to_light = device.to_device_like(conditions["light"], color) - geometry.means
         squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_light_distance(geometry))
         if self.degree:
-            bands = real_light_harmonics(
-                normalize_direction(to_light, geometry.length_scale.detach()[:, None]), self.degree
-            )
+            size = geometry.length_scale.detach()[:, None]
+            bands = real_light_harmonics(normalize_direction(to_light, size), self.degree)
             color = color + (bands[:, 1:, None] * params["light_sh"]).sum(1)
         strength = device.to_device_like(conditions["light_intensity"], color) / self.typical
         strength = strength / (squared if self.falloff else 1.0)
@@ -310,3 +318,133 @@ def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
 def min_squared_light_distance(geometry: Geometry) -> Tensor:
     """(N, 1) smallest squared distance to a light for falloff."""
     return (_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square()
+
+
+# ---------------------------------------------------------------- visibility
+
+SIZE = 192  # pixels of the depth images, square
+LAYERS = 4  # of equal depth; more of them separate depths better and take longer
+
+BIAS, SOFTNESS = 1 / 20, 1 / 20
+"""In scene diameters, as the light sees the scene: how far behind a depth image light has fallen to a half, and within
+what distance before and after that it fades. Surfaces made of ellipsoids are bumpy: a smaller bias lets the bumps
+shadow each other, a larger one detaches shadows from their casters. With both equal a point on a depth image itself
+keeps all of its light."""
+
+_FAR = 1e3  # scene radii; from there all rays are parallel, and a float32 depth image keeps no digits
+_CHUNK = 1024  # points per unit of work
+
+
+def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor, settings: RenderSettings) -> Shade:
+    """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,), by layered shadow maps.
+
+    The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity
+    A_k and mean depth d_k. The light's transmittance at a point x of depth z is
+
+        V(x) = prod_k (1 - A_k s((z - d_k - bias)/softness)),      s a smooth step from 0 at -1 to 1 at 1,
+
+    exactly 1 where nothing lies in front, and 1 - A behind something of opacity A. One slab, a common shadow map, would
+    know one mean depth per pixel: half way between a translucent thing and the floor below it. Depths are read as
+    inverse depth, weighted by opacity, bilinearly: that is exact on planes, so that a lit floor does not shadow itself
+    at grazing light. V carries no gradient.
+
+    The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of
+    them lie, and points behind it count as lit. ``settings`` are the frame's own: its backend and threads draw the
+    depth images too.
+    """
+    with torch.no_grad():
+        means = geometry.means.detach().double()
+        light = light.detach().double()
+        middle = (means.amin(0) + means.amax(0)) / 2
+        far, largest = (means - middle).norm(dim=-1).max(), geometry.scales.detach().max()
+        *place, far_away, size = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one synchronisation
+        center, light = torch.tensor(place, dtype=torch.float64), light.cpu()
+        radius = far_away + size
+        distance = float((light - center).norm())
+        if distance < 1e-9 * max(radius, 1e-30):
+            return lambda points: torch.ones(len(points), device=points.device)
+        if distance > _FAR * radius:
+            light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
+        focal = 0.5 * SIZE / math.tan(math.asin(min(radius / distance, 0.94)))
+        overhead = abs(float(light[2] - center[2])) >= 0.9 * distance
+        up = torch.tensor([0.0, 1.0, 0.0] if overhead else [0.0, 0.0, 1.0], dtype=torch.float64)
+        camera = Camera(look_at(light, center, up), focal, focal, SIZE / 2, SIZE / 2, SIZE, SIZE)
+        near = max(1e-4 * radius, distance - 1.5 * radius)
+        depths = means @ device.to_device_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
+        low, high = torch.stack([depths.min(), depths.max()]).tolist()
+        edges = torch.linspace(low, high, LAYERS + 1, dtype=torch.float64)
+        slabs = torch.bucketize(depths, device.to_device_like(edges[1:-1], means))
+        own = replace(settings, depth=True, near=near, samples=1)
+        opacities, distances = render_slabs(geometry, density, slabs, LAYERS, camera, own)
+    view, limits = camera.viewmat[:3].contiguous(), (BIAS * 2.0 * radius, SOFTNESS * 2.0 * radius)
+
+    def visibility(points: Tensor) -> Tensor:
+        points = points.detach().double().contiguous()
+        if not device.on_numba(points, opacities):
+            return sample_visibility(
+                points, device.to_device_like(view, points), near, focal, opacities, distances, *limits
+            )
+        found = np.empty(len(points), np.float32)
+        places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy())
+        parallel_for(_visibility_kernel, len(found), _CHUNK, settings.threads, *places, *images, *limits, found)
+        return torch.from_numpy(found)
+
+    return visibility
+
+
+def sample_visibility(
+    points: Tensor,
+    view: Tensor,
+    near: float,
+    focal: float,
+    alphas: Tensor,
+    depths: Tensor,
+    bias: float,
+    softness: float,
+) -> Tensor:
+    """(M,) float32 visibility of ``points`` (M, 3) float64 in torch code, for a GPU: the twin of the kernel below."""
+    nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
+    images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
+    x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
+    ahead = (z > near) & x.isfinite() & y.isfinite() & z.isfinite()
+    scale = 2.0 * focal / alphas.shape[1] / torch.where(ahead, z, 1.0)
+    where = torch.where(ahead[:, None], torch.stack([x * scale, y * scale], -1), 0.0).clamp(-3.0, 3.0)
+    # outside of the images nothing absorbs
+    read = F.grid_sample(images.flatten(0, 1)[None], where[None, None], align_corners=False)[0, :, 0]
+    alpha, inverse_depth = read.unflatten(0, (-1, 2)).unbind(1)
+    behind = z - alpha / inverse_depth.clamp_min(1e-30)
+    s = (0.5 + 0.5 * (behind - bias) / softness).clamp(0.0, 1.0)
+    return torch.where(ahead, (1.0 - alpha * s * s * (3.0 - 2.0 * s)).prod(0), 1.0).float()
+
+
+@exact_kernel
+def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, bias, softness, found):  # type: ignore[no-untyped-def]
+    """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
+    size = alphas.shape[1]
+    for p in range(start, stop):
+        x = view[0, 0] * points[p, 0] + view[0, 1] * points[p, 1] + view[0, 2] * points[p, 2] + view[0, 3]
+        y = view[1, 0] * points[p, 0] + view[1, 1] * points[p, 1] + view[1, 2] * points[p, 2] + view[1, 3]
+        z = view[2, 0] * points[p, 0] + view[2, 1] * points[p, 1] + view[2, 2] * points[p, 2] + view[2, 3]
+        found[p] = 1.0
+        if not z > near:  # behind the light's camera
+            continue
+        # in pixels, 0 the middle of the first
+        u, v = focal * x / z + 0.5 * size - 0.5, focal * y / z + 0.5 * size - 0.5
+        if not (-1.0 < u < size and -1.0 < v < size):
+            continue
+        i, j = int(np.floor(v)), int(np.floor(u))
+        down, right = v - i, u - j
+        arrives = 1.0
+        for k in range(alphas.shape[0]):
+            alpha, nearness = 0.0, 0.0
+            for di in range(2):
+                for dj in range(2):
+                    if 0 <= i + di < size and 0 <= j + dj < size and alphas[k, i + di, j + dj] > 0.0:
+                        own = np.float64(alphas[k, i + di, j + dj])
+                        weight = (down if di else 1.0 - down) * (right if dj else 1.0 - right) * own
+                        alpha += weight
+                        nearness += weight / max(np.float64(depths[k, i + di, j + dj]), near)
+            behind = z - alpha / max(nearness, 1e-30)
+            s = min(max(0.5 + 0.5 * (behind - bias) / softness, 0.0), 1.0)
+            arrives *= 1.0 - alpha * s * s * (3.0 - 2.0 * s)
+        found[p] = arrives

@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.data import Dataset
-from neuprim.core.errors import BackendUnavailable, ConfigError
+from neuprim.core.errors import ConfigError
 from neuprim.core.model import sh
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, Conditions, Constant, DensityField, read_script
@@ -105,14 +105,6 @@ def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], 
     return loader(settings, context)
 
 
-def _load_mesh_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    try:
-        import trimesh  # noqa: F401
-    except ImportError as error:
-        raise BackendUnavailable(f"scene=mesh needs the package trimesh ({error}): pip install trimesh") from error
-    return _load_static_scene("mesh", "load_mesh", settings, context)
-
-
 def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
     """Of generated data, which file they show and where its points are."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
@@ -135,7 +127,9 @@ TASK = TaskSpec(
             partial(_load_static_scene, "datasets", "load_room_dataset"),
         ),
         SceneSpec(
-            "mesh", "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE", _load_mesh_scene
+            "mesh",
+            "your own model, ray-cast: a .glb, .gltf, .obj, .ply or .stl: scene.path=FILE",
+            partial(_load_static_scene, "mesh", "load_mesh"),
         ),
         SceneSpec(
             "blender",

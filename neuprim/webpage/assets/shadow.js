@@ -1,4 +1,4 @@
-// Light that arrives at primitives or points, by depth images out of the light in slabs: neuprim/tasks/relight/visibility.py has the mathematics.
+// Light that arrives at primitives or points, by depth images out of the light in slabs: neuprim/tasks/relight/colour.py has the mathematics.
 const FAR = 1e3; // scene radii
 
 // The light's camera over all living primitives, and the depths between slabs; null where the light is in the middle of everything.

@@ -17,10 +17,17 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.population import split_population
-from neuprim.tasks.relight import visibility
-from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_light_harmonics
+from neuprim.tasks.relight import colour
+from neuprim.tasks.relight.colour import (
+    BIAS,
+    FORMS,
+    SOFTNESS,
+    LightHarmonics,
+    LightNetwork,
+    light_visibility,
+    real_light_harmonics,
+)
 from neuprim.tasks.relight.lighting import parse_light_intensities, parse_light_positions
-from neuprim.tasks.relight.visibility import BIAS, SOFTNESS, light_visibility
 from tests import scenes
 from tests.lit_models import COUNT, light, model
 
@@ -111,7 +118,7 @@ def slabs() -> tuple[Geometry, Cosine]:
 
 
 def test_what_lies_behind_something_is_in_its_shadow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(visibility, "BIAS", 0.0875)
+    monkeypatch.setattr(colour, "BIAS", 0.0875)
     geometry, density = slabs()
     straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS)(geometry.means)
     assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())

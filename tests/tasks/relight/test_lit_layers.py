@@ -13,8 +13,13 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import unproject_rendered_depth
 from neuprim.tasks.relight import TASK
-from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
-from neuprim.tasks.relight.visibility import _visibility_kernel, light_visibility, sample_visibility
+from neuprim.tasks.relight.colour import (
+    LightHarmonics,
+    LightNetwork,
+    _visibility_kernel,
+    light_visibility,
+    sample_visibility,
+)
 from tests import scenes
 from tests.chords import chords
 from tests.lit_models import light, model

@@ -221,12 +221,6 @@ def test_exposure(folder: Path, context: SceneContext) -> None:
     torch.testing.assert_close(dataset.test.pixels(0).alpha, plain.test.pixels(0).alpha)
 
 
-def test_held_out_training_views(folder: Path, context: SceneContext) -> None:
-    (folder / "transforms_test.json").unlink()
-    dataset = read(folder, context, hold_out=2)
-    assert [dataset.test.view(i).name for i in range(len(dataset.test))] == ["r_0", "r_2"] and len(dataset.train) == 1
-
-
 def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:
     for split in ("train", "test"):
         for png in (folder / split).glob("*.png"):
@@ -254,7 +248,6 @@ FRAME = "transforms_train.json: frames[1]"
     ("change", "words"),
     [
         (lambda f: f.pop("pl_pos"), (FRAME, "pl_pos is missing", "point light's position")),
-        (lambda f: f.update(pl_pos=None), (FRAME, "pl_pos is null", "3 numbers")),
         (lambda f: f.update(pl_pos=[1, 2]), (FRAME, "pl_pos is a list of 2")),
         (lambda f: f.update(pl_pos=[1, 2, "x"]), (FRAME, 'pl_pos[2] is "x"', "finite number")),
         (
@@ -262,15 +255,9 @@ FRAME = "transforms_train.json: frames[1]"
             (FRAME, "pl_intensity is a list of 2", "3 numbers of at least 0, or one"),
         ),
         (lambda f: f.update(pl_intensity=-1), (FRAME, "pl_intensity is -1", "at least 0")),
-        (lambda f: f.update(pl_intensity="bright"), (FRAME, "pl_intensity is", "bright")),
         (lambda f: f.pop("transform_matrix"), (FRAME, "transform_matrix is missing")),
-        (
-            lambda f: f.update(transform_matrix=[[2, 0, 0, 0], [0, 2, 0, 0], [0, 0, 2, 0], [0, 0, 0, 1]]),
-            (FRAME, "singular or scaled"),
-        ),
         (lambda f: f.update(file_ext=".npy"), (FRAME, 'file_ext is ".npy"', ".exr")),
         (lambda f: f.update(file_ext=".exr"), ("1 files not found", "./train/r_1.exr")),
-        (lambda f: f.update(file_path="train/absent"), ("1 files not found", "train/absent")),
         (lambda f: f.pop("file_path"), (FRAME, "file_path is missing")),
         (lambda f: f.update(img_path="a/b.png", file_path=None), ("1 files not found", "a/b.png")),
         (lambda f: f.update(file_path="./train/r_0"), ("train/r_0", "listed 2 times")),

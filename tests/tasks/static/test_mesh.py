@@ -20,7 +20,7 @@ from neuprim.scenes.shading import encode_scene_srgb
 from neuprim.tasks.static import mesh as generator
 from neuprim.tasks.static.mesh import MeshSettings, generate_mesh_images, load_mesh
 from neuprim.tasks.static.mesh.model import MeshFolder
-from neuprim.tasks.static.mesh.obj import read_obj
+from neuprim.tasks.static.mesh.obj_ply_stl import read_obj
 from neuprim.tasks.static.mesh.surface import FARTHEST, MeshSurface, MeshTexture, read_surfaces
 from tests.models import BLUE, GREEN, RED, YELLOW, quarters, textured, write_glb, write_obj
 

@@ -132,7 +132,7 @@ def test_more_than_is_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suff
     else:
         data = trimesh.Scene(trimesh.Trimesh(*cube()[:2], process=False)).export(file_type=suffix[1:])
         path.write_bytes(data.encode() if isinstance(data, str) else data)
-    for module in ("gltf", "obj", "ply_stl", "surface"):
+    for module in ("gltf", "obj_ply_stl", "surface"):
         monkeypatch.setattr(f"neuprim.tasks.static.mesh.{module}.{limit}", 11)
     found = refusal(path)
     assert text in found or (suffix == ".stl" and "36 vertices; expected at most 11" in found)

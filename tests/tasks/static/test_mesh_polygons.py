@@ -10,9 +10,8 @@ import pytest
 
 from neuprim.core.errors import DataError
 from neuprim.tasks.static import mesh as generator
-from neuprim.tasks.static.mesh import polygons
-from neuprim.tasks.static.mesh.model import MeshFolder
-from neuprim.tasks.static.mesh.polygons import triangulate_polygons
+from neuprim.tasks.static.mesh import model as polygons
+from neuprim.tasks.static.mesh.model import MeshFolder, triangulate_polygons
 from neuprim.tasks.static.mesh.surface import read_surfaces
 
 U = [(3, 3), (2, 3), (2, 1), (1, 1), (1, 3), (0, 3), (0, 0), (3, 0)]

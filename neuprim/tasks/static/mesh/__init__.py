@@ -24,8 +24,7 @@ from neuprim.scenes.shading import DAYLIGHT, Daylight, scene_daylight_radiance
 from neuprim.scenes.solids import FIELD_OF_VIEW, Radiance, SolidsSettings, describe_solids_images
 from neuprim.tasks.static.mesh.gltf import read_gltf
 from neuprim.tasks.static.mesh.model import MeshFolder, Model, Up, find_model_file
-from neuprim.tasks.static.mesh.obj import read_obj
-from neuprim.tasks.static.mesh.ply_stl import read_ply_mesh, read_stl
+from neuprim.tasks.static.mesh.obj_ply_stl import read_obj, read_ply_mesh, read_stl
 from neuprim.tasks.static.mesh.surface import MeshSurface, read_surfaces
 
 # Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at.

@@ -2,17 +2,13 @@
 
 The density is sampled on a lattice of ``grid`` voxels along the longest side, blurred by ``smooth`` voxels (primitives
 end in a step, which would leave stairs), and contoured by VTK's flying edges (Schroeder et al. 2015). The default level
-is the one whose silhouettes along the three axes agree best with where the model is more than half opaque: for each
-axis, a column of voxels is opaque if its optical depth passes ln 2, and shows matter if its densest voxel passes the
-level. Pieces with less than ``keep`` of the largest piece's area are left out.
+is that of :func:`find_export_surface_level`. Pieces with less than ``keep`` of the largest piece's area are left out.
 
 A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its
-normal.
-Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up already:
-``up=y``, or where the model was fitted to such a mesh), as its readers turn it back, and has what moves it far from the
-origin in its node, as its vertices are float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj
-and linear in .glb, as glTF wants them; they are what the
-task's display shows, or red, green and blue, or grey. Other channels are refused.
+normal. Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up
+already), as its readers turn it back, and has what moves it far from the origin in its node, as its vertices are
+float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them.
+They are what the task's display shows, or red, green and blue, or grey. Other channels are refused.
 
 The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of
 an orbit.
@@ -74,7 +70,13 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     channels = job.run.channels
     hint = f", and task {job.run.task.name!r} has no display that makes these"
     rgb = None if channels.own is not None else find_export_rgb_channels(job.run, hint)
-    contour = _load_export_contouring()
+    try:
+        import pyvista
+    except ImportError as error:
+        needed = f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'"
+        raise BackendUnavailable(needed) from error
+    import trimesh
+
     smooth, keep = job.number("smooth", 0, 4) or 0.0, job.number("keep", 0, 1) or 0.0
     up, turn = job.choice("up", "auto", "z", "y"), job.run.world.rotation
     if up == "auto":  # of the world's axes, the one that is the scene's z
@@ -88,12 +90,14 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     notes = [f"surface at an extinction of {level:.4g} per scene unit" + ", chosen by silhouettes" * (given is None)]
     field = ndimage.gaussian_filter(sigma, smooth) if smooth else sigma
     job.progress("contouring", 0.3)
-    points, faces = contour(field, level)
-    if not len(faces):
+    image = pyvista.ImageData(dimensions=field.shape)
+    image.point_data["sigma"] = field.ravel(order="F")
+    surface = image.contour([level], scalars="sigma", method="flying_edges")
+    if not surface.n_cells:
         densest = f"the densest of the sampled points has {float(field.max()):.4g} per scene unit"
         raise ConfigError(f"level={level:.4g}: no surface; {densest}")
-    import trimesh
-
+    points = np.asarray(surface.points, np.float64)
+    faces = np.asarray(surface.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
     mesh = trimesh.Trimesh(points @ scene_from_index[:3, :3].T + scene_from_index[:3, 3], faces, process=False)
     mesh, dropped = _drop_small_pieces(mesh, keep)
     if mesh.volume < 0:
@@ -105,8 +109,6 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     iou = _compare_exported_silhouettes(job, conditions, mesh)
     _save_mesh(mesh, colours, "srgb" if rgb is None else channels.color_space, path, up, job.run.world)
     notes.append(f"{len(mesh.vertices)} vertices, {len(mesh.faces)} triangles; {dropped} small pieces left out")
-    seen_from = "weighted by density, seen along the normal from outside"
-    notes.append(f"colours: of the primitives around each vertex, {seen_from}")
     if channels.display_text:
         notes.append(f"colours: {channels.display_text}")
     if path.suffix.lower() == ".glb" and up == "z":
@@ -115,25 +117,6 @@ def _write_mesh(job: ExportJob) -> ExportReport:
 
 
 # ---------------------------------------------------------------- surface
-
-
-def _load_export_contouring() -> Any:
-    """Return a function (values (X, Y, Z), level) -> points (V, 3) in indices, triangles (F, 3)."""
-    try:
-        import pyvista
-    except ImportError as error:
-        needed = f"--format mesh needs the package pyvista ({error}): pip install 'neuprim[mesh]'"
-        raise BackendUnavailable(needed) from error
-
-    def contour(values: np.ndarray, level: float) -> tuple[np.ndarray, np.ndarray]:
-        image = pyvista.ImageData(dimensions=values.shape)
-        image.point_data["sigma"] = values.ravel(order="F")
-        surface = image.contour([level], scalars="sigma", method="flying_edges")
-        if not surface.n_cells:
-            return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
-        return np.asarray(surface.points, np.float64), np.asarray(surface.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
-
-    return contour
 
 
 def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:

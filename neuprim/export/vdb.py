@@ -2,15 +2,12 @@
 
 Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below
 ``threshold`` is not stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that
-grid's part is written: what absorbs because it burns is no density. A model that was fitted to .vdb files is written on
-the voxels and in the units of these files, frame by frame, so that both overlay each other, with no value above the
-source frame's largest and nothing outside its active voxels; else in the coordinates of the run's data on cubic voxels
-whose lattice has a corner of its index space in the scene's origin, one lattice for all frames. Axes are those of the
-data; nothing is turned.
+grid's part is written. A model that was fitted to .vdb files is written on the voxels and in the units of these files,
+with no value above the source frame's largest and nothing outside its active voxels; else in the coordinates of the
+run's data on cubic voxels whose lattice has a corner of its index space in the scene's origin, one for all frames.
 
-Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid, as the
-scene's look has it; ``world``: extinction per world unit of the file, what a volume shader multiplies with a length;
-``scene``: extinction per scene unit, sigma itself. Where nothing is known of a world, that is the scene.
+Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid; ``world``:
+extinction per world unit, what a volume shader multiplies with a length; ``scene``: extinction per scene unit, sigma.
 """
 
 from __future__ import annotations
@@ -23,23 +20,20 @@ from typing import NamedTuple
 
 import numpy as np
 import torch
-from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport
-from neuprim.core.io.vdb import VdbGrid, VdbTiles, read_grid, vdb_scale_transform, write_vdb
+from neuprim.core.io.vdb import VdbGrid, VdbTiles, vdb_scale_transform, write_vdb
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.task import API_VERSION
 from neuprim.core.volumes.density_grid import density_grid
 from neuprim.core.volumes.density_truth import (
-    DensityComparison,
     DensityGridPlacement,
     DensityGridSource,
     GridExtent,
     measure_density_errors,
-    split_density_grid_planes,
 )
 from neuprim.export.shared import find_export_box
 
@@ -50,10 +44,6 @@ OPTIONS = {
     "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
     "half": (False, "16-bit floats"),
     "name": ("density", "of the grid"),
-    "source": (
-        True,
-        "whether to look for the files that the model was fitted to: their voxels, and errors against them",
-    ),
 }
 _SLAB_BYTES = 64 * 2**20
 _MOST_VOXELS = 2**34
@@ -69,7 +59,7 @@ class _GridFrame:
 
 
 def _write_vdb_frames(job: ExportJob) -> ExportReport:
-    source, placement, notes = _find_export_source(job, job.flag("source"))
+    source, placement, notes = _find_export_source(job)
     frames = _list_export_frames(job, placement)
     paths = _name_vdb_files(job, frames)
     units = job.choice("units", "auto", "source", "world", "scene")
@@ -88,7 +78,6 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     origin = np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
     fallback = _export_voxel_transform(job, box, scene_from_world, origin)
     sampler = _VdbExportSampler(job, _exported_component(job, placement), scene_from_world, name, factor, threshold)
-    cut = _CutVoxels(0, 0)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -96,51 +85,28 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         transform = None
         if own and source is not None and frame.source is not None:
             transform = source.grid_transform(frame.source)
-        transform = fallback if transform is None else transform
-        grid = sampler.sample_grid(frame.conditions, transform)
+        grid = sampler.sample_grid(frame.conditions, fallback if transform is None else transform)
         if placement is not None and placement.extents:
             extents = placement.extents  # of a time between frames: around all
             extent = GridExtent.around(extents) if frame.source is None else extents[frame.source]
-            grid, more_cut = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
-            cut = _CutVoxels(*(a + b for a, b in zip(cut, more_cut, strict=True)))
+            grid = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
         write_vdb(path, [grid])
         if source is not None and frame.source is not None:
-            errors |= _measure_vdb_errors(job, source, frame, path, scene_from_world, factor)
-    notes += _describe_exported_grid(placement, units, factor, name)
-    if any(cut):
-        above = f"{cut.above} voxels were above the source's largest value and are set to it"
-        notes.append(f"{above}; {cut.outside} outside its bounds are left out")
+            errors |= _measure_vdb_errors(job, source, frame.source, frame.conditions)
+    notes.append(f"grid {name!r} in {units} units: extinction per scene unit = value x {1 / factor:g}")
+    if placement is not None and not placement.exact:
+        notes.append(f"flames absorb, too: written is the part that comes from {placement.grid!r} alone")
     world = "the source's world" if placement else "the coordinates of the run's data"
     where = "the source's own voxels and world" if own else f"cubic voxels in {world}"
     notes.append(f"on {where}; values below {threshold:.3g} are left out")
     if errors and placement is not None:
         notes.append(
             f"errors: the model's extinction from {placement.grid!r} against the files' own values of that grid, "
-            "on all their voxels, as in metrics.json; file_*: what was written against them; psnr_active over voxels "
-            "with matter, max_error as a share of the frame's largest sigma"
+            "on all their voxels, as in metrics.json"
         )
     return ExportReport(tuple(paths), False, errors, tuple(notes))
-
-
-def _describe_exported_grid(placement: DensityGridPlacement | None, units: str, factor: float, name: str) -> list[str]:
-    """Say what the values of the written grid mean."""
-    unit = f"extinction per {units} unit"
-    if units == "source" and placement is not None:
-        unit = f"in the units of the source's grid {placement.grid!r}"
-    notes = [f"grid {name!r} is {unit}: extinction per scene unit = value x {1 / factor:g}; clamped at 0 per primitive"]
-    if placement is not None and not placement.exact:
-        source = repr(placement.grid)
-        notes.append(f"flames absorb, too: written is the part of the extinction that comes from {source} alone")
-    return notes
-
-
-class _CutVoxels(NamedTuple):
-    """How many voxels were above the source's largest value, and outside its bounds."""
-
-    above: int
-    outside: int
 
 
 def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) -> Primitives:
@@ -161,41 +127,35 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
     return model.component(placement.component)
 
 
-def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> tuple[VdbGrid, _CutVoxels]:
-    """Clamp a grid to an extent: no value above its largest, none outside its box; and count what that changed.
+def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> VdbGrid:
+    """Clamp a grid to an extent: no value above its largest, none outside its box; a source value of 1 is ``per_unit``.
 
-    Args:
-        per_unit: what a source value of 1 is in the grid.
+    The extent is that of the source's frame.
     """
-    if not len(grid.origins):
-        return grid, _CutVoxels(0, 0)
     offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
     centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
     inside = np.zeros(grid.masks.shape, bool)
     if extent.box is not None:
         inside = ((centres >= extent.box[0]) & (centres <= extent.box[1])).all(-1)
-    kept, largest = grid.masks & inside, np.float32(extent.largest * per_unit)
-    above = kept & (grid.values > largest)
-    values = np.where(kept, np.minimum(grid.values, largest), np.float32(0))
+    kept = grid.masks & inside
+    values = np.where(kept, np.minimum(grid.values, np.float32(extent.largest * per_unit)), np.float32(0))
     some = kept.any((1, 2, 3))
-    cut = _CutVoxels(int(above.sum()), int((grid.masks & ~inside).sum()))
-    return replace(grid, origins=grid.origins[some], values=values[some], masks=kept[some]), cut
+    return replace(grid, origins=grid.origins[some], values=values[some], masks=kept[some])
 
 
 # ---------------------------------------------------------------- which frames, and where
 
 
 def _find_export_source(
-    job: ExportJob, wanted: bool
+    job: ExportJob,
 ) -> tuple[DensityGridSource | None, DensityGridPlacement | None, list[str]]:
     """Find the scene's files, how the model lies in their world, and notes about it."""
     notes: list[str] = []
     source = None
-    if wanted:
-        try:
-            source = job.run.volume()
-        except NeuprimError as error:
-            notes.append(f"the source's files cannot be read, so neither their voxels nor errors against them: {error}")
+    try:
+        source = job.run.volume()
+    except NeuprimError as error:
+        notes.append(f"the source's files cannot be read, so neither their voxels nor errors against them: {error}")
     record = job.run.header.get("world")
     kept = None
     if isinstance(record, dict) and "grid" in record:
@@ -325,36 +285,13 @@ class _VdbExportSampler(NamedTuple):
 
 
 def _measure_vdb_errors(
-    job: ExportJob,
-    source: DensityGridSource,
-    frame: _GridFrame,
-    path: Path,
-    scene_from_world: np.ndarray,
-    factor: float,
+    job: ExportJob, source: DensityGridSource, frame: int, conditions: Conditions
 ) -> dict[str, float]:
-    """Compare the model and the written file with the source, on the source's own voxels."""
-    assert frame.source is not None
+    """Compare the model with a frame of the source, on the source's own voxels."""
     settings = job.run.settings
-    component = None if source.placement.exact else source.placement.component
-    part: dict[str, str] = {} if component is None else {"component": component}
-    found = measure_density_errors(job.run.model, frame.conditions, source, frame.source, settings.threads, **part)
-    place = source.points(frame.source)
-    if found is None or place is None:
-        return {}
-    name = f"frame_{source.placement.numbers[frame.source]:04d}"
-    result = {f"{name}.{key}": value for key, value in found.items()}
-    grid, written = read_grid(path, str(job.options["name"])), DensityComparison()
-    if grid.bounds is None:
-        return result
-    dense = grid.to_dense()
-    for matrix, shape in split_density_grid_planes(*place):
-        chain = np.linalg.inv(scene_from_world @ grid.transform) @ matrix.numpy()
-        offset = chain[:3, 3] - np.array(grid.bounds[0])
-        values = ndimage.affine_transform(dense, chain[:3, :3], offset, shape, order=1, mode="grid-constant") / factor
-        written.add_block(source.grid(frame.source, matrix, shape, **part).numpy(), values)
-    numbers = written.errors()
-    assert numbers is not None
-    return result | {f"{name}.file_{key}": value for key, value in numbers.items()}
+    part = {} if source.placement.exact else {"component": source.placement.component}
+    found = measure_density_errors(job.run.model, conditions, source, frame, settings.threads, **part)
+    return {f"frame_{source.placement.numbers[frame]:04d}.{key}": value for key, value in (found or {}).items()}
 
 
 EXPORTER = Exporter(

@@ -99,9 +99,6 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
         assert {key: report.errors[f"{name}.{key}"] for key in DENSITY_ERRORS} == {
             key: entry[key] for key in DENSITY_ERRORS
         }
-        # on the very voxels of the file: missing in it is what is faint, above the source's peak or outside its bounds
-        assert report.errors[f"{name}.file_relative_l2"] <= entry["relative_l2"] + 1e-3
-        assert report.errors[f"{name}.file_max_error"] <= entry["max_error"] + 1e-3
 
 
 def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 import math
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -19,7 +21,7 @@ from neuprim.tasks.dynamic import TASK as DYNAMIC
 from neuprim.tasks.relight import TASK as RELIGHT
 from neuprim.webpage import Condition, PageScene, PageView, WebPage, make_model_webpage
 
-__all__ = ["LIGHT", "SETTINGS", "camera_at", "page_of", "random_model"]
+__all__ = ["LIGHT", "SETTINGS", "camera_at", "header_of", "page_of", "random_model"]
 
 SETTINGS = RenderSettings(alpha_min=0.0, transmittance_min=0.0)
 """Without cuts: pairs at the edge of one fall on either side, and blending cannot stop early."""
@@ -72,3 +74,11 @@ def page_of(
     page = make_model_webpage(name, model, (0, 1, 2), settings, PageScene(conditions=given, views=views, **more), level)
     path.write_text(page.text, encoding="utf-8")
     return page
+
+
+def header_of(text: str) -> dict[str, Any]:
+    """The facts that a page holds beside its numbers."""
+    found = re.search(r'<script id="page" type="application/json">(.*?)</script>', text, re.DOTALL)
+    assert found
+    header: dict[str, Any] = json.loads(found[1])
+    return header

@@ -4,11 +4,9 @@ report."""
 from __future__ import annotations
 
 import html
-import json
 import math
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -20,14 +18,9 @@ from neuprim.tasks.dynamic import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.webpage.model_page import held_out_webpage_views
 from tests.core import tiny
-from tests.page_models import random_model
+from tests.page_models import header_of, random_model
 from tests.plugins import marked
 from tests.short_runs import fit, words
-
-
-@pytest.fixture(scope="module")
-def run_dir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return marked.static_run(tmp_path_factory.mktemp("runs") / "marked <run>")
 
 
 @pytest.fixture(scope="module")
@@ -36,19 +29,11 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return fit(words(tiny.write_blender(folder / "scene"), folder / "run", 20))
 
 
-def header_of(text: str) -> dict[str, Any]:
-    found = re.search(r'<script id="page" type="application/json">(.*?)</script>', text, re.DOTALL)
-    assert found
-    header: dict[str, Any] = json.loads(found[1])
-    return header
-
-
 def test_a_run_with_its_data(trained: Path, tmp_path: Path) -> None:
     report = export_run(trained, "html", tmp_path / "p.html", ["views=2"])
     header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
-    assert len(header["views"]) == 2 and all(
-        view["truth"].startswith("data:image/webp;base64,") for view in header["views"]
-    )
+    assert len(header["views"]) == 2
+    assert all(view["truth"].startswith("data:image/webp;base64,") for view in header["views"])
     assert header["home"] == header["views"][0]["camera"] and header["count"] == 40
     assert not report.lossless and report.errors["psnr"] > 50
     assert any("MB" in note for note in report.notes)
@@ -116,39 +101,6 @@ def test_a_run_without_its_data(trained: Path, tmp_path: Path) -> None:
     assert any(note.startswith("no held-out cameras: ") and "gone" in note for note in report.notes)
     header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
     assert header["views"] == [] and report.errors["psnr"] > 50
-
-
-def test_conditions_begin_where_asked(tmp_path: Path) -> None:
-    run = marked.dynamic_run(tmp_path / "run", marked.write_sequence(tmp_path / "vdb"))
-    for given, time in (([], 0.5), (["time=0.25"], 0.25)):
-        export_run(run, "html", tmp_path / f"{time}.html", [*given, "views=0"])
-        (found,) = header_of((tmp_path / f"{time}.html").read_text(encoding="utf-8"))["conditions"]
-        assert (found["name"], found["value"], found["range"]) == ("time", time, [0.0, 1.0])
-
-
-def test_other_orders_and_samples_are_said(run_dir: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "copy"
-    copy.mkdir()
-    text = (run_dir / "config.yaml").read_text(encoding="utf-8").replace("sort: center", "sort: entry")
-    (copy / "config.yaml").write_text(text, encoding="utf-8")
-    (copy / "model.safetensors").write_bytes((run_dir / "model.safetensors").read_bytes())
-    notes = export_run(copy, "html", tmp_path / "p.html", ["views=0"]).notes
-    assert any("sort=entry" in note and "by centres" in note for note in notes)
-
-
-def test_a_name_of_strangers_is_text(run_dir: Path, tmp_path: Path) -> None:
-    export_run(run_dir, "html", tmp_path / "p.html", ["views=0"])
-    page = (tmp_path / "p.html").read_text(encoding="utf-8")
-    assert "<title>marked &lt;run&gt;</title>" in page and "marked <run>" not in page
-
-
-def test_a_damaged_header_has_an_upward_axis_all_the_same(tmp_path: Path) -> None:
-    for k, up in enumerate(([0, 0, 0], [1, None, 2])):
-        run = marked.write_run(
-            tmp_path / f"run{k}", marked.static_model(), ["task=static", "scene=solids"], data={"up": up}
-        )
-        export_run(run, "html", tmp_path / f"{k}.html", ["views=0"])
-        assert header_of((tmp_path / f"{k}.html").read_text(encoding="utf-8"))["up"] == [0.0, 0.0, 1.0]
 
 
 # ---------------------------------------------------------------- in the report

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import subprocess
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from neuprim.core.errors import BackendUnavailable
 from neuprim.inspect import window
 from neuprim.inspect.window import prepare_headless
 from neuprim.runs.inspect import InspectRequest, inspect_run
+from tests.browsers import executable
 from tests.plugins import runs
 
 pytest.importorskip("pyvista", exc_type=ImportError)
@@ -88,47 +88,39 @@ def test_the_slider_draws_the_frame_it_comes_to(run_dir: Path, tmp_path: Path, m
     monkeypatch.setattr(window.Window, "interact", interact)
     monkeypatch.setattr("neuprim.runs.inspect.has_display", lambda: True)
     plain = window.Window.__init__
-    monkeypatch.setattr(
-        window.Window, "__init__", lambda self, panels, up, off, size=None: plain(self, panels, up, True, (240, 200))
-    )
+    small = lambda self, panels, up, off, size=None: plain(self, panels, up, True, (240, 200))  # noqa: E731
+    monkeypatch.setattr(window.Window, "__init__", small)
     assert look(run_dir, conditions={"time": "0,1"}) == []
     assert found[1] - found[0] > 15
 
 
 @pytest.mark.slow
 def test_the_page_works_in_a_browser_without_a_network(run_dir: Path, tmp_path: Path) -> None:
-    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
-    if browser is None:
-        pytest.skip("no Chromium to open the page with")
+    browser = executable()
     words = {"conditions": {"time": "0,1"}, "against": str(run_dir.parent / "files"), "show": ["volume", "primitives"]}
     (page,) = look(run_dir, out=tmp_path / "p.html", **words)
 
-    def shot(part: str, opened: Path | None = None) -> np.ndarray:
+    def shot(part: str, opened: Path = page) -> np.ndarray:
         picture = tmp_path / "shot.png"
         picture.unlink(missing_ok=True)
-        flags = [
-            "--headless",
-            "--no-sandbox",
-            "--disable-background-networking",
+        flags = ["--headless", "--no-sandbox", "--disable-background-networking", "--window-size=800,500"]
+        flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
+        flags += [
+            "--proxy-server=127.0.0.1:9",
+            "--virtual-time-budget=10000",
             f"--user-data-dir={tmp_path / 'profile'}",
         ]
-        flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=800,500"]
-        flags += ["--proxy-server=127.0.0.1:9", "--virtual-time-budget=10000", f"--screenshot={picture}"]
-        subprocess.run(
-            [browser, *flags, f"{(opened or page).as_uri()}#{part}"], check=True, capture_output=True, timeout=180
-        )
+        command = [browser, *flags, f"--screenshot={picture}", f"{opened.as_uri()}#{part}"]
+        subprocess.run(command, check=True, capture_output=True, timeout=180)
         return pixels(picture)
 
     first, last = shot("frame=0"), shot("frame=1")
     assert colourful(first[80:400]) > 1000, "the canvas is not blank"
     assert np.abs(first - last)[80:400].max() > 60
-    moved, hand = (
-        tmp_path / "moved.html",
-        'const s = document.getElementById("frame"); s.value = 1; s.dispatchEvent(new Event("input"));',
-    )
-    moved.write_text(
-        page.read_text().replace("</body>", f"<script>setTimeout(() => {{ {hand} }}, 1000)</script></body>")
-    )
+    moved = tmp_path / "moved.html"
+    hand = 'const s = document.getElementById("frame"); s.value = 1; s.dispatchEvent(new Event("input"));'
+    script = f"<script>setTimeout(() => {{ {hand} }}, 1000)</script></body>"
+    moved.write_text(page.read_text().replace("</body>", script))
     by_hand = shot("frame=0", moved)
     assert np.abs(by_hand - last).max() < 20 < np.abs(by_hand - first).max(), "the slider moves"
     for part in ("view=isosurface", "view=slices", "view=primitives"):

@@ -3,7 +3,6 @@ browser."""
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Any
@@ -19,15 +18,8 @@ from neuprim.tasks.relight import colour as light_colour
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
-from neuprim.webpage.model_page import pack_webpage_model, shader_constants
-from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
-
-
-def header_of(text: str) -> dict[str, Any]:
-    found = re.search(r'<script id="page" type="application/json">(.*?)</script>', text, re.DOTALL)
-    assert found
-    header: dict[str, Any] = json.loads(found[1])
-    return header
+from neuprim.webpage.model_page import pack_webpage_model, shader_constants, stored_up_axis
+from tests.page_models import LIGHT, SETTINGS, camera_at, header_of, page_of, random_model
 
 
 def test_what_a_level_keeps(tmp_path: Path) -> None:
@@ -62,9 +54,7 @@ def test_polynomials_are_good_to_float32(edge: int) -> None:
 
 
 def test_a_field_without_a_script_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(
-        ConfigError, match="density field GaussianDensity has no script for browsers; a page cannot show it"
-    ):
+    with pytest.raises(ConfigError, match="density field GaussianDensity has no script for browsers"):
         page_of(random_model(GaussianDensity(), SphericalHarmonics(0)), tmp_path / "p.html")
 
 
@@ -81,14 +71,9 @@ def test_names_do_not_become_parts_of_the_page(tmp_path: Path) -> None:
     """Neither by HTML nor by the marks that parts are put in place of."""
     hostile = "</script><script>alert(1)</script>@numbers@"
     views = [PageView(hostile, camera_at((0.3, -3.0, 1.0)), {})]
-    page = page_of(
-        random_model(CosineDensity(1), SphericalHarmonics(0)),
-        tmp_path / "p.html",
-        name=hostile,
-        subtitle=hostile,
-        views=views,
-    )
-    plain = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "q.html")
+    model = random_model(CosineDensity(1), SphericalHarmonics(0))
+    page = page_of(model, tmp_path / "p.html", name=hostile, subtitle=hostile, views=views)
+    plain = page_of(model, tmp_path / "q.html")
     assert page.text.count("<script") == plain.text.count("<script") == 4
     assert page.text.count("</script>") == plain.text.count("</script>")
     assert header_of(page.text)["views"][0]["name"] == hostile
@@ -98,21 +83,21 @@ def test_names_do_not_become_parts_of_the_page(tmp_path: Path) -> None:
 def test_the_policy_lets_nothing_else_run_or_load(tmp_path: Path) -> None:
     text = page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html").text
     policy = re.search(r'Content-Security-Policy" content="(.*?)"', text)
-    assert (
-        policy
-        and policy[1].startswith("default-src 'none'; script-src 'nonce-")
-        and "unsafe-inline" not in policy[1].split("style-src")[0]
-    )
+    assert policy and policy[1].startswith("default-src 'none'; script-src 'nonce-")
+    assert "unsafe-inline" not in policy[1].split("style-src")[0]
     assert "http:" not in text and "https:" not in text
     assert not re.search(r"<(script|link|img|iframe)[^>]*\s(src|href)=[\"'](?!data:|\")", text)
 
 
 def test_pages_are_the_same_bytes_again(tmp_path: Path) -> None:
-    made = [
-        page_of(random_model(CosineDensity(2), SphericalHarmonics(1)), tmp_path / "p.html", level=2).text
-        for _ in range(2)
-    ]
-    assert made[0] == made[1]
+    model = random_model(CosineDensity(2), SphericalHarmonics(1))
+    assert page_of(model, tmp_path / "p.html", level=2).text == page_of(model, tmp_path / "q.html", level=2).text
+
+
+def test_a_damaged_header_has_an_upward_axis_all_the_same() -> None:
+    for up in ([0, 0, 0], [1, None, 2], [1, 2], "z", [float("nan"), 0, 0]):
+        assert stored_up_axis({"data": {"up": up}}) == (0.0, 0.0, 1.0)
+    assert stored_up_axis({"data": {"up": [0, -1, 0]}}) == (0.0, -1.0, 0.0) and stored_up_axis({}) == (0.0, 0.0, 1.0)
 
 
 def test_the_controls_of_conditions(tmp_path: Path) -> None:

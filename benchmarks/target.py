@@ -35,7 +35,7 @@ from shared.tables import DOCS, RESULTS, Run, Table, between_markers, make_table
 from neuprim.config import Job, compose, load_config_task
 from neuprim.config.command_settings import SearchTarget
 from neuprim.core.checkpoint import load_model_checkpoint, save_compressed
-from neuprim.core.compression import DEFAULT_LEVEL, bit_table
+from neuprim.core.compression.quantizers import DEFAULT_LEVEL, bit_table
 from neuprim.core.compute.threads import cpu_name
 from neuprim.runs.fit import Event, Note
 from neuprim.runs.open import load_dataset

@@ -7,7 +7,8 @@ from collections.abc import Callable
 import torch
 from torch import Tensor
 
-from neuprim.core.compression import BitTable, Quantizers, canonical_model, fit_quantizers, storage_order
+from neuprim.core.compression.codec import Quantizers, canonical_model, fit_quantizers, storage_order
+from neuprim.core.compression.quantizers import BitTable
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import ColourField, DensityField, prunable_units_of_model
 from neuprim.core.model.gaussian import GaussianDensity

@@ -47,7 +47,8 @@ from neuprim.conformance.task_under_test import (
 )
 from neuprim.core import checkpoint
 from neuprim.core.channels import find_channels
-from neuprim.core.compression import LEVELS, canonical_model
+from neuprim.core.compression.codec import canonical_model
+from neuprim.core.compression.quantizers import LEVELS
 from neuprim.core.errors import ConfigError, FormError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.geometry import GEOMETRY_SPECS

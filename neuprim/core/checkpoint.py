@@ -17,7 +17,17 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
 
-from neuprim.core import compression
+from neuprim.core.compression.codec import (
+    Quantizers,
+    StoredSize,
+    canonical_model,
+    encode_sections,
+    fit_quantizers,
+    format_quantizer_bits,
+)
+from neuprim.core.compression.file import CONFIG, is_compressed, read_compressed, read_model_header, write_compressed
+from neuprim.core.compression.quantizers import BitTable
+from neuprim.core.compression.sections import TEXT, CompressedSection
 from neuprim.core.errors import CheckpointError, cut_error_text, nearest
 from neuprim.core.io.files import atomic_path
 from neuprim.core.io.json_reader import finite_json_number, load_json
@@ -50,8 +60,8 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     Raises:
         CheckpointError: missing, truncated, foreign or of another format version.
     """
-    if compression.is_compressed(path):
-        return _check_model_header(path, compression.read_model_header(path), kind)
+    if is_compressed(path):
+        return _check_model_header(path, read_model_header(path), kind)
     try:
         with safe_open(str(path), framework="pt") as file:
             metadata = file.metadata() or {}
@@ -105,8 +115,8 @@ def read_tensors(
     Args:
         rows: of a tensor's name and shape, those to read; None for all.
     """
-    if compression.is_compressed(path):
-        header, tensors, _ = compression.read_compressed(path)
+    if is_compressed(path):
+        header, tensors, _ = read_compressed(path)
         return _check_model_header(path, header, kind), tensors
     header = read_header(path, kind)
     try:
@@ -142,36 +152,31 @@ def save_compressed(
     model: Primitives,
     task: str,
     extra: Mapping[str, Any],
-    bits: compression.BitTable | compression.Quantizers,
+    bits: BitTable | Quantizers,
     config: str | None = None,
-) -> dict[str, compression.StoredSize]:
+) -> dict[str, StoredSize]:
     """As :func:`save_model`, in few bits; returns what the file has of every parameter.
 
     Args:
         bits: how many, or how the numbers of a model that is folded are coded.
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
     """
-    if isinstance(bits, compression.BitTable):
-        model = compression.canonical_model(model)
-        made = compression.fit_quantizers(model, bits)
+    if isinstance(bits, BitTable):
+        model = canonical_model(model)
+        made = fit_quantizers(model, bits)
     else:
         made = bits
-    sections = compression.encode_sections(model, made)
+    sections = encode_sections(model, made)
     if config is not None:
-        sections.insert(
-            0, compression.CompressedSection(compression.CONFIG, compression.TEXT, (), planes=(config.encode(),))
-        )
+        sections.insert(0, CompressedSection(CONFIG, TEXT, (), planes=(config.encode(),)))
     header = {"format": FORMAT, "kind": "model", **model_header(model, task, extra)}
-    sizes = compression.write_compressed(path, header, model.count, sections)
-    return {
-        name: compression.StoredSize(compression.format_quantizer_bits(scheme), sizes[name])
-        for name, scheme in made.items()
-    }
+    sizes = write_compressed(path, header, model.count, sections)
+    return {name: StoredSize(format_quantizer_bits(scheme), sizes[name]) for name, scheme in made.items()}
 
 
 def checkpoint_config(path: Path) -> str | None:
     """Return the text of the ``config.yaml`` in a compressed model; None where it has none."""
-    return compression.read_compressed(path)[2]
+    return read_compressed(path)[2]
 
 
 def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict[str, Any]:

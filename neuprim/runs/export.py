@@ -13,7 +13,7 @@ from typing import Any
 import torch
 
 from neuprim.core import checkpoint
-from neuprim.core.compression import is_compressed
+from neuprim.core.compression.file import is_compressed
 from neuprim.core.conditions import condition_flag, named, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel

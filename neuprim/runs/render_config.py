@@ -27,7 +27,7 @@ from neuprim.core.cameras.pinhole import AnyCamera, camera_exr_attributes
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
 from neuprim.core.checkpoint import read_header
-from neuprim.core.compression import is_compressed
+from neuprim.core.compression.file import is_compressed
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.io.exr import ExrChannel, write_exr_layers

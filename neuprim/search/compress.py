@@ -12,16 +12,14 @@ from typing import NamedTuple
 
 from neuprim.config import Job, RunConfig
 from neuprim.core.checkpoint import load_model_checkpoint, read_header_extra, save_compressed
-from neuprim.core.compression import (
-    DEFAULT_LEVEL,
-    BitTable,
+from neuprim.core.compression.codec import (
     Quantizers,
-    bit_table,
     canonical_model,
     fake_quantize,
     fit_quantizers,
     fit_quantizers_to_error,
 )
+from neuprim.core.compression.quantizers import DEFAULT_LEVEL, BitTable, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset_check import check_dataset_views
 from neuprim.core.errors import ConfigError, NeuprimError
@@ -57,10 +55,10 @@ class CompressRequest:
     """What to compress.
 
     Unless a level or bits are given, training views decide how coarse every number may be, within ``tolerance``.
-    Without the run's data the level is :data:`~neuprim.core.compression.DEFAULT_LEVEL`.
+    Without the run's data the level is :data:`~neuprim.core.compression.quantizers.DEFAULT_LEVEL`.
 
     Attributes:
-        level: 1 (nearly lossless) to 5 (very small), see :data:`neuprim.core.compression.LEVELS`.
+        level: 1 (nearly lossless) to 5 (very small), see :data:`neuprim.core.compression.quantizers.LEVELS`.
         bits: overrides NAME=BITS of a level.
         out: the file; None for ``model.neuprim`` in the run directory.
         overwrite: whether an existing file may be replaced.

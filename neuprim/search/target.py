@@ -19,7 +19,7 @@ import torch
 from neuprim.config import Job, RunConfig, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings, SearchTarget
 from neuprim.core.checkpoint import load_model_checkpoint, read_header_extra, save_compressed
-from neuprim.core.compression import Quantizers
+from neuprim.core.compression.codec import Quantizers
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset_views

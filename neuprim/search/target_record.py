@@ -11,7 +11,7 @@ from typing import Any, Literal
 from neuprim.config import RunConfig, load_config_task
 from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.checkpoint import load_model_checkpoint, save_compressed
-from neuprim.core.compression import DEFAULT_LEVEL, bit_table
+from neuprim.core.compression.quantizers import DEFAULT_LEVEL, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.io.files import read_json_record, write_json
 from neuprim.core.task import TaskSpec

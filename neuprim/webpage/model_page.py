@@ -21,8 +21,8 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, orbit
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels
-from neuprim.core.compression import bit_table, canonical_model, fit_quantizers, storage_order
-from neuprim.core.compression.quantizers import RotationQuantizer
+from neuprim.core.compression.codec import canonical_model, fit_quantizers, storage_order
+from neuprim.core.compression.quantizers import RotationQuantizer, bit_table
 from neuprim.core.compression.sections import COLUMNS, ROTATIONS, pack_section
 from neuprim.core.conditions import FRAMES
 from neuprim.core.data import Dataset

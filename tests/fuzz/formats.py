@@ -313,7 +313,7 @@ def _run(folder: Path) -> None:
 
 def _compressed(folder: Path) -> None:
     from neuprim.core import checkpoint
-    from neuprim.core.compression import LEVELS
+    from neuprim.core.compression.quantizers import LEVELS
     from tests.compressing import example, without_pieces
 
     for name, model in (("whole", example("static", 20)[1]), ("pruned", without_pieces(example("static", 20)[1]))):

@@ -16,7 +16,7 @@ import trimesh
 from neuprim.core import checkpoint
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.world import World
-from neuprim.core.compression import LEVELS
+from neuprim.core.compression.quantizers import LEVELS
 from neuprim.core.data.points_file import read_points
 from neuprim.core.errors import CheckpointError, DataError
 from neuprim.core.io.ply import read_ply

@@ -12,7 +12,7 @@ import torch
 
 from neuprim.cli import main
 from neuprim.core import checkpoint
-from neuprim.core.compression import LEVELS
+from neuprim.core.compression.quantizers import LEVELS
 from neuprim.core.errors import CheckpointError, ConfigError, DataError
 from neuprim.runs.export import import_run_directory
 from neuprim.runs.measure import evaluate_run

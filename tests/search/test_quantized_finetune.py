@@ -9,8 +9,8 @@ import pytest
 import torch
 
 from neuprim.config import Job
-from neuprim.core.compression import Quantizers, bit_table, canonical_model, fit_quantizers
-from neuprim.core.compression.quantizers import ColumnQuantizer
+from neuprim.core.compression.codec import Quantizers, canonical_model, fit_quantizers
+from neuprim.core.compression.quantizers import ColumnQuantizer, bit_table
 from neuprim.core.data import Dataset
 from neuprim.core.model.primitives import Primitives
 from neuprim.runs.open import load_dataset, load_run

@@ -12,16 +12,9 @@ import torch
 
 import neuprim.core.compression.codec as codec
 from neuprim.core import checkpoint
-from neuprim.core.compression import (
-    LEVELS,
-    bit_table,
-    canonical_model,
-    fake_quantize,
-    fit_quantizers,
-    fit_quantizers_to_error,
-    read_compressed,
-)
-from neuprim.core.compression.quantizers import ColumnQuantizer
+from neuprim.core.compression.codec import canonical_model, fake_quantize, fit_quantizers, fit_quantizers_to_error
+from neuprim.core.compression.file import read_compressed
+from neuprim.core.compression.quantizers import LEVELS, ColumnQuantizer, bit_table
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives

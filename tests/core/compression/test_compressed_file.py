@@ -20,7 +20,9 @@ import pytest
 import zstandard
 
 from neuprim.core import checkpoint
-from neuprim.core.compression import CONFIG, LEVELS, CompressedSection, is_compressed, write_compressed
+from neuprim.core.compression.file import CONFIG, is_compressed, write_compressed
+from neuprim.core.compression.quantizers import LEVELS
+from neuprim.core.compression.sections import CompressedSection
 from neuprim.core.errors import CheckpointError
 from neuprim.tasks.static import TASK
 from tests.compressing import example

@@ -24,7 +24,7 @@ from neuprim.core.task import Loss
 from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
-from neuprim.core.train.trainer_state import hash_training_views
+from neuprim.core.train.training_views import hash_training_views
 
 _ALIGNMENT = 16
 """Numbers; tensors start at multiples of 64 bytes, which vector units read at once."""

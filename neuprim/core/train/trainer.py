@@ -32,8 +32,14 @@ from neuprim.core.train.losses import MaxScreenSize, PointLossResult, point_loss
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.population import PopulationChange, make_population
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.train.trainer_state import check_state, hash_training_views, select_state_tensors
-from neuprim.core.train.training_views import Exposures, Prefetcher, reduce_training_view, resolution_factor
+from neuprim.core.train.trainer_state import check_state, select_state_tensors
+from neuprim.core.train.training_views import (
+    Exposures,
+    Prefetcher,
+    hash_training_views,
+    reduce_training_view,
+    resolution_factor,
+)
 
 MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
 

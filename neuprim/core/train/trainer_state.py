@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -10,14 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.data import ViewSet
 from neuprim.core.errors import CheckpointError
-
-
-def hash_training_views(views: ViewSet) -> str:
-    """Hash the names of views: other frames or images of the same number are other data."""
-    text = "\n".join(views.view(i).name for i in range(len(views)))
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import math
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -11,7 +12,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from neuprim.core.data import Pixels, View
+from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.data.image_views import average_pixels, reduce_image_mask
 
 _MIN_SIDE = 16
@@ -76,6 +77,12 @@ def reduce_training_view(view: View, pixels: Pixels, factor: int) -> tuple[View,
     alpha = None if pixels.alpha is None else average_pixels(pixels.alpha[..., None], factor)[..., 0]
     mask = None if pixels.mask is None else reduce_image_mask(pixels.mask, factor)
     return replace(view, camera=camera.reduced(factor)), Pixels(average_pixels(pixels.rgb, factor), alpha, mask)
+
+
+def hash_training_views(views: ViewSet) -> str:
+    """Hash the names of views: other frames or images of the same number are other data."""
+    text = "\n".join(views.view(i).name for i in range(len(views)))
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class Exposures:

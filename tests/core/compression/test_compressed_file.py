@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import math
 import os
@@ -25,8 +26,10 @@ from neuprim.core.compression.quantizers import LEVELS
 from neuprim.core.compression.sections import CompressedSection
 from neuprim.core.errors import CheckpointError
 from neuprim.tasks.static import TASK
-from tests.compressing import example
+from tests.compressing import FIELDS, example
 from tests.systems import posix
+
+CONFIG_TEXT = "task: static\nnote: naïve\n"
 
 
 def refused(path: Path, *words: str) -> str:
@@ -42,7 +45,100 @@ def refused(path: Path, *words: str) -> str:
     return message
 
 
-# ---------------------------------------------------------------- another writer, from docs/data_formats.md alone
+# ---------------------------------------------------------------- another reader, and another writer, from
+# docs/data_formats.md alone
+
+
+def table_rows(table: bytes, sections: int) -> list[dict[str, Any]]:
+    rows, at = [], 0
+    for _ in range(sections):
+        length = table[at]
+        name = table[at + 1 : at + 1 + length].decode()
+        at += 1 + length
+        coding, packing, dimensions = table[at : at + 3]
+        shape = struct.unpack_from(f"<{dimensions}I", table, at + 3)
+        at += 3 + 4 * dimensions
+        numbers = (coding, packing, shape, *struct.unpack_from("<QQI", table, at))
+        at += 20
+        keys = ("name", "coding", "packing", "shape", "planes", "size", "crc")
+        rows.append(dict(zip(keys, (name, *numbers), strict=True)))
+    assert at == len(table)
+    return rows
+
+
+def read_by_the_book(data: bytes) -> tuple[dict[str, Any], dict[str, np.ndarray], str]:
+    assert data[:8] == bytes.fromhex("894E45555052494D")
+    version, sections, count, header_size, table_size, crc = struct.unpack_from("<IIQIII", data, 8)
+    body = 36 + header_size
+    assert version == 1 and crc == zlib.crc32(data[8:32] + data[36 : body + table_size])
+    header, at, text = json.loads(data[36:body]), body + table_size, ""
+    found: dict[str, np.ndarray] = {}
+    masks: list[list[int]] = []
+    for row in table_rows(data[body:at], sections):
+        part, at = data[at : at + row["size"]], at + row["size"]
+        assert zlib.crc32(part) == row["crc"]
+        columns = math.prod(row["shape"])
+        split = {0: 0, 1: 9 * columns, 2: 27, 3: 1, 4: 0, 5: 11 * columns}[row["coding"]]
+        head, packed = part[:split], part[split:]
+        content = zstandard.ZstdDecompressor().decompress(packed) if row["packing"] else packed
+        assert len(content) == row["planes"]
+        if row["coding"] == 0:
+            text = content.decode()
+            continue
+        if row["coding"] == 4:
+            width = -(-count // 8)
+            for k in range(columns):
+                mask = content[k * width : (k + 1) * width]
+                masks.append([n for n in range(count) if mask[n // 8] >> n % 8 & 1])
+            continue
+        stream = io.BytesIO(content)
+
+        def codes(bits: int, rows: int = count, stream: io.BytesIO = stream) -> np.ndarray:
+            planes = [np.frombuffer(stream.read(rows), np.uint8).astype(object) for _ in range(-(-bits // 8))]
+            return sum(plane * 256**i for i, plane in enumerate(planes))  # type: ignore[return-value]
+
+        if row["coding"] == 3:
+            h = 2 ** (head[0] - 1) - 1
+            g, *others = (codes(b) for b in (2, head[0], head[0], head[0]))
+            values = np.zeros((count, 4))
+            for n in range(count):
+                u = [int(c[n]) - h for c in others]
+                q = [x / math.sqrt(2 * h * h) for x in u]
+                q.insert(int(g[n]), math.sqrt(max(2 * h * h - sum(x * x for x in u), 0)) / math.sqrt(2 * h * h))
+                values[n] = q
+        else:
+            records = [struct.unpack_from("<Bff", head, 9 * i) for i in range(columns)]
+            mask_of = struct.unpack_from(f"<{columns}H", head, 9 * columns) if row["coding"] == 5 else [0] * columns
+            own = [masks[k - 1] if k else list(range(count)) for k in mask_of]
+            if row["coding"] == 2:
+                b = records[0][0]
+                keys = np.cumsum(codes(3 * b))
+                bits = [(i, 1 << i) for i in range(b)]
+                cells = [
+                    np.array([sum(bit for i, bit in bits if int(k) >> 3 * i + a & 1) for k in keys]) for a in range(3)
+                ]
+            else:
+                cells = [codes(b, len(rows)) for (b, _, _), rows in zip(records, own, strict=True)]
+            values = np.zeros((count, columns))
+            for j, (b, low, high) in enumerate(records):
+                m = 2**b - 1
+                values[own[j], j] = [(low * (m - int(c)) + high * int(c)) / m for c in cells[j]]
+        found[row["name"]] = values.astype(np.float32).reshape(count, *row["shape"])
+    assert at == len(data)
+    return header, found, text
+
+
+@pytest.mark.parametrize("level", LEVELS)
+@pytest.mark.parametrize("name", FIELDS)
+def test_the_documentation_is_all_that_a_reader_needs(tmp_path: Path, name: str, level: int) -> None:
+    task, model = example(name, 25)
+    checkpoint.save_compressed(tmp_path / "m", model, task.name, {"note": "naïve"}, LEVELS[level], CONFIG_TEXT)
+    header, found, text = read_by_the_book((tmp_path / "m").read_bytes())
+    again, wanted = checkpoint.load_model_checkpoint(tmp_path / "m", task)
+    assert header == wanted and text == CONFIG_TEXT == checkpoint.checkpoint_config(tmp_path / "m")
+    assert found.keys() == again.params.keys()
+    for key, value in again.params.items():
+        assert found[key].tobytes() == value.numpy().tobytes(), key
 
 
 def by_hand(**changes: Any) -> bytes:
@@ -114,12 +210,11 @@ def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
     assert header["task"] == "static" and checkpoint.checkpoint_config(path) is None and is_compressed(path)
     assert checkpoint.read_header(path, "model") == header
     low, high = np.float32([-0.1, 0.3]).astype(float)
-    text = "task: static\nnote: naïve\n"
     column = (1, (1,), struct.pack("<Bff", 8, low, high), bytes([100, 255]))
-    path.write_bytes(by_hand(sections={"b2": column, CONFIG: (0, (), b"", text.encode())}))
+    path.write_bytes(by_hand(sections={"b2": column, CONFIG: (0, (), b"", CONFIG_TEXT.encode())}))
     found = checkpoint.load_model_checkpoint(path, TASK)[0].params["b2"]
     assert found.flatten().tolist() == np.float32([(155 * low + 100 * high) / 255, high]).tolist()
-    assert checkpoint.checkpoint_config(path) == text
+    assert checkpoint.checkpoint_config(path) == CONFIG_TEXT
     with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
         checkpoint.read_header(path, "checkpoint")
 

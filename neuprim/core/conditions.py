@@ -138,7 +138,7 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
 def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
     """Read one number or range; a range that the task does not read is made of numbers that it does."""
     try:
-        return _parse_condition_value(spec, text)
+        return _condition_values_from_text(spec, text)
     except NeuprimError:
         found = None if spec.shape else _RANGE.fullmatch(text)
         if found is None:
@@ -146,7 +146,9 @@ def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tens
         first, last = float(found[1]), float(found[2])
         try:
             ends = [
-                value for end in (first, last) for value in _parse_condition_value(spec, _format_condition_number(end))
+                value
+                for end in (first, last)
+                for value in _condition_values_from_text(spec, _format_condition_number(end))
             ]
         except NeuprimError:
             pass  # the task's message about the whole text says more than one about an end
@@ -157,11 +159,11 @@ def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tens
                 raise ConfigError(f"{condition_flag(spec.name)} {text}: expected {expected}") from None
             dtype = ends[0].dtype if ends[0].is_floating_point() else torch.float64
             numbers = torch.linspace(first, last, count, dtype=dtype).tolist()
-            return [value for x in numbers for value in _parse_condition_value(spec, _format_condition_number(x))]
+            return [value for x in numbers for value in _condition_values_from_text(spec, _format_condition_number(x))]
         raise
 
 
-def _parse_condition_value(spec: ConditionSpec, text: str) -> list[Tensor]:
+def _condition_values_from_text(spec: ConditionSpec, text: str) -> list[Tensor]:
     try:
         values = spec.parse(text)
     except ValueError as error:  # as float("x") raises it; the text is the user's

@@ -51,7 +51,7 @@ def _inspect_primitives(frame: InspectionFrame) -> list[Layer]:
     return [Ellipsoids(geometry.means.detach().numpy(), axes, colours=colours), Text(text)]
 
 
-def _inspect_primitive(frame: InspectionFrame) -> list[Layer]:
+def _inspect_density_in_primitive(frame: InspectionFrame) -> list[Layer]:
     position, (unit, faces) = frame.chosen_position(), make_inspection_ball()
     geometry = frame.geometry[position : position + 1]
     axes = (geometry.rotations * geometry.scales[:, None, :])[0].double()
@@ -77,7 +77,11 @@ PRIMITIVES = Inspector(
     API_VERSION, "primitives", "the ellipsoids in their own colours", _inspect_primitives, shows="model"
 )
 PRIMITIVE = Inspector(
-    API_VERSION, "primitive", "the density inside one primitive, cut open", _inspect_primitive, shows="primitive"
+    API_VERSION,
+    "primitive",
+    "the density inside one primitive, cut open",
+    _inspect_density_in_primitive,
+    shows="primitive",
 )
 DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _inspect_difference, shows="both")
 

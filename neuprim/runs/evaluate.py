@@ -20,7 +20,7 @@ from neuprim.plugins.attribution import call_task_clips, call_task_orbit
 from neuprim.report.pictures import WorstRegions, error_map
 from neuprim.report.run_report import Viewer, write_report
 from neuprim.runs.fit import Fitted
-from neuprim.runs.measure import measure_views, render_image, summarize_metrics
+from neuprim.runs.measure import measure_views, render_image, summarize_run_metrics
 from neuprim.webpage.model_page import (
     PageScene,
     held_out_webpage_views,
@@ -73,7 +73,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
                 rendered = render_image(model, clip.source.view(i), settings, dataset.background)
                 add_frame(clip, i, rendered, clip.source.pixels(i).over(dataset.background))
     size = (directory / "model.safetensors").stat().st_size
-    metrics = summarize_metrics(fitted, dataset, model, views, size, fitted.training, fitted.lpips)
+    metrics = summarize_run_metrics(fitted, dataset, model, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
     orbit = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [display(render_image(model, view, settings, dataset.background)) for view in orbit]

@@ -30,7 +30,7 @@ from neuprim.core.train.settings import TrainSettings, build_settings, loss_sett
 from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.plugins.attribution import attribute_errors, call_task_clips, call_task_facts, check_fields, guard_loss
 from neuprim.plugins.registry import LOSSES
-from neuprim.runs.measure import measure_views, render_image, summarize_metrics
+from neuprim.runs.measure import measure_views, render_image, summarize_run_metrics
 from neuprim.runs.open import load_dataset
 
 _CURVE_VIEWS = 5
@@ -129,7 +129,7 @@ class Fitted(Job):
         self.unlock_bands()
         views = measure_views(self.model, self.task, self.dataset, self.config.renderer, self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
-        return summarize_metrics(self, self.dataset, self.model, views, size, self.training, self.lpips, self.split)
+        return summarize_run_metrics(self, self.dataset, self.model, views, size, self.training, self.lpips, self.split)
 
 
 def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset | None = None) -> Fitted:

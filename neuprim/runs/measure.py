@@ -211,10 +211,10 @@ def evaluate_run(
         size = estimate_run_file_bytes(model_file(run.directory), run.model, model)
         model = move_to_render_device(model, config.settings, dataset.test.view(0))
         views = measure_views(model, run.task, dataset, config.settings, distance, render_view=config.render_view)
-        return summarize_metrics(run, dataset, model, views, size, training, distance)
+        return summarize_run_metrics(run, dataset, model, views, size, training, distance)
 
 
-def summarize_metrics(
+def summarize_run_metrics(
     job: Job,
     dataset: Dataset,
     model: Primitives,

@@ -95,7 +95,7 @@ def render_run(
         BackendUnavailable: a format whose package is missing.
     """
     run = load_run(run)
-    session = _RenderSession(run, request, notify, progress)
+    session = _RunRenderSession(run, request, notify, progress)
     targets = session.choose_targets()
     if not request.overwrite:
         refuse_run_results(run.directory, targets)
@@ -108,7 +108,7 @@ def render_run(
     return targets
 
 
-class _RenderSession:
+class _RunRenderSession:
     """A loaded run with the views of a request."""
 
     def __init__(

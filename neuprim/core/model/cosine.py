@@ -33,7 +33,7 @@ from neuprim.core.model.fields import Conditions, Cosine, DensityField, read_scr
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
-from neuprim.core.model.tensors import number_fault
+from neuprim.core.model.tensors import field_number_fault
 from neuprim.core.validation import Range
 
 OMEGA0 = 30.0  # SIREN boost: multiplies the whole phase
@@ -69,7 +69,7 @@ class CosineDensity(DensityField):
     def __init__(self, neurons: int = 8, omega0: float = OMEGA0, edge: int = 0, gain: bool = False) -> None:
         if not isinstance(neurons, int) or not 0 <= neurons <= 16:
             raise ValueError(f"{neurons!r} neurons; expected 0..16")
-        if number_fault(omega0) is not None or omega0 <= 0:
+        if field_number_fault(omega0) is not None or omega0 <= 0:
             raise ValueError(f"omega0 {omega0!r}; expected a positive number")
         if type(edge) is not int or edge not in EDGES:
             raise ValueError(f"edge {edge!r}; expected 0, 1 or 2")

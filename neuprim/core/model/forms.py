@@ -20,9 +20,9 @@ from neuprim.core.model.tensors import (
     PrimitiveTensors,
     Shapes,
     Sizes,
+    field_number_fault,
     function_fault,
     labelled_fault,
-    number_fault,
 )
 
 # ---------------------------------------------------------------- closed forms of density
@@ -58,7 +58,7 @@ class Cosine(PrimitiveTensors):
     def fault(self, sizes: Sizes) -> str | None:
         if type(self.edge) is not int or self.edge not in EDGES:
             return f"edge has value {self.edge!r}; expected 0, 1 or 2"
-        return super().fault(sizes) or labelled_fault("omega0", number_fault(self.omega0))
+        return super().fault(sizes) or labelled_fault("omega0", field_number_fault(self.omega0))
 
     def __add__(self, other: Cosine) -> Cosine:
         """f + g, exactly: the neurons of both side by side, with the first omega0 (the second if that is 0).

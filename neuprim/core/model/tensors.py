@@ -40,7 +40,7 @@ def primitive_tensor_fault(value: Any) -> str | None:
     return None
 
 
-def number_fault(value: Any) -> str | None:
+def field_number_fault(value: Any) -> str | None:
     """The same of what should be a finite number."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return f"type {type(value).__name__}; expected a finite number"

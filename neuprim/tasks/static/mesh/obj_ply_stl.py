@@ -278,10 +278,10 @@ def read_ply_mesh(folder: MeshFolder) -> Model:
         if image is not None:
             images[texture[1]] = image
             materials[""] = Material((1.0, 1.0, 1.0), texture[1], cutoff=0.5, blend=True)
-    return Model(folder.file, partial(_read_ply_mesh_faces, folder.file, data), folder.digest, materials, images)
+    return Model(folder.file, partial(_read_mesh_faces_of_ply, folder.file, data), folder.digest, materials, images)
 
 
-def _read_ply_mesh_faces(path: Path, data: bytes) -> tuple[list[Faces], int]:
+def _read_mesh_faces_of_ply(path: Path, data: bytes) -> tuple[list[Faces], int]:
     """Read all triangles and count the vertices."""
     elements = read_ply_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
     vertices = elements["vertex"]

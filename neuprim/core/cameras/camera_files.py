@@ -16,7 +16,6 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import usd_stage
 from neuprim.core.cameras.colmap import find_colmap_model, read_colmap_cameras
 from neuprim.core.cameras.intrinsics import (
     MODELS,
@@ -38,6 +37,7 @@ from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.json_reader import JsonReader
 
 _MAX_BYTES = 64 * 1024 * 1024
+_USD_SCRIPT = Path(__file__).with_name("usd_stage.py")  # run, never imported
 _VIEWER_NOTE = (
     "poses are taken as they are; nerfstudio's viewer has them in the frame that its dataparser moved "
     "and scaled the scene to"
@@ -49,8 +49,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
     models.
 
     ``FILE#/PRIM`` chooses one camera of a stage; ``size`` is (width, height) where the file names none. Raises
-    DataError
-    for a missing or wrong field, and BackendUnavailable if the package that reads the format is missing.
+    DataError for a missing or wrong field, and BackendUnavailable if the package that reads the format is missing.
     """
     text, hash_, prim = str(path).partition("#")
     path, prim = (Path(text), prim) if hash_ and not path.exists() else (path, "")
@@ -217,7 +216,7 @@ def _read_usd_stage(path: Path, prim: str) -> JsonReader:
     if path.stat().st_size > _MAX_USD_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_USD_BYTES}")
     # -P: modules beside the script are none of pxr's
-    words = [sys.executable, "-P", str(Path(usd_stage.__file__)), str(path.resolve()), prim, str(MAX_CAMERAS)]
+    words = [sys.executable, "-P", str(_USD_SCRIPT), str(path.resolve()), prim, str(MAX_CAMERAS)]
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=_USD_SECONDS)
     except subprocess.TimeoutExpired:

@@ -148,6 +148,6 @@ def test_a_reader_that_never_ends_or_dies(tmp_path: Path, monkeypatch: pytest.Mo
         ("raise MemoryError", "MemoryError"),
     ):
         script.write_text(text)
-        monkeypatch.setattr("neuprim.core.cameras.camera_files.usd_stage.__file__", str(script))
+        monkeypatch.setattr("neuprim.core.cameras.camera_files._USD_SCRIPT", script)
         with pytest.raises(DataError, match=words):
             read_usd_cameras(path, "", (64, 48))

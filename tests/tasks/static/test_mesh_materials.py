@@ -190,6 +190,17 @@ def test_textures_of_libraries_are_moved_and_in_folders_with_blanks(
         assert shown(tmp_path / "a.obj") == list(colour)
 
 
+@pytest.mark.parametrize("metallic", [{}, {"baseColorFactor": [0, 0, 1, 1]}, None])
+def test_specular_glossiness_wins_over_what_stands_beside_it(tmp_path: Path, metallic: dict[str, Any] | None) -> None:
+    document = Document(tmp_path)
+    document.material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0.5, 0.25, 0.0, 1]}}
+    if metallic is not None:
+        document.material["pbrMetallicRoughness"] = metallic
+    assert shown(document.write()) == srgb(0.5, 0.25, 0)
+    document.material["extensions"]["KHR_materials_pbrSpecularGlossiness"] = {"diffuseTexture": document.texture()}
+    assert shown(document.write()) == list(RED)
+
+
 def test_base_colours_are_linear_and_multiply_those_of_vertices(tmp_path: Path) -> None:
     """A factor as dark as an 8-bit linear value cannot hold."""
     document = Document(tmp_path)
@@ -315,33 +326,6 @@ def test_what_a_file_offers_beside_compression_is_read(tmp_path: Path) -> None:
         parts_of(document.write())
 
 
-@pytest.mark.parametrize("base", [None, {"baseColorFactor": [0, 0, 1, 1]}])
-def test_specular_glossiness_is_refused_unless_there_is_another_colour(
-    tmp_path: Path, recwarn: pytest.WarningsRecorder, base: dict[str, Any] | None
-) -> None:
-    document = Document(tmp_path)
-    document.material["extensions"] = {"KHR_materials_pbrSpecularGlossiness": {"diffuseFactor": [0.5, 0.25, 0.0, 1]}}
-    if base is None:
-        with pytest.raises(DataError, match="needs the glTF extension KHR_materials_pbrSpecularGlossiness"):
-            parts_of(document.write())
-        return
-    document.material["pbrMetallicRoughness"] = base
-    assert shown(document.write()) == list(BLUE)
-    assert any("KHR_materials_pbrSpecularGlossiness; drawn without" in str(w.message) for w in recwarn)
-
-
-def test_instances_are_refused_and_poses_are_said_not_to_be_drawn(tmp_path: Path) -> None:
-    """A skinned mesh stays where it is stored, wherever its node is."""
-    document = Document(tmp_path)
-    document.json["nodes"] = [{"mesh": 0, "skin": 0, "translation": [9, 0, 0]}, {"mesh": 0, "weights": [0.5]}]
-    with pytest.warns(match="2 meshes have a skin or morph weights, which are not read; drawn unposed"):
-        first, second = placed(document.write())
-    np.testing.assert_array_equal(first, second)
-    document.json["nodes"][1]["extensions"] = {"EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": 0}}}
-    with pytest.raises(DataError, match="needs the glTF extension EXT_mesh_gpu_instancing, which is not read"):
-        parts_of(document.write())
-
-
 def placed(path: Path) -> list[np.ndarray]:
     """The corners of every part, in the order of their middles."""
     return sorted((part.corners for part in parts_of(path)), key=lambda c: c.mean(axis=(0, 1)).tolist())
@@ -365,6 +349,79 @@ def test_triangles_strips_and_fans(tmp_path: Path, mode: int, indices: list[int]
     (corners,) = placed(document.write())
     across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     assert len(corners) == 2 and np.allclose(across, [0, 0, 4])
+
+
+@pytest.mark.parametrize("kind", ["<f4", "i1", "<i2"])
+def test_instances_are_expanded_below_their_node(tmp_path: Path, kind: str) -> None:
+    """Turned by a quaternion of any length, scaled along one axis, moved; then what the node does."""
+    document = Document(tmp_path)
+    most = 1 if kind == "<f4" else np.iinfo(kind).max
+    half = math.sqrt(0.5)
+    turns = np.array([[0, 0, half, half], [0, 0, 0, 1]]) * most
+    attributes = {
+        "TRANSLATION": document.add(np.array([[10, 0, 0], [0, 20, 0]], np.float32)),
+        "ROTATION": document.add(
+            (2 * turns if kind == "<f4" else np.round(turns)).astype(kind), normalized=kind != "<f4"
+        ),
+        "SCALE": document.add(np.array([[1, 3, 1], [1, 1, -2]], np.float32)),
+    }
+    extensions = {"EXT_mesh_gpu_instancing": {"attributes": attributes}}
+    document.json["nodes"] = [{"mesh": 0, "translation": [0, 0, 5], "scale": [2, 2, 2], "extensions": extensions}]
+    document.json["extensionsUsed"] = ["EXT_mesh_gpu_instancing"]
+    second, first = placed(document.write())
+    # a corner (x, y) becomes (x, 3y), turns to (-3y, x) and moves to (10 - 3y, x), which the node doubles
+    np.testing.assert_allclose(
+        first[0], [[20 + 6, -2, 5], [20 + 6, 2, 5], [20 - 6, 2, 5]], atol=0.05 if kind == "i1" else 1e-3
+    )
+    np.testing.assert_allclose(second[0], [[-2, 38, 5], [2, 38, 5], [2, 42, 5]], atol=1e-6)
+    document.json["accessors"][attributes["SCALE"]]["count"] = 1
+    with pytest.raises(DataError, match=r"instances have \[1, 2\] places"):
+        parts_of(document.write())
+
+
+def test_more_instances_than_parts_are_refused(tmp_path: Path) -> None:
+    document = Document(tmp_path)
+    document.json["nodes"][0]["extensions"] = {
+        "EXT_mesh_gpu_instancing": {"attributes": {"TRANSLATION": document.add(np.zeros((20_001, 3), np.float32))}}
+    }
+    with pytest.raises(DataError, match="20001 instances; expected at most 20000"):
+        parts_of(document.write())
+
+
+def test_morph_targets_have_their_default_weights(tmp_path: Path) -> None:
+    document = Document(tmp_path)
+    raised = np.array([[0, 0, 4]] * 4, np.float32)
+    document.primitive["targets"] = [{"POSITION": document.add(raised)}, {"POSITION": document.add(-raised)}]
+    assert placed(document.write())[0][..., 2].max() == 0
+    document.json["meshes"][0]["weights"] = [0.5, 0.0]
+    assert (placed(document.write())[0][..., 2] == 2).all()
+    document.json["nodes"] = [{"mesh": 0}, {"mesh": 0, "weights": [0.0, 1.0]}]  # a node's own win
+    below, above = sorted(placed(document.write()), key=lambda c: c[..., 2].max())
+    assert (above[..., 2] == 2).all() and (below[..., 2] == -4).all()
+
+
+def test_a_skin_is_where_its_joints_are(tmp_path: Path) -> None:
+    """Two joints: the left corners hang on one at rest, the right ones on both alike, the other 6 further up. The
+    mesh's node counts not."""
+    document = Document(tmp_path)
+    bound = np.eye(4, dtype=np.float32)
+    bound[3, :3] = [-7, 0, 0]  # column by column: the inverse of the joint's first place
+    document.json["nodes"] = [
+        {"mesh": 0, "skin": 0, "translation": [100, 0, 0]},
+        {"scale": [2, 2, 2], "children": [2, 3]},
+        {"translation": [0, 0, 0]},
+        {"translation": [7, 0, 6]},
+    ]
+    binds = np.stack([np.eye(4, dtype=np.float32), bound]).reshape(2, 16)
+    document.json["skins"] = [{"joints": [2, 3], "inverseBindMatrices": document.add(binds)}]
+    document.primitive["attributes"]["JOINTS_0"] = document.add(np.array([[0, 1, 0, 0]] * 4, np.uint8))
+    shares = np.array([[255, 0, 0, 0], [127, 127, 0, 0], [127, 127, 0, 0], [255, 0, 0, 0]], np.uint8)
+    document.primitive["attributes"]["WEIGHTS_0"] = document.add(shares, normalized=True)
+    (found,) = placed(document.write())
+    np.testing.assert_allclose(found[0], [[-2, -2, 0], [2, -2, 6], [2, 2, 6]], atol=1e-5)
+    document.json["nodes"][3]["children"] = [1]
+    with pytest.raises(DataError, match="joint 2 is outside of the scene"):
+        parts_of(document.write())
 
 
 def write_stl(path: Path, head: bytes, *attributes: int) -> Path:

@@ -12,7 +12,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.cameras.pinhole import RayCamera
 from neuprim.core.errors import BackendUnavailable, DataError
-from neuprim.core.render import RenderSettings, choose_backend, render_lowered
+from neuprim.core.render import RenderSettings, choose_backend, render, render_lowered
 from neuprim.core.render.reference import _PreparedPrimitives, frame_rays, pixel_ray_directions
 from tests import scenes
 
@@ -181,3 +181,25 @@ def test_entry_order_is_by_distance() -> None:
     }  # type: ignore[arg-type]
     assert images["center"][0] > 0.9 > 0.1 > images["center"][1]  # the red centre is nearer,
     assert images["entry"][1] > 0.9 > 0.1 > images["entry"][0]  # the green sphere is entered at 2.0, the red one at 2.5
+
+
+def test_a_task_s_model_through_a_fisheye() -> None:
+    """``render`` lowers view-dependent colours for such a camera as for any other."""
+    from neuprim.core.model.cosine import CosineDensity
+    from neuprim.core.model.primitives import Primitives
+    from neuprim.tasks.static import SphericalHarmonics
+
+    t = ball((0.0, 0.0, -2.0), 0.5, 3.0)
+    params = {k: t[k].float() for k in ("means", "log_scales", "quats", "W1", "b1", "w2", "b2")}
+    colour = {"sh_dc": torch.zeros(1, 3), "sh_rest": torch.zeros(1, 3, 3)}
+    colour["sh_rest"][0, 1] = 0.5  # the band of z
+    model = Primitives(CosineDensity(neurons=0), SphericalHarmonics(1), {**params, **colour})
+    seen = [
+        render(
+            model,
+            RayCamera.fisheye(21, 21, look_at(torch.tensor([0, 0, z]), torch.zeros(3), torch.tensor([1.0, 0, 0])), 360),
+        )
+        for z in (1.0, -5.0)
+    ]
+    first, second = ((o.rgb.sum((0, 1)) / o.alpha.sum())[0].item() for o in seen)
+    assert abs(first - second) > 0.3, "the colour depends on the side it is seen from"

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.pinhole import RayCamera
+from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.fields import Constant, CustomColour, CustomDensity, RayNet
 from neuprim.core.render import RenderSettings, choose_backend, render_lowered
 from neuprim.core.render.reference import pixel_ray_directions
@@ -118,3 +119,17 @@ def test_silhouettes_of_soft_edges_need_no_floor() -> None:
                 assert leaves["means"].grad is not None and bool(torch.isfinite(leaves["means"].grad).all())
                 grads.append(leaves["means"].grad)
             assert torch.equal(*grads) == (edge > 0), (backend, edge)
+
+
+OPAQUE = CustomDensity(lambda prim, o, d, t0, t1: t1 - t0)
+
+
+def test_forms_without_a_kernel_go_to_the_reference() -> None:
+    low, net = scenes.lowered(scenes.tensors(3)), scenes.lowered(scenes.tensors(3, hidden=2))
+    assert choose_backend(low, RenderSettings()).name == choose_backend(net, RenderSettings()).name == "cpu"
+    assert choose_backend(replace(low, density=OPAQUE), RenderSettings()).name == "reference"
+    colour = CustomColour(lambda prim, x, d: x, 3)
+    assert choose_backend(replace(low, colour=colour), RenderSettings()).name == "reference"
+    for form, named in ((low, "CustomDensity density"), (net, "CustomDensity density, RayNet colour")):
+        with pytest.raises(BackendUnavailable, match=named):
+            render_lowered(replace(form, density=OPAQUE), scenes.camera(8, 8), RenderSettings(backend="cpu"))

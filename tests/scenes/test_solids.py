@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 import trimesh
+from PIL import Image
 
 from neuprim.core.cameras import Camera
 from neuprim.core.task import SceneContext
@@ -16,6 +18,7 @@ from neuprim.scenes import solids as generator
 from neuprim.scenes.raycast import Scene
 from neuprim.scenes.shading import DAYLIGHT, scene_daylight_radiance
 from neuprim.scenes.shapes import Solid, ball, build_solids, chamfered_box, parse_solid_srgb, uniform_colour
+from neuprim.scenes.solids import SolidsSettings, generate_solids
 from neuprim.tasks.static.datasets import load_solids_dataset
 
 SMALL = {"size": 32, "train_views": 3, "test_views": 2, "supersampling": 2}
@@ -114,3 +117,17 @@ def test_silhouette_lies_where_the_loaders_cameras_project_it(scene: Scene, tmp_
             np.testing.assert_allclose(found, [*corners.min(0), *corners.max(0)], atol=1.5)
             x, y = np.floor(project(camera, points)).astype(int).T
             assert (alpha.numpy()[y, x] > 0).mean() > 0.99
+
+
+def test_layout_and_alpha(tmp_path: Path) -> None:
+    folder = generate_solids(SolidsSettings(**SMALL), tmp_path)
+    for split, count in (("train", 3), ("test", 2)):
+        layout = json.loads((folder / f"transforms_{split}.json").read_text())
+        assert layout["camera_angle_x"] == pytest.approx(np.radians(40)) and len(layout["frames"]) == count
+        for frame in layout["frames"]:
+            image = np.asarray(Image.open(folder / f"{frame['file_path']}.png"))
+            alpha = image[..., 3] / 255
+            assert image.shape == (32, 32, 4) and 0.1 < alpha.mean() < 0.6
+            assert (alpha == 1).mean() > 0.05 and ((alpha > 0) & (alpha < 1)).any()
+            assert not alpha[[0, -1]].any() and not alpha[:, [0, -1]].any() and not image[alpha == 0].any()
+            assert 40 < image[alpha == 1][:, :3].mean() < 200 and image[alpha == 1][:, :3].std() > 30

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from neuprim.runs.open import load_run
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic import TASK, parse_dynamic_time
 from tests.reports import offered
+from tests.tasks.dynamic import sequences
 from tests.tasks.dynamic.sequences import blob
 
 SMALL = (
@@ -111,3 +113,22 @@ def test_a_simulated_scene_says_so(tmp_path: Path) -> None:
     m = metrics(folder)
     assert m["data_source"] == "simulated" and "simulated" in m["dataset"]
     assert "simulated data" in (folder / "report.html").read_text()
+
+
+def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(files: Path, tmp_path: Path) -> None:
+    quick, equations, paper = (compose(["task=dynamic", f"preset={name}"]) for name in ("quick", "equations", "paper"))
+    assert equations.model.density == paper.model.density == {"time": "phase"}
+    assert equations.model.colour == {"powers": 4, "waves": 4, "frequencies": "printed"}
+    assert equations.model.sh_degree == 3
+    assert (equations.train.voxels_every, quick.train.voxels_every) == (4, 16), "about the same share of a step's time"
+    train = dataclasses.replace(equations.train, voxels_every=quick.train.voxels_every)
+    assert (train, equations.renderer) == (quick.train, quick.renderer), "the budget and the rates are those of quick"
+    words = "preset=equations train.iterations=20 train.population.every=5 train.population.start=0 model.neurons=8"
+    model = load_run(fit(files, tmp_path / "run", *words.split())).model
+    assert model.parameters_per_primitive == 143 + 1
+    assert bool(model.params["W_t"].any()) and bool(model.params["time_sin"].any())
+    # the form alone, without shares of components
+    data = dataclasses.replace(sequences.dataset(files, tmp_path), points=None)
+    fields = TASK.build(vars(quick.model), data)
+    numbers = 10 + sum(spec.size for field in fields for spec in field.parameters())
+    assert abs(143 * equations.model.primitives - numbers * quick.model.primitives) <= 143 / 2

@@ -250,3 +250,11 @@ def test_beauty_is_what_is_emitted_less_what_is_absorbed() -> None:
     assert (layers["absorption"] - (emitted - arrived)).abs().max() < 1e-5 * emitted.max()
     assert (layers["emission"] - layers["absorption"] - arrived).abs().max() < 1e-5 * emitted.max()
     assert (emitted - arrived).max() > 0.05 * emitted.max(), "something is absorbed"
+
+
+def test_motion_is_a_parabola_about_the_middle_of_life() -> None:
+    m = model("window+motion")
+    own = m.of(m.density)
+    since = 0.75 - own["window_center"]
+    moved = m.density.move(own, m.geometry, at(0.75)).means
+    assert torch.allclose(moved, m.params["means"] + own["velocity"] * since + own["acceleration"] * since**2)

@@ -211,3 +211,11 @@ def test_training_survives_highlights(loss: str) -> None:
     with torch.no_grad():
         image = render(trainer.model, view.camera, view.conditions, RenderSettings(backend="reference")).rgb
     assert bool(torch.isfinite(image).all()) and image.max() > 0.05
+
+
+def test_harmonics_know_the_direction_of_any_light() -> None:
+    m = model(LightHarmonics(3, 3))
+    lights = ({"light": d * torch.tensor([0.6, -0.3, 0.7]), "light_intensity": torch.ones(3)} for d in (1e6, 1e30))
+    with torch.no_grad():
+        near, far = (render(m, scenes.camera(), c).rgb for c in lights)
+    assert near.max() > 0.1 and torch.allclose(near, far, atol=2e-5)

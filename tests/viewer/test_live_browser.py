@@ -47,8 +47,8 @@ class Tab:
         page.goto(address)
 
     def picture(self) -> np.ndarray:
-        """(H, W, 3) int of the part of the window that no panel covers."""
-        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)[160:, 20:380]
+        """(H, W, 3) int of the part of the window that no panel and no notice covers."""
+        return np.asarray(Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")).astype(int)[200:, 20:380]
 
     def until(self, condition: Callable[[], bool], what: str) -> None:
         end = time.monotonic() + PATIENCE
@@ -141,11 +141,10 @@ def test_a_person_looks_at_a_training(tmp_path: Path, monkeypatch: pytest.Monkey
         tab.choose("ellipsoids", "none")
         seen = tab.moved(solid)
         page.get_by_label("choose by a click").click()
-        contrast = np.abs(seen.astype(int) - seen[0, 0]).max(-1)  # largest where the model is most opaque
-        y, x = np.unravel_index(int(contrast.argmax()), contrast.shape)
+        y, x = np.unravel_index(int(seen.min(-1).argmin()), seen.shape[:2])  # the background is white
 
         def described() -> bool:  # the page listens to clicks a moment after the box was ticked
-            page.mouse.click(int(x) + 20, int(y) + 160)
+            page.mouse.click(int(x) + 20, int(y) + 200)
             page.wait_for_timeout(500)
             texts = page.evaluate("[...document.querySelectorAll('textarea')].map(e => e.value).join()")
             return "semi-axes" in str(texts)

@@ -1,4 +1,4 @@
-"""How well the Gaussians of the ``gaussian-ply`` export reproduce trained primitives, for each edge.
+"""How well Gaussians reproduce trained primitives, for each edge and each rule of the ``gaussian-ply`` export.
 
     python benchmarks/gaussians.py [RUN_DIR ...] [--edges 0 1 2] [--neurons 8 0] [--iterations 600] [--docs]
 
@@ -18,6 +18,7 @@ from shared.tables import DOCS, Table, between_markers
 
 from neuprim.config import compose
 from neuprim.core.model.edge import EDGES
+from neuprim.export.gaussian_ply import SIZES
 from neuprim.runs.export import export_run
 from neuprim.runs.run import run
 
@@ -32,11 +33,13 @@ def train(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
 
 
 def export_table(runs: Sequence[tuple[str, Path]]) -> Table:
-    table = Table("model", "PSNR")
+    table = Table("model", *(f"size={size}" for size in SIZES))
     for name, folder in runs:
         with tempfile.TemporaryDirectory() as target:
-            report = export_run(folder, "gaussian-ply", Path(target) / "gaussians.ply")
-        table.row(name, f"{report.errors['psnr']:.1f} dB")
+            reports = [
+                export_run(folder, "gaussian-ply", Path(target) / f"{size}.ply", [f"size={size}"]) for size in SIZES
+            ]
+        table.row(name, *(f"{report.errors['psnr']:.1f} dB" for report in reports))
     return table
 
 

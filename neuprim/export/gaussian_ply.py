@@ -3,16 +3,20 @@
 Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in
 the coordinates of the run's data (``double x y z`` where float32 would lose more than 1e-4 of the scene's size, as in
 UTM), normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit
-of the opacity, natural logarithm of the standard deviations, quaternion wxyz. Colours are those of the model in its own
-colour space; viewers show numbers as sRGB. A grey model is written as three equal channels; other channels than red,
-green and blue are refused. A model that depends on time or light is written under one value of each. Colours that are
-no harmonics are fitted by harmonics.
+of the opacity,
+natural logarithm of the standard deviations, quaternion wxyz. How they are fitted: :func:`fit_gaussians`.
+Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three
+equal channels; other channels than red, green and blue are refused. A model that depends on time or light is written
+under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are
+fitted by harmonics.
 
-The error is the PSNR of the Gaussians, drawn as the 3DGS rasteriser draws them, against the model's own images.
+The error is the PSNR of images of the fitted Gaussians, drawn as the 3DGS rasteriser draws them, against the model's
+own.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -23,6 +27,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.cameras.world import World
+from neuprim.core.data import View
 from neuprim.core.data.points_file import LINEAR
 from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, TrainedModel
@@ -34,13 +39,23 @@ from neuprim.core.render import render
 from neuprim.core.task import API_VERSION
 from neuprim.export.shared import ExportHarmonics, choose_export_views, find_export_rgb_channels, fit_export_harmonics
 
+SIZES = ("moments", "footprint", "profile")
+"""What the size of a Gaussian may be fitted to."""
 _SIDE = 12  # points of the quadrature along an axis of the unit ball
 _CHUNK = 512
 _FACTORS = [1.06**i for i in range(-24, 25)]  # on the covariance, in steps of three percent in size
 # Of the authors' rasteriser:
 _NEAR, _BLUR, _ALPHA_MAX, _ALPHA_MIN, _TRANSMITTANCE_MIN = 0.2, 0.3, 0.99, 1.0 / 255.0, 1e-4
 
-OPTIONS = {"views": ("auto", "cameras of the PSNR: test, orbit, or auto (test for models without conditions)")}
+OPTIONS = {
+    "size": (
+        "auto",
+        "profile: the bell closest to the primitive's opacity; footprint: as much screen as it covers; moments: "
+        "covariance of the density; "
+        "auto: the best",
+    ),
+    "views": ("auto", "cameras of the PSNR: test, orbit, or auto (test for models without conditions)"),
+}
 
 LAYOUT = (
     *("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2"),
@@ -52,43 +67,49 @@ _MAX_ROUNDING = 1e-4  # of centres in float32, as a share of the size of their c
 
 
 def _write_gaussian_ply(job: ExportJob) -> ExportReport:
-    which = job.choice("views", "auto", "test", "orbit")
+    size, which = job.choice("size", "auto", *SIZES), job.choice("views", "auto", "test", "orbit")
     (conditions,) = job.frames()
-    run, channels, rgb = job.run, job.run.channels, find_export_rgb_channels(job.run)
+    channels, rgb = job.run.channels, find_export_rgb_channels(job.run)
     job.progress("fitting Gaussians", 0.0)
-    gaussians = fit_gaussians(run, conditions)
-    if not len(gaussians.means):
+    fits = {name: fit_gaussians(job.run, conditions, name) for name in SIZES if size in ("auto", name)}
+    if not all(len(g.means) for g in fits.values()):
         reason = "no primitive absorbs anything under these conditions; nothing to export"
-        raise ConfigError(f"{run.directory}: {reason}")
-    colours = fit_export_harmonics(run, conditions).select_channels(rgb)
-    views, seen = choose_export_views(job, which, conditions)
-    background = torch.tensor([float(x) for x in run.header.get("background", [0.0] * run.model.colour.channels)])
-    scores = []
-    for i, view in enumerate(views):
-        job.progress("comparing images", i / len(views))
-        with torch.no_grad():
-            truth = render(run.model, view.camera, view.conditions, run.settings, background).rgb[..., list(rgb)]
-        scores.append(psnr(draw_exported_gaussians(gaussians, colours, view.camera, background[list(rgb)]), truth))
-    errors = {"psnr": float(np.mean(scores)), "psnr_worst": float(np.min(scores))}
-    rows = _gaussian_ply_rows(gaussians, colours, run.world)
-    linear = channels.color_space == "linear"
+        raise ConfigError(f"{job.run.directory}: {reason}")
+    colours = fit_export_harmonics(job.run, conditions).select_channels(rgb)
+    images, seen = _draw_export_images(job, which, conditions, rgb)
+    background = _export_background(job)[list(rgb)]
+    scores = {name: _measure_gaussian_psnrs(job, fit, colours, images, background) for name, fit in fits.items()}
+    size = max(scores, key=lambda name: float(np.mean(scores[name])))
+    gaussians, errors = fits[size], {"psnr": float(np.mean(scores[size])), "psnr_worst": float(np.min(scores[size]))}
+    rows = _gaussian_ply_rows(gaussians, colours, job.run.world)
+    space = channels.color_space
     comments = ["3D Gaussian splatting layout, fitted to neural primitives by neuprim (lossy)"]
-    write_ply(job.out, rows, comments + [LINEAR] * linear)
+    comments += [LINEAR] * (space == "linear")
+    write_ply(job.out, rows, comments)
     notes = [
-        f"{len(gaussians.means)} Gaussians; PSNR of them drawn as the 3DGS rasteriser does, against the model's "
-        f"images, {seen}, {channels.color_space} values"
+        f"{len(gaussians.means)} Gaussians, size={size}; PSNR of them drawn as the 3DGS rasteriser does, against "
+        f"the model's images, {seen}, {space} values",
+        "axes and units are those of the run's data; degree 3 harmonics",
     ]
     if rows.dtype["x"] == np.float64:
-        notes.append("x y z are double; a program that takes them for float rounds them")
+        kept = float(np.spacing(np.abs(np.stack([rows[axis] for axis in "xyz"])).max().astype(np.float32)))
+        notes.append(
+            "x y z are double: the coordinates are so large that a program which takes them for float rounds "
+            f"them to {kept:.2g}"
+        )
     if colours.residual > 0:
-        fitted = f"fitted with an RMS error of {colours.residual:.2g}"
-        notes.append(f"the model's colours are no harmonics of the view; {fitted}")
+        notes.append(
+            "the model's colours are no harmonics of the view; fitted at the centres with an RMS error of "
+            f"{colours.residual:.2g}"
+        )
     if channels.own is not None:
-        shown = f"not what the display of task {run.task.name!r} shows"
-        notes.append(f"red, green and blue are the channels {channels.name_list}, {shown}")
+        notes.append(
+            f"red, green and blue are the channels {channels.name_list}, not what the display of task "
+            f"{job.run.task.name!r} shows"
+        )
     elif channels.display_text:
         notes.append(f"colours: {channels.display_text}")
-    if linear:
+    if space == "linear":
         notes.append("colours are linear, viewers take them for sRGB: they look darker there")
     return ExportReport((job.out,), False, errors, tuple(notes))
 
@@ -109,6 +130,39 @@ def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: Wo
     for i, name in enumerate(LAYOUT):
         rows[name] = table[:, i]
     return rows
+
+
+def _draw_export_images(
+    job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]
+) -> tuple[list[tuple[View, Tensor]], str]:
+    """Draw the model from the comparison views, red, green and blue, and say which views these are."""
+    run = job.run
+    views, what = choose_export_views(job, which, conditions)
+    background, images = _export_background(job), []
+    for i, view in enumerate(views):
+        job.progress("drawing the model", i / len(views))
+        with torch.no_grad():
+            image = render(run.model, view.camera, view.conditions, run.settings, background).rgb
+        images.append((view, image[..., list(rgb)]))
+    return images, what
+
+
+def _measure_gaussian_psnrs(
+    job: ExportJob,
+    gaussians: Gaussians,
+    colours: ExportHarmonics,
+    images: list[tuple[View, Tensor]],
+    background: Tensor,
+) -> list[float]:
+    found = []
+    for i, (view, truth) in enumerate(images):
+        job.progress("drawing the Gaussians", i / len(images))
+        found.append(psnr(draw_exported_gaussians(gaussians, colours, view.camera, background), truth))
+    return found
+
+
+def _export_background(job: ExportJob) -> Tensor:
+    return torch.tensor([float(x) for x in job.run.header.get("background", [0.0] * job.run.model.colour.channels)])
 
 
 # ---------------------------------------------------------------- fitting and drawing Gaussians
@@ -144,13 +198,15 @@ class Gaussians:
         return np.sqrt(np.maximum(values, 1e-30)), quats
 
 
-def fit_gaussians(run: TrainedModel, conditions: Conditions) -> Gaussians:
+def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gaussians:
     """Fit one Gaussian to each primitive that absorbs anything.
 
-    By quadrature on the ellipsoid, with rho = max(0, sigma): mean and covariance are those of rho. A 3DGS footprint is
-    opacity x exp(-d^2/2) on the screen, a bell, while an opaque primitive is flat with an edge. So the covariance is
-    scaled and the opacity chosen such that the bell is closest to the primitive's alpha, by least squares over the
-    screens along the ellipsoid's three axes, among those that cover as much.
+    By quadrature on the ellipsoid, with rho = max(0, sigma): mean and covariance are those of rho; the opacity is the
+    mean over the ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that
+    mean. That is ``size="moments"``. A 3DGS footprint is opacity x exp(-d^2/2) on the screen, never more than a bell,
+    while an opaque primitive is flat with an edge, so the covariance is scaled: with "footprint" so that both cover the
+    same area, the mean over the axes of the integral of alpha across the screen; with "profile" so that the bell is
+    closest to alpha, by least squares over the three axes' screens, among those whose opacity makes up the area.
     """
     model = run.model
     with torch.no_grad():
@@ -160,7 +216,7 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions) -> Gaussians:
         for i in range(0, still.count, _CHUNK):
             part = slice(i, i + _CHUNK)
             params = {name: value[part] for name, value in own.items()}
-            parts.append(_fit_gaussian_chunk(model.density.density, params, still[part], moved[part], conditions))
+            parts.append(_fit_gaussian_chunk(model.density.density, params, still[part], moved[part], conditions, size))
     empty = (torch.zeros(0, 3), torch.zeros(0, 3, 3), torch.zeros(0), torch.zeros(0, dtype=torch.bool))
     means, covariances, opacities, kept = (torch.cat(column) for column in zip(empty, *parts, strict=True))
     found = kept.nonzero()[:, 0]
@@ -168,9 +224,8 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions) -> Gaussians:
 
 
 def _fit_gaussian_chunk(
-    density: Any, own: Any, still: Geometry, moved: Geometry, conditions: Conditions
+    density: Any, own: Any, still: Geometry, moved: Geometry, conditions: Conditions, size: str
 ) -> tuple[Tensor, ...]:
-    """Return means, covariances, opacities, and which primitives absorb anything; a screen is (n, side, side)."""
     n, step = still.count, 2.0 / _SIDE
     ticks = (torch.arange(_SIDE, dtype=torch.float64) + 0.5) * step - 1
     ball = torch.cartesian_prod(ticks, ticks, ticks)
@@ -187,33 +242,54 @@ def _fit_gaussian_chunk(
     mean = weight @ ball
     spread = torch.einsum("np,npi,npj->nij", weight, ball - mean[:, None], ball - mean[:, None])
     cube = rho.reshape(n, _SIDE, _SIDE, _SIDE)
-    grid = torch.stack(torch.meshgrid(ticks, ticks, indexing="ij"), -1)
-    alphas, areas, bells, weights, squares = [], [], [], [], []
+    middle = ((mean + 1) / step).floor().long().clamp(0, _SIDE - 1)
+    every = torch.arange(n)
+    alphas, areas, bells, screens = [], [], [], []
     for axis in range(3):
         alpha = -torch.expm1(-cube.sum(axis + 1) * step * scales[:, axis, None, None])
         u, v = (a for a in range(3) if a != axis)
         flat = spread[:, [u, u, v, v], [u, v, u, v]].reshape(n, 2, 2)
-        d = grid - mean[:, [u, v]][:, None, None]
-        inverse = torch.linalg.inv(flat + 1e-12 * torch.eye(2, dtype=torch.float64))
-        alphas.append(alpha)
+        alphas.append(alpha[every, middle[:, u], middle[:, v]])
         areas.append(alpha.sum((1, 2)) * step * step)
         bells.append(2 * torch.pi * torch.linalg.det(flat).clamp_min(1e-12).sqrt())
-        weights.append(scales[:, u] * scales[:, v])
-        squares.append(torch.einsum("nuvi,nij,nuvj->nuv", d, inverse, d))
-    covered = (torch.stack(weights) * torch.stack(areas)).sum(0)
-    best: tuple[Tensor, ...] = ()
-    for factor in _FACTORS:  # on the covariance; a bell's part outside of the screen is known in closed form
-        opacity = (covered / (torch.stack(weights) * torch.stack(bells) * factor).sum(0)).clamp(1e-6, _ALPHA_MAX)
-        error = torch.zeros_like(opacity)
-        for w, bell, square, alpha in zip(weights, bells, squares, alphas, strict=True):
-            common = (alpha * (-0.5 / factor * square).exp()).sum((1, 2)) * step * step
-            error = error + w * (opacity.square() * bell * factor / 2 - 2 * opacity * common)
-        new = (error, torch.full_like(error, factor), opacity)
-        best = tuple(torch.where(error < best[0], x, y) for x, y in zip(new, best, strict=True)) if best else new
-    _, wider, opacity = best
+        screens.append((alpha, flat, mean[:, [u, v]], scales[:, u] * scales[:, v]))
+    opacity = torch.stack(alphas).mean(0).clamp(1e-6, 1 - 1e-6)
+    if size == "footprint":
+        spread = spread * (torch.stack(areas) / (opacity * torch.stack(bells))).mean(0)[:, None, None]
+    elif size == "profile":
+        wider, opacity = _fit_gaussian_ply_profile(screens, torch.stack(areas), torch.stack(bells), ticks)
+        spread = spread * wider[:, None, None]
     world = R * scales[:, None, :]
     means = moved.means.double() + (world @ mean[:, :, None])[..., 0]
-    return means, world @ (spread * wider[:, None, None]) @ world.transpose(1, 2), opacity, kept
+    return means, world @ spread @ world.transpose(1, 2), opacity, kept
+
+
+def _fit_gaussian_ply_profile(
+    screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return (n,) factors on the covariance and (n,) opacities of the bells closest to three screens.
+
+    A screen is (alpha, covariance, mean, area). For each factor, the opacity keeps the integral of alpha, at most 0.99.
+    The factor with the least squared error wins; a bell's part outside of the screen is known in closed form.
+    """
+    step = ticks[1] - ticks[0]
+    weights = torch.stack([screen[3] for screen in screens])
+    u, v = torch.meshgrid(ticks, ticks, indexing="ij")
+    away = []
+    for _, flat, mean, _ in screens:
+        d = torch.stack([u - mean[:, 0, None, None], v - mean[:, 1, None, None]], -1)
+        inverse = torch.linalg.inv(flat + 1e-12 * torch.eye(2, dtype=torch.float64))
+        away.append(torch.einsum("nuvi,nij,nuvj->nuv", d, inverse, d))
+    best: tuple[Tensor, ...] = ()
+    for factor in _FACTORS:
+        opacity = ((weights * areas).sum(0) / (weights * bells * factor).sum(0)).clamp(1e-6, _ALPHA_MAX)
+        error = torch.zeros_like(opacity)
+        for weight, bell, square, (alpha, *_) in zip(weights, bells, away, screens, strict=True):
+            common = (alpha * (-0.5 / factor * square).exp()).sum((1, 2)) * step * step
+            error = error + weight * (opacity.square() * bell * factor / 2 - 2 * opacity * common)
+        new = (error, torch.full_like(error, factor), opacity)
+        best = tuple(torch.where(error < best[0], x, y) for x, y in zip(new, best, strict=True)) if best else new
+    return best[1], best[2]
 
 
 def draw_exported_gaussians(

@@ -124,7 +124,8 @@ class TimeHarmonics(ColourField):
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
         dc, xi = params["sh_dc"], get_frame_time(conditions)
-        for name, basis in self._terms(xi).items():
+        terms = self._terms(xi) if self.powers or self.waves else {}  # a frame of still colours computes none
+        for name, basis in terms.items():
             if name in params:
                 dc = dc + (params[name] * device.to_device_like(basis, dc)[:, None]).sum(1)
         return dc, params.get("sh_rest")

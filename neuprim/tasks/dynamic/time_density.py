@@ -372,10 +372,25 @@ def _mean_motion_over_time(params: Params, geometry: Geometry) -> dict[str, Tens
 WINDOW_EDGE = 2  # exponent of the window in time
 
 
+@exact_kernel
+def _rows_in_time_window_kernel(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
+    """How many there are; ``rows`` begins with them."""
+    found = 0
+    for n in range(center.shape[0]):
+        if abs(xi - np.float64(center[n, 0])) < np.exp(np.float64(log_window[n, 0])):
+            rows[found] = n
+            found += 1
+    return found
+
+
 def rows_in_time_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
     """Ascending int64 rows of (N, 1) tensors with abs(xi - center) < exp(log_window), in float64; no gradient."""
-    tau = log_window.detach()[:, 0].double().exp()
-    return ((xi - center.detach()[:, 0].double()).abs() < tau).nonzero()[:, 0]
+    center, log_window = center.detach(), log_window.detach()
+    if not device.on_numba(center, log_window):
+        return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
+    rows = np.empty(len(center), np.int64)
+    found = _rows_in_time_window_kernel(center.contiguous().numpy(), log_window.contiguous().numpy(), float(xi), rows)
+    return torch.from_numpy(rows[:found])
 
 
 class _TimeWindow(torch.autograd.Function):

@@ -258,7 +258,7 @@ def make_run_finetune_trainer(
         cooldown=0.0,
         rates={spec.name: scale * usual.rates.get(spec.name, spec.lr) for spec in copy.specs},
         max_seconds=None,
-        coarse=1,
+        stride=1,
         warmup_steps=0,
         voxels_every=min(usual.voxels_every, voxels_every),
         population=replace(config.train.population, strategy="fixed", grow_from=1.0),

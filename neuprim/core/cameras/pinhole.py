@@ -48,6 +48,12 @@ class Camera:
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
+    def strided(self, stride: int, column: int, row: int) -> Camera:
+        """Return the view of every ``stride``-th pixel in x and y, from (``column``, ``row``) on: their rays."""
+        cx, cy = ((c - first - 0.5) / stride + 0.5 for c, first in ((self.cx, column), (self.cy, row)))
+        width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
+        return Camera(self.viewmat, self.fx / stride, self.fy / stride, cx, cy, width, height)
+
     def project(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """Return (N, 2) pixels and (N,) depths of (N, 3) points, float64; pixels are valid for depth > 0."""
         view = self.viewmat.double()

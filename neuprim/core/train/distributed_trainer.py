@@ -120,15 +120,15 @@ class DistributedTrainer(Trainer):
         return self._stopping
 
     def _draw_views(self) -> list[ViewTask]:
-        drawn = [(self._next_view(), self._draw_background()) for _ in range(self.settings.views_per_step * self.ranks)]
+        drawn = [self._draw_view() for _ in range(self.settings.views_per_step * self.ranks)]
         own = drawn[self.rank :: self.ranks]
         after = int(self.order[self.rank]) if len(self.order) > self.rank else None
-        upcoming = [*(index for index, _ in own[1:]), after]
+        upcoming = [*(index for index, *_ in own[1:]), after]
         self._checksum = int(self.model.params["means"].detach().view(torch.int32).sum())
         if self._sums is None or not self._sums.fits(self.model.params):
             self._sums = GradientSum(self.model.params, self.group)
         self._present = [False] * len(self.model.params)
-        return [ViewTask(index, background, then) for (index, background), then in zip(own, upcoming, strict=True)]
+        return [ViewTask(*view, then) for view, then in zip(own, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
         assert self._sums is not None

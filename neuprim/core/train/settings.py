@@ -109,8 +109,8 @@ class TrainSettings:
         iterations: steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A command line
             that types ``max_seconds`` alone means that: all the seconds are used, however fast the machine.
         views_per_step: views of a step; gradients are their mean. A GPU has room for several small images.
-        coarse: factor by which training views are reduced at first; 1 for none. It is halved, rounded down, until
-            ``coarse_until``, a fraction of the budget, from which on views are as they are.
+        stride: a step renders every stride-th pixel of a view in x and y, from a random first one; 1 renders whole
+            views. "auto" lets the pixels of a step take about as long as its primitives, and is finer towards the end.
         angular_size: limit of a primitive's largest semi-axis over its distance to the nearest training camera; null
             for none.
         exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed
@@ -141,8 +141,7 @@ class TrainSettings:
 
     iterations: Annotated[int, Range(at_least=0)] | None = 30_000
     views_per_step: Annotated[int, Range(1, 1024)] = 1
-    coarse: Annotated[int, Range(1, 64)] = 1
-    coarse_until: Share = 0.3
+    stride: Annotated[int, Range(1, 64)] | Literal["auto"] = 1
     angular_size: Annotated[float, Range(above=0)] | None = None
     exposure_rate: NotNegative = 0.0
     max_seconds: Annotated[float, Range(above=0, says="a positive number of seconds")] | None = None

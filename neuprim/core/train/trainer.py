@@ -35,10 +35,12 @@ from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer_state import check_state, select_state_tensors
 from neuprim.core.train.training_views import (
     Exposures,
+    PixelStride,
     Prefetcher,
+    choose_stride,
+    count_covered_pixels,
+    draw_stride,
     hash_training_views,
-    reduce_training_view,
-    resolution_factor,
 )
 
 MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
@@ -65,10 +67,11 @@ class StepReport:
 
 
 class ViewTask(NamedTuple):
-    """A view to render by its index, its background, and the index of the view after it, if known."""
+    """A view to render by its index, its background, its pixels, and the index of the view after it, if known."""
 
     view: int
     background: Tensor
+    stride: PixelStride
     upcoming: int | None
 
 
@@ -143,6 +146,7 @@ class Trainer:
         size, rate = settings.angular_size, settings.exposure_rate
         self.max_screen_size = None if size is None else MaxScreenSize(train, size)
         self.exposures = Exposures(len(train), dataset.channels, rate, self.device) if rate > 0 else None
+        self.covered_pixels = count_covered_pixels(train) if settings.stride == "auto" else 0.0
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order, self.step, self.elapsed = torch.empty(0, dtype=torch.int64), 0, 0.0
         self.fake_quantize: Callable[[dict[str, Tensor]], dict[str, Tensor]] | None = None
@@ -271,9 +275,9 @@ class Trainer:
         """Draw the views of a step with their backgrounds; none for ``train.supervision=voxels``."""
         if self.settings.supervision == "voxels":
             return []
-        drawn = [(self._next_view(), self._draw_background()) for _ in range(self.settings.views_per_step)]
-        upcoming = [*(index for index, _ in drawn[1:]), int(self.order[0]) if len(self.order) else None]
-        return [ViewTask(index, background, then) for (index, background), then in zip(drawn, upcoming, strict=True)]
+        drawn = [self._draw_view() for _ in range(self.settings.views_per_step)]
+        upcoming = [*(index for index, *_ in drawn[1:]), int(self.order[0]) if len(self.order) else None]
+        return [ViewTask(*view, then) for view, then in zip(drawn, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
         """Called after the backward pass of each view, whose gradients one process adds to those of earlier views."""
@@ -291,12 +295,15 @@ class Trainer:
 
     # ------------------------------------------------------------ parts of a step
 
-    def _next_view(self) -> int:
-        """Index of the next view: random order without replacement."""
+    def _draw_view(self) -> tuple[int, Tensor, PixelStride]:
+        """Draw the next view, in random order without replacement, its background and its pixels."""
+        train, settings = self.dataset.train, self.settings
         if len(self.order) == 0:
-            self.order = torch.randperm(len(self.dataset.train), generator=self.generator)
+            self.order = torch.randperm(len(train), generator=self.generator)
         index, self.order = int(self.order[0]), self.order[1:]
-        return index
+        background = self._draw_background()
+        stride = choose_stride(settings.stride, self.covered_pixels, self.model.count, self.progress)
+        return index, background, draw_stride(stride, train.view(index), self.generator)
 
     def _draw_background(self) -> Tensor:
         choice, channels = self.settings.background, self.dataset.channels
@@ -329,10 +336,9 @@ class Trainer:
 
     def _render_view(self, task: ViewTask, progress: float) -> _RenderedView:
         """Render a view and compare it with its image."""
-        index, settings = task.view, self.settings
+        index = task.view
         pixels = self._load_pixels(index) if self.prefetcher is None else self.prefetcher.take(index, task.upcoming)
-        factor = resolution_factor(progress, settings.coarse, settings.coarse_until)
-        view, pixels = reduce_training_view(self.dataset.train.view(index), pixels, factor)
+        view, pixels = task.stride.take(self.dataset.train.view(index), pixels)
         background = task.background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)

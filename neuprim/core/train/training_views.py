@@ -1,4 +1,4 @@
-"""Training views: loaded one ahead on a GPU, reduced early in the training, with a gain per photograph."""
+"""Training views: loaded one ahead on a GPU, some of their pixels in a step, with a gain per photograph."""
 
 from __future__ import annotations
 
@@ -8,15 +8,24 @@ from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import replace
+from typing import Literal, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neuprim.core.data import Pixels, View, ViewSet
-from neuprim.core.data.image_views import average_pixels, reduce_image_mask
 
-_MIN_SIDE = 16
-"""Pixels along a side that no reduction goes below."""
+_MIN_SIDE = 11
+"""Pixels along a side that no stride goes below: the window of SSIM."""
+
+_PIXELS_PER_PRIMITIVE = 3.2
+"""Covered pixels of a view that take as long in a step on the CPU as one primitive does."""
+
+_COUNTED_VIEWS = 16
+"""Views whose covered pixels are counted, spread over the training set."""
+
+_STRIDE_STAGES = ((0.7, 1), (0.9, 2))
+"""Used fraction of the budget -> divisor of the automatic stride until then; from the last one on views are whole."""
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
@@ -51,32 +60,55 @@ class Prefetcher:
         return pixels
 
 
-def resolution_factor(progress: float, coarse: int, until: float) -> int:
-    """Factor by which views are reduced at this used fraction of the budget.
+class PixelStride(NamedTuple):
+    """Every ``step``-th pixel of a view in x and y, the first at (``column``, ``row``)."""
 
-    It starts at ``coarse`` and is halved, rounded down, after equal shares of the time up to ``until``; from there on
-    it is 1.
+    step: int = 1
+    column: int = 0
+    row: int = 0
+
+    def take(self, view: View, pixels: Pixels) -> tuple[View, Pixels]:
+        """The view that has these pixels alone: its rays and colours are theirs, nothing is averaged."""
+        if self.step == 1:
+            return view, pixels
+        rgb, alpha, mask = (
+            None if x is None else x[self.row :: self.step, self.column :: self.step].contiguous()
+            for x in (pixels.rgb, pixels.alpha, pixels.mask)
+        )
+        assert rgb is not None
+        return replace(view, camera=view.camera.strided(*self)), Pixels(rgb, alpha, mask)
+
+
+def count_covered_pixels(views: ViewSet) -> float:
+    """Mean number of pixels of a training view that show something: with alpha above 0, and not masked."""
+    chosen = range(0, len(views), -(-len(views) // _COUNTED_VIEWS))
+    total = 0
+    for pixels in map(views.pixels, chosen):
+        covered = torch.ones(pixels.rgb.shape[:2], dtype=torch.bool) if pixels.alpha is None else pixels.alpha > 0
+        total += int((covered if pixels.mask is None else covered & pixels.mask).sum())
+    return total / len(chosen)
+
+
+def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int, progress: float) -> int:
+    """The step between pixels at this used fraction of the budget.
+
+    ``auto`` balances the work per pixel, which falls with the square of the stride, and that per primitive, which does
+    not: on either side of the balance a step costs more than it teaches. It depends on sizes alone.
     """
-    if coarse <= 1 or progress >= until:
-        return 1
-    stages = coarse.bit_length() - 1
-    return coarse >> min(int(progress / until * stages), stages)
+    if stride != "auto":
+        return stride
+    divisor = next((divisor for until, divisor in _STRIDE_STAGES if progress < until), None)
+    balance = round(math.sqrt(covered / (_PIXELS_PER_PRIMITIVE * primitives)))
+    return 1 if divisor is None else max(balance // divisor, 1)
 
 
-def reduce_training_view(view: View, pixels: Pixels, factor: int) -> tuple[View, Pixels]:
-    """Average a view over blocks of ``factor`` x ``factor`` pixels; the remainder at the right and bottom is cut off.
-
-    Colours are premultiplied, so the mean is what a camera with larger pixels sees. A large pixel is valid where all
-    of its parts are.
-    """
-    camera = view.camera
-    while factor > 1 and min(camera.width, camera.height) // factor < _MIN_SIDE:
-        factor //= 2
-    if factor == 1:
-        return view, pixels
-    alpha = None if pixels.alpha is None else average_pixels(pixels.alpha[..., None], factor)[..., 0]
-    mask = None if pixels.mask is None else reduce_image_mask(pixels.mask, factor)
-    return replace(view, camera=camera.reduced(factor)), Pixels(average_pixels(pixels.rgb, factor), alpha, mask)
+def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:
+    """Draw the first pixel. A stride that leaves a view fewer than 11 pixels a side is lowered; 1 draws nothing."""
+    stride = max(min(stride, min(view.camera.width, view.camera.height) // _MIN_SIDE), 1)
+    if stride == 1:
+        return PixelStride()
+    column, row = torch.randint(stride, (2,), generator=generator).tolist()
+    return PixelStride(stride, column, row)
 
 
 def hash_training_views(views: ViewSet) -> str:

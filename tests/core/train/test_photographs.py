@@ -15,7 +15,7 @@ from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.train import training_views
 from neuprim.core.train.losses import MaxScreenSize
 from neuprim.core.train.trainer import Trainer
-from neuprim.core.train.training_views import Exposures, reduce_training_view, resolution_factor
+from neuprim.core.train.training_views import Exposures
 from tests.core import tiny
 
 
@@ -45,49 +45,6 @@ class Gained(ViewSet):
     def pixels(self, index: int) -> Pixels:
         found = self.views.pixels(index)
         return Pixels(found.over(torch.ones(3)) * self.gains[index])
-
-
-def test_the_factor_halves_in_equal_shares() -> None:
-    at = [resolution_factor(p, 8, 0.3) for p in (0.0, 0.09, 0.1, 0.19, 0.2, 0.29, 0.3, 1.0)]
-    assert at == [8, 8, 4, 4, 2, 2, 1, 1]
-    assert [resolution_factor(p, 6, 0.4) for p in (0.0, 0.2, 0.4)] == [6, 3, 1]
-    assert {resolution_factor(p / 10, 1, 0.3) for p in range(11)} == {1}
-
-
-def test_a_coarse_view_is_the_mean_of_what_it_covers(plain: Dataset) -> None:
-    view, pixels = plain.train.view(0), plain.train.pixels(0)
-    height, width = pixels.rgb.shape[:2]
-    mask = torch.ones(height, width, dtype=torch.bool)
-    mask[1, 0] = False
-    small, rough = reduce_training_view(view, replace(pixels, mask=mask), 2)
-    assert rough.rgb.shape == (height // 2, width // 2, 3) == (small.camera.height, small.camera.width, 3)
-    assert torch.allclose(rough.rgb[3, 5], pixels.rgb[6:8, 10:12].mean((0, 1)), atol=1e-6)
-    if pixels.alpha is not None and rough.alpha is not None:
-        assert torch.allclose(rough.alpha[3, 5], pixels.alpha[6:8, 10:12].mean(), atol=1e-6)
-    assert rough.mask is not None and not rough.mask[0, 0] and int((~rough.mask).sum()) == 1
-    point = torch.tensor([0.05, -0.1, 0.2, 1.0], dtype=torch.float64)
-    fine, far = (camera.K @ (camera.viewmat @ point)[:3] for camera in (view.camera, small.camera))
-    assert torch.allclose(fine[:2] / fine[2], 2 * far[:2] / far[2]), "where a point is seen does not move"
-
-
-def test_a_view_is_never_reduced_to_nothing(plain: Dataset) -> None:
-    view, pixels = plain.train.view(0), plain.train.pixels(0)
-    small, few = reduce_training_view(view, pixels, 1024)
-    assert 4 <= small.camera.width < 8 and few.rgb.shape[1] == small.camera.width
-
-
-def test_coarse_steps_look_at_small_images(plain: Dataset, monkeypatch: pytest.MonkeyPatch) -> None:
-    sizes = []
-    from neuprim.core.train import trainer as module
-
-    drawn = module.render
-    monkeypatch.setattr(
-        module, "render", lambda m, camera, *rest: sizes.append(camera.width) or drawn(m, camera, *rest)
-    )
-    for _ in tiny.trainer(plain, 20, coarse=2, coarse_until=0.5).run():
-        pass
-    full = plain.train.view(0).camera.width
-    assert sizes == [full // 2] * 10 + [full] * 10
 
 
 def test_gains_are_found_and_their_mean_is_one(plain: Dataset) -> None:

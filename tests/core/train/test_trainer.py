@@ -78,7 +78,7 @@ def test_half_saved_loaded_and_half_is_the_whole(strategy: str, random_backgroun
     """N chosen so that the stop falls in the middle of an epoch and between two interventions."""
 
     def make() -> Trainer:
-        smooth = {"warmup_steps": 5, "anisotropy_weight": 1e-3, "anisotropy_from": 15}
+        smooth = {"warmup_steps": 5, "anisotropy_weight": 1e-3, "anisotropy_from": 15, "stride": 2}
         return tiny.trainer(random_background, 40, population=STRATEGIES[strategy], **smooth)
 
     whole = make()

@@ -194,6 +194,9 @@ def prepare_training(
     else:
         events(Preparing("starting points"))
         trainer = make_run_trainer(job, dataset, loss, group)
+        wanted, found = config.model.primitives, trainer.model.count
+        if found < wanted and config.train.population.strategy != "relocate":
+            events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={wanted:,}"))
     # every later command uses the near plane that the trainer chose
     config = replace(config, renderer=replace(config.renderer, near=trainer.renderer.near))
     split = "train, held out" if hold_out and make is None else "test"
@@ -215,6 +218,10 @@ def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iter
                 events(Evaluated(held_out))
             next_point = _next_run_curve_progress(trainer)
         yield report, held_out
+    count, wanted = trainer.model.count, trainer.settings.population.grow_to or 0
+    if trainer.settings.population.strategy == "relocate" and count < wanted:
+        why = "too few interventions of the population, or places with an error, to split for the others"
+        events(Note(f"{count:,} primitives of model.primitives={wanted:,}: {why}; see train.population.every"))
 
 
 def _next_run_curve_progress(trainer: Trainer) -> float:

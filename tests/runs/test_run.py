@@ -25,7 +25,7 @@ from neuprim.core import checkpoint, errors
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimWarning
 from neuprim.core.io.files import write_text
-from neuprim.runs.fit import measure_run_curve_point, prepare_training, train_to_end
+from neuprim.runs.fit import Event, Note, measure_run_curve_point, prepare_training, train_to_end
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics, result_files
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -395,6 +395,29 @@ def test_a_share_of_the_primitives_is_there_at_first_and_all_at_the_end(
     assert fitted.model.count == first
     train_to_end(fitted)
     assert fitted.model.count == 40
+
+
+@pytest.mark.parametrize(
+    ("words_of_population", "said"),
+    [
+        (["grow_from=0.2", "every=30"], "32 primitives of model.primitives=40: too few interventions"),
+        (["strategy=fixed", "grow_from=1"], "two offers 3 starting points for model.primitives=40"),
+    ],
+)
+def test_a_count_that_is_not_reached_is_said(
+    scene: Path, tmp_path: Path, words_of_population: list[str], said: str
+) -> None:
+    more = [f"train.population.{word}" for word in words_of_population]
+    if "strategy=fixed" in words_of_population:
+        names = "".join(f"property float {axis}\n" for axis in "xyz")
+        head = f"ply\nformat ascii 1.0\nelement vertex 3\n{names}end_header\n"
+        write_text(tmp_path / "three.ply", head + "0 0 0\n0.1 0 0\n0 0.1 0\n")
+        more.append(f"model.init.points={tmp_path / 'three.ply'}")
+    events: list[Event] = []
+    fitted = prepare_training(compose(words(scene, tmp_path / "out", 100, *more, "train.eval_every=0")), events.append)
+    train_to_end(fitted, events.append)
+    notes = [event.text for event in events if isinstance(event, Note)]
+    assert len(notes) == 1 and said in notes[0]
 
 
 def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None:

@@ -66,7 +66,7 @@ CORE: dict[str, set[str]] = {
     "io": {"errors"},
     "validation": {"errors"},
     "settings": {"validation", "errors"},
-    "metrics": {"errors"},
+    "metrics": {"compute", "errors"},
     "cameras": {"errors", "io"},
     "compute": {"errors", "io"},
     "environment": {"errors", "io"},

@@ -49,12 +49,19 @@ class Pixels:
         alpha, mask = (None if x is None else hardware.copy_to_device(x, device) for x in (self.alpha, self.mask))
         return Pixels(hardware.copy_to_device(self.rgb, device), alpha, mask)
 
+    def strided(self, step: int, column: int, row: int) -> Pixels:
+        """Copy every ``step``-th pixel in x and y, the first at (``column``, ``row``)."""
+        chosen = slice(row, None, step), slice(column, None, step)
+        alpha, mask = (None if x is None else x[chosen].contiguous() for x in (self.alpha, self.mask))
+        return Pixels(self.rgb[chosen].contiguous(), alpha, mask)
+
     def over(self, background: Tensor) -> Tensor:
         """Composite over a (C,) colour: (H, W, C). Opaque pixels are returned unchanged."""
-        if self.alpha is None:
-            return self.rgb
-        uncovered, channels = (1.0 - self.alpha).reshape(-1), self.rgb.shape[-1]
-        return torch.addr(self.rgb.reshape(-1, channels), uncovered, background.to(self.rgb)).reshape(self.rgb.shape)
+        rgb, alpha = self.rgb, self.alpha
+        if alpha is None:
+            return rgb
+        uncovered, channels = (1.0 - alpha).reshape(-1), rgb.shape[-1]
+        return torch.addr(rgb.reshape(-1, channels), uncovered, background.to(rgb)).reshape(rgb.shape)
 
 
 class ViewSet(ABC):

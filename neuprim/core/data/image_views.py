@@ -6,8 +6,10 @@ import threading
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +19,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import resolve_threads
 from neuprim.core.data import Pixels, View, ViewSet
 from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.images import ImageInfo, read_image, read_mask_image, srgb_to_linear
@@ -176,6 +179,15 @@ class ImageFrame:
     conditions: Conditions = field(default_factory=dict)  # time, light, ...; empty for static scenes
 
 
+@exact_kernel
+def _premultiply_dataset_kernel(rgba, rgb):  # type: ignore[no-untyped-def]
+    scale = np.float32(1.0 / 255.0)
+    for i in range(rgba.shape[0]):
+        a = np.float32(rgba[i, 3]) * scale
+        for c in range(3):
+            rgb[i, c] = np.float32(rgba[i, c]) * scale * a
+
+
 @dataclass(frozen=True)
 class _StoredImage:
     """Final pixels of a view, (H, W, C) uint8, half or float, and which of them count."""
@@ -183,23 +195,69 @@ class _StoredImage:
     data: Tensor
     premultiplied: bool
     mask: Tensor | None
+    to_linear: bool = False  # whether 8-bit colours are converted to linear light
+    scale: float = 1.0  # factor of colours after that
+
+    def strided(self, step: int, column: int, row: int) -> _StoredImage:
+        few = Pixels(self.data, None, self.mask).strided(step, column, row)
+        return replace(self, data=few.rgb, mask=few.mask)
+
+    @property
+    def alpha(self) -> Tensor | None:
+        """(H, W) float32, None without."""
+        if self.data.shape[-1] == 3:
+            return None
+        alpha = self.data[..., 3].float()
+        if self.data.dtype == torch.uint8:
+            alpha = alpha * (1.0 / 255.0) if self._by_kernel else alpha / 255.0
+        return alpha.contiguous()
+
+    @property
+    def rgb(self) -> Tensor:
+        """(H, W, 3) float32, premultiplied."""
+        if self._by_kernel:  # in one pass, as every step needs them
+            rgb = torch.empty(*self.data.shape[:2], 3)
+            _premultiply_dataset_kernel(self.data.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy())
+            return rgb
+        rgb, eight_bit = self.data[..., :3], self.data.dtype == torch.uint8
+        if not self.to_linear:
+            return (rgb / 255.0 if eight_bit else rgb.float()).contiguous()
+        rgb = _LINEAR[rgb.int()] if eight_bit else rgb.float()
+        alpha = None if self.premultiplied else self.alpha
+        return ((rgb if alpha is None else rgb * alpha[..., None]) * self.scale).contiguous()
+
+    @property
+    def _by_kernel(self) -> bool:
+        """Whether these are 8-bit sRGB colours to be multiplied with alpha."""
+        return not (self.premultiplied or self.to_linear or self.data.shape[-1] == 3)
 
 
-@exact_kernel
-def _premultiply_dataset_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
-    scale = np.float32(1.0 / 255.0)
-    for i in range(rgba.shape[0]):
-        a = np.float32(rgba[i, 3]) * scale
-        alpha[i] = a
-        for c in range(3):
-            rgb[i, c] = np.float32(rgba[i, c]) * scale * a
+class StoredPixels(Pixels):
+    """Pixels of a stored image that become floats when they are first used: of a strided view its own alone, and alpha
+    alone where nobody asks for colours.
 
+    Args:
+        image: the image, or None with the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
+    """
 
-def _premultiply_dataset_pixels(rgba: Tensor) -> tuple[Tensor, Tensor]:
-    """(H, W, 3) and (H, W) floats of straight-alpha 8-bit pixels, in one pass, as every step needs them."""
-    rgb, alpha = torch.empty(*rgba.shape[:2], 3), torch.empty(rgba.shape[:2])
-    _premultiply_dataset_kernel(rgba.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy())
-    return rgb, alpha
+    image: _StoredImage | None
+
+    def __init__(self, image: _StoredImage | None = None, **fields: Any) -> None:
+        self.__dict__.update(fields if image is None else {"mask": image.mask}, image=image)
+
+    @cached_property
+    def rgb(self) -> Tensor:  # type: ignore[override]
+        assert self.image is not None
+        return self.image.rgb
+
+    @cached_property
+    def alpha(self) -> Tensor | None:  # type: ignore[override]
+        return None if self.image is None else self.image.alpha
+
+    def strided(self, step: int, column: int, row: int) -> Pixels:
+        if self.image is None:
+            return super().strided(step, column, row)
+        return StoredPixels(self.image.strided(step, column, row))
 
 
 class ImageViews(ViewSet):
@@ -240,27 +298,7 @@ class ImageViews(ViewSet):
 
     def pixels(self, index: int) -> Pixels:
         """Read a view; raises DataError if the file is missing, damaged or changed, or its mask leaves nothing."""
-        stored = self._load_image(range(len(self))[index])
-        if self._to_linear:
-            return self._linear_pixels(stored)
-        if stored.data.dtype == torch.uint8 and stored.data.shape[-1] == 4 and not stored.premultiplied:
-            return Pixels(*_premultiply_dataset_pixels(stored.data), stored.mask)
-        data = stored.data.float()
-        if stored.data.dtype == torch.uint8:
-            data = data / 255.0
-        if data.shape[-1] == 3:
-            return Pixels(data, None, stored.mask)
-        rgb, alpha = data[..., :3], data[..., 3]
-        rgb = rgb.contiguous() if stored.premultiplied else rgb * alpha[..., None]
-        return Pixels(rgb, alpha.contiguous(), stored.mask)
-
-    def _linear_pixels(self, stored: _StoredImage) -> Pixels:
-        rgb, alpha = stored.data[..., :3], stored.data[..., 3] if stored.data.shape[-1] == 4 else None
-        rgb = _LINEAR[rgb.int()] if rgb.dtype == torch.uint8 else rgb.float()
-        if alpha is not None:
-            alpha = alpha / 255.0 if alpha.dtype == torch.uint8 else alpha.float().contiguous()
-            rgb = rgb if stored.premultiplied else rgb * alpha[..., None]
-        return Pixels((rgb * self.scale).contiguous(), alpha, stored.mask)
+        return StoredPixels(replace(self._load_image(range(len(self))[index]), scale=self.scale))
 
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
@@ -277,7 +315,7 @@ class ImageViews(ViewSet):
             return DataError(f"{self.file(index)}: image is transparent everywhere; expected something to see")
 
         faults = {}
-        with ThreadPoolExecutor(4) as pool:
+        with ThreadPoolExecutor(resolve_threads(0)) as pool:
             for index, error in enumerate(pool.map(fault, range(len(self)))):
                 if error is not None:
                     faults[index] = error
@@ -321,7 +359,7 @@ class ImageViews(ViewSet):
             raise DataError(f"{frame.path}: mask and lens distortion leave no pixel that counts; expected at least one")
         if image.dtype == torch.float32 and image.abs().max() <= 65504.0:
             image = image.half()
-        return _StoredImage(image, premultiplied, mask)
+        return _StoredImage(image, premultiplied, mask, self._to_linear)
 
     def _resample_frame(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Undistort and reduce; colours become premultiplied, the number type stays."""

@@ -1,8 +1,6 @@
 """Measures of images against their truth."""
 
 from neuprim.core.metrics.image import (
-    SSIM_SIGMA,
-    SSIM_WINDOW,
     comparable_images,
     mean_metrics,
     metric_from_json,
@@ -12,6 +10,7 @@ from neuprim.core.metrics.image import (
     ssim,
     ssim_3dgs,
 )
+from neuprim.core.metrics.ssim_float64 import SSIM_SIGMA, SSIM_WINDOW
 
 __all__ = [
     "SSIM_SIGMA",

@@ -12,17 +12,13 @@ from typing import Any
 
 import numpy as np
 import torch
-from kornia.metrics import ssim as ssim_map
 from torch import Tensor
 from torch.nn.functional import pad
 
 from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.core.metrics.ssim_float64 import SSIM_WINDOW, mean_ssim
 
 _MAX_NAMED = 6  # views in one line; metrics.json names all
-
-SSIM_WINDOW = 11  # taps of the Gaussian window per axis (Wang et al. 2004)
-
-SSIM_SIGMA = 1.5  # standard deviation of that window in pixels; kornia fixes it
 
 
 def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
@@ -76,19 +72,23 @@ def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak:
 
 
 def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
-    """Structural similarity, the mean over pixels and channels of kornia's SSIM map, in -1..1 and 1 for equal images.
+    """Structural similarity, the mean over pixels and channels, in -1..1 and 1 for equal images.
 
     An 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only positions where the window lies inside the
     image ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data
-    range L.
+    range L. Equal to kornia's in float64.
     """
     first, second = comparable_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
         raise DataError(f"peak must be a positive number, found {peak}")
     fitting = min(first.shape[0], first.shape[1])
-    window = min(SSIM_WINDOW, fitting - 1 + fitting % 2)
+    if fitting >= SSIM_WINDOW:
+        return mean_ssim(first, second, float(peak))
+    from kornia.metrics import ssim as ssim_map  # slow to import, and only tiny images need it
+
     first, second = (image.permute(2, 0, 1)[None].contiguous() for image in (first, second))
     # kornia's eps would keep equal dark images below 1; the two constants already keep the denominator positive.
+    window = fitting - 1 + fitting % 2
     return ssim_map(first, second, window_size=window, max_val=float(peak), eps=0.0, padding="valid").mean().item()
 
 
@@ -99,9 +99,8 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
     is mostly higher. Nothing is quantised, as those tools do.
     """
     first, second = comparable_images(rendered, truth)
-    border = SSIM_WINDOW // 2
-    first, second = (pad(image.permute(2, 0, 1)[None], (border,) * 4) for image in (first, second))
-    return ssim_map(first, second, window_size=SSIM_WINDOW, max_val=1.0, eps=0.0, padding="valid").mean().item()
+    border = (0, 0, *(SSIM_WINDOW // 2,) * 4)
+    return mean_ssim(pad(first, border), pad(second, border), 1.0)
 
 
 def metric_to_json(key: str, value: float) -> dict[str, float | bool | None]:

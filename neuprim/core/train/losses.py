@@ -13,7 +13,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import torch
-from kornia.metrics import ssim as kornia_ssim
 from scipy.spatial import cKDTree
 from torch import Tensor
 
@@ -47,6 +46,8 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
     l1 = (rendered - truth).abs().mean()
     if ssim_weight == 0 or min(rendered.shape[:2]) < _WINDOW:
         return l1, {"l1": l1.item()}
+    from kornia.metrics import ssim as kornia_ssim  # slow to import, and the fused versions do without
+
     with torch.backends.cudnn.flags(enabled=False):  # may round to ten bits, and variances are differences of blurs
         maps = kornia_ssim(rendered.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None], _WINDOW, padding="valid")
     similarity = maps.mean()

@@ -17,10 +17,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
-from neuprim.core.data import Dataset, Pixels, PointSamples
-from neuprim.core.data.dataset_check import check_pixels
+from neuprim.core.data import Dataset, PointSamples
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -35,8 +33,8 @@ from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.trainer_state import check_state, select_state_tensors
 from neuprim.core.train.training_views import (
     Exposures,
+    PixelLoader,
     PixelStride,
-    Prefetcher,
     choose_stride,
     count_covered_pixels,
     draw_stride,
@@ -139,9 +137,7 @@ class Trainer:
         self.extent = near_plane_extent(dataset.extent, model.params["means"], cameras)
         self.device = best_render_backend_device(model, self.renderer, cameras[0], train.view(0).conditions)
         model.params = model.to(self.device).params
-        self.prefetcher: Prefetcher | None = None
-        if self.device.type == device.CUDA:
-            self.prefetcher = Prefetcher(self._load_pixels, device.free_cuda_memory(self.device) // 4)
+        self.loader = PixelLoader(dataset, self.device)
         self.population = make_population(settings.population)
         size, rate = settings.angular_size, settings.exposure_rate
         self.max_screen_size = None if size is None else MaxScreenSize(train, size)
@@ -322,12 +318,6 @@ class Trainer:
         assert self.dataset.points is not None, "the constructor refuses data without points"
         return self.dataset.points.draw(self.settings.voxels_per_step, self.generator)
 
-    def _load_pixels(self, index: int) -> Pixels:
-        """Pixels of a training view, on the training's device."""
-        pixels = self.dataset.train.pixels(index)
-        check_pixels("train", self.dataset.train.view(index), pixels, self.dataset.channels)
-        return pixels.to(self.device)
-
     def _quantized_model(self) -> Primitives:
         """The model that images and points are rendered of."""
         if self.fake_quantize is None:
@@ -337,8 +327,7 @@ class Trainer:
     def _render_view(self, task: ViewTask, progress: float) -> _RenderedView:
         """Render a view and compare it with its image."""
         index = task.view
-        pixels = self._load_pixels(index) if self.prefetcher is None else self.prefetcher.take(index, task.upcoming)
-        view, pixels = task.stride.take(self.dataset.train.view(index), pixels)
+        view, pixels = task.stride.take(self.dataset.train.view(index), self.loader.take(index, task.upcoming))
         background = task.background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)

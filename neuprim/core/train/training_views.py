@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextvars import copy_context
 from dataclasses import replace
@@ -13,7 +13,10 @@ from typing import Literal, NamedTuple
 import torch
 from torch import Tensor
 
-from neuprim.core.data import Pixels, View, ViewSet
+from neuprim.core.compute import device
+from neuprim.core.data import Dataset, Pixels, View, ViewSet
+from neuprim.core.data.dataset_check import check_pixels
+from neuprim.core.data.image_views import StoredPixels
 
 _MIN_SIDE = 11
 """Pixels along a side that no stride goes below: the window of SSIM."""
@@ -30,22 +33,27 @@ _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 
-class Prefetcher:
-    """Loads the pixels of the next view in a thread; it does not change which views are used.
+class PixelLoader:
+    """Loads the pixels of training views; for a GPU those of the next view in a thread, which does not change which
+    views are used, and keeps those that fit, as loading a large view again takes longer than a step."""
 
-    Args:
-        load: (index of a view) -> its pixels on the training's device; the same every time.
-        capacity: bytes of pixels to keep: loading a large view again takes longer than a step.
-    """
-
-    def __init__(self, load: Callable[[int], Pixels], capacity: int) -> None:
-        self._load, self._capacity = load, capacity
+    def __init__(self, dataset: Dataset, where: torch.device) -> None:
+        self._dataset, self._device = dataset, where
+        self._capacity = device.free_cuda_memory(where) // 4 if where.type == device.CUDA else 0
         self._cache: dict[int, Pixels] = {}
         self._pool: ThreadPoolExecutor | None = None
         self._pending: tuple[int, Future[Pixels]] | None = None
 
+    def _load(self, index: int) -> Pixels:
+        pixels = self._dataset.train.pixels(index)
+        if not isinstance(pixels, StoredPixels):  # they have the size of their view, and no floats yet
+            check_pixels("train", self._dataset.train.view(index), pixels, self._dataset.channels)
+        return pixels if self._device.type == device.HOST else pixels.to(self._device)
+
     def take(self, index: int, upcoming: int | None) -> Pixels:
         """Return a view's pixels, and start loading those of ``upcoming``, if it is known. Raises what loading did."""
+        if self._device.type == device.HOST:
+            return self._load(index)
         pending, self._pending = self._pending, None
         if index in self._cache:
             pixels = self._cache[index]
@@ -71,12 +79,7 @@ class PixelStride(NamedTuple):
         """The view that has these pixels alone: its rays and colours are theirs, nothing is averaged."""
         if self.step == 1:
             return view, pixels
-        rgb, alpha, mask = (
-            None if x is None else x[self.row :: self.step, self.column :: self.step].contiguous()
-            for x in (pixels.rgb, pixels.alpha, pixels.mask)
-        )
-        assert rgb is not None
-        return replace(view, camera=view.camera.strided(*self)), Pixels(rgb, alpha, mask)
+        return replace(view, camera=view.camera.strided(*self)), pixels.strided(*self)
 
 
 def count_covered_pixels(views: ViewSet) -> float:

@@ -9,8 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from kornia.metrics import ssim as ssim_map
 from scipy.signal import convolve2d
 
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.errors import DataError, NonFiniteError
 from neuprim.core.metrics import (
     SSIM_SIGMA,
@@ -111,6 +113,40 @@ def test_wrong_shapes_and_types_are_named(rendered: torch.Tensor, truth: torch.T
     for metric in (psnr, ssim):
         with pytest.raises(DataError, match=text):
             metric(rendered, truth)
+
+
+def kornia_ssim(rendered: torch.Tensor, truth: torch.Tensor, peak: float = 1.0) -> float:
+    first, second = (image.double().permute(2, 0, 1)[None] for image in (rendered, truth))
+    return ssim_map(first, second, window_size=11, max_val=peak, eps=0.0, padding="valid").mean().item()
+
+
+@pytest.mark.parametrize(("height", "width", "channels"), [(11, 700, 3), (300, 11, 1), (43, 61, 70), (130, 180, 3)])
+def test_ssim_equals_kornia(height: int, width: int, channels: int) -> None:
+    """More windows than one block has, more rows than one band, images next to equal, flat, bright, and not images."""
+    rendered, truth = pair(height, width, channels, seed=width)
+    flat, wild = torch.full_like(truth, 0.7), 1e3 * torch.randn(truth.shape, generator=torch.Generator().manual_seed(1))
+    images = [
+        (rendered, truth, 1.0),
+        (rendered.float(), truth.float(), 1.0),
+        (flat, flat + 1e-7, 1.0),
+        (flat, truth, 1.0),
+        (torch.ones_like(truth), torch.ones_like(truth) - 1e-3 * truth, 1.0),
+        (1.0 - truth, truth, 1.0),
+        (50 * rendered, 50 * truth, 50.0),
+        (wild.double(), truth, 1.0),
+    ]
+    for first, second, peak in images:
+        expected = kornia_ssim(first, second, peak)
+        found = ssim(first, second, peak)
+        assert found == pytest.approx(expected, abs=1e-10), (first.flatten()[0], peak)
+        with limit_threads(1):
+            assert ssim(first, second, peak) == found, "any number of threads gives the same bits"
+    border = (0, 0, 5, 5, 5, 5)
+    first, second = (image.clamp(0, 1) for image in (rendered, truth))
+    expected = kornia_ssim(*(torch.nn.functional.pad(image, border) for image in (first, second)))
+    assert ssim_3dgs(first, second) == pytest.approx(expected, abs=1e-10)
+    turned = [image.transpose(0, 1).contiguous().transpose(0, 1) for image in (rendered, truth)]
+    assert ssim(*turned) == ssim(rendered, truth), "strided tensors are read right"
 
 
 def test_non_finite_values_are_an_error_not_a_number() -> None:

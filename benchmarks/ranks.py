@@ -33,7 +33,7 @@ from neuprim.runs.fit import compile_run_kernels, fit, prepare_training, use_one
 
 RECORD = RESULTS / "ranks.json"
 SCENES = {
-    "solids": ("task=static", "scene=solids"),
+    "solids": ("task=static", "scene=solids", "scene.size=200"),
     "smoke_fire": ("task=dynamic", "scene=smoke_fire", "scene.size=64"),
     "lit_solids": ("task=relight", "scene=lit_solids", "scene.size=128"),
     "large": ("task=static", "scene=solids", "scene.size=400", "model.primitives=20000"),

@@ -48,7 +48,7 @@ LOCK_FILE = ".lock"
 """In the directory while it is locked; it names the process."""
 
 _RESULT_FILES = ("metrics.json", "report.html", "viewer.html")
-_RESULT_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst_\d{3,}\.png")
+_RESULT_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst_\d{3,}\.png|preview\.png")
 
 Progress = Callable[[str, float], None]
 

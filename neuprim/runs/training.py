@@ -23,6 +23,7 @@ from neuprim.core import checkpoint
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
 from neuprim.core.errors import CheckpointError, RankError, warn_once
+from neuprim.core.io import images
 from neuprim.core.io.files import write_text
 from neuprim.core.io.json_reader import load_json
 from neuprim.core.model.primitives import Primitives
@@ -46,9 +47,13 @@ from neuprim.runs.fit import (
     use_one_torch_thread_for_run,
 )
 from neuprim.runs.launch.jobs import interruptible_run
+from neuprim.runs.measure import render_image
 from neuprim.runs.open import discard_results
 
-CURVE_FILE = "metrics.jsonl"
+CURVE_FILE, PREVIEW_FILE = "metrics.jsonl", "renders/preview.png"
+
+PREVIEW_SECONDS = 5.0
+"""Training time until :data:`PREVIEW_FILE` is first written; each time after that is twice as far away."""
 
 BEGIN = 0.8
 """Progress of the run that the first step stands for."""
@@ -138,6 +143,8 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
     curve, saved = config.output_dir / CURVE_FILE, config.output_dir / "checkpoint.safetensors"
     cut_run_curve(curve, trainer.step)
     last_saved, interrupted = time.monotonic(), False
+    preview, wait = config.output_dir / PREVIEW_FILE, PREVIEW_SECONDS
+    preview_due = trainer.elapsed + wait
     try:
         with interruptible_run(terminated=trainer.ranks > 1) as stop, use_one_torch_thread_for_run():
             trainer.stop_requested = stop.is_set
@@ -157,6 +164,13 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
                     with _warn_of_unwritable_run_file(fitted, saved):
                         save_run_training(fitted)
                     last_saved = time.monotonic()
+                if trainer.elapsed >= preview_due:
+                    with _warn_of_unwritable_run_file(fitted, preview):
+                        write_run_preview(fitted, preview)
+                        if wait == PREVIEW_SECONDS:
+                            events(Note(f"a first picture, renewed as the training goes on: {preview}"))
+                    wait *= 2
+                    preview_due = trainer.elapsed + wait
                 between(fitted, stop)
                 if trainer.stopping:
                     interrupted = True
@@ -165,7 +179,22 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
         save_run_training(fitted)
         raise
     save_run_training(fitted)
+    if wait > PREVIEW_SECONDS:
+        with _warn_of_unwritable_run_file(fitted, preview):
+            write_run_preview(fitted, preview)
     return interrupted
+
+
+def write_run_preview(fitted: Fitted, path: Path) -> None:
+    """Write the middle held-out view, ground truth on the left and the model as it is now on the right.
+
+    Raises OSError; a picture that was there is intact then.
+    """
+    test, background = fitted.dataset.test, fitted.dataset.background
+    middle, display = len(test) // 2, fitted.channels.display
+    rendered = render_image(fitted.model, test.view(middle), fitted.trainer.renderer, background)
+    path.parent.mkdir(exist_ok=True)
+    images.write_png(path, torch.cat([display(x) for x in (test.pixels(middle).over(background), rendered)], dim=1))
 
 
 def _train_run_as_follower(trainer: Trainer) -> bool:

@@ -48,7 +48,7 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 class SolidsSettings:
     """Settings of ``scene=solids``: image size in pixels, images of each split, and rays per pixel side."""
 
-    size: ImageSize = 200
+    size: ImageSize = 512
     train_views: Annotated[int, Range(1, 10000)] = 80
     test_views: Annotated[int, Range(1, 10000)] = 20
     supersampling: Supersampling = 3

@@ -14,6 +14,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from PIL import Image
@@ -25,6 +26,7 @@ from neuprim.core import checkpoint, errors
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimWarning
 from neuprim.core.io.files import write_text
+from neuprim.runs import training
 from neuprim.runs.fit import Event, Note, measure_run_curve_point, prepare_training, train_to_end
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics, result_files
@@ -296,6 +298,24 @@ def test_what_cannot_go_on_leaves_an_earlier_run_alone(scene: Path, tmp_path: Pa
     header, tensors = checkpoint.read_tensors(out / "checkpoint.safetensors", "checkpoint")
     checkpoint.write_tensors(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
     refused(CheckpointError, r"checkpoint\.safetensors.*'dynamic'.*'static'")
+
+
+def test_a_preview_is_written_while_a_run_trains_and_changes_nothing(
+    scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(training, "PREVIEW_SECONDS", 1e-4)
+    out, seen, notes = tmp_path / "run", [], []
+    preview = out / "renders" / "preview.png"
+
+    def listen(event: Event) -> None:
+        notes.extend([event.text] if isinstance(event, Note) and "picture" in event.text else [])
+
+    run(compose(words(scene, out)), listen, lambda fitted, stop: seen.append(preview.is_file()))
+    assert not seen[0] and seen[1] and notes == [f"a first picture, renewed as the training goes on: {preview}"]
+    assert_same_run(whole, out)
+    (drawn,) = (p for p in (out / "renders").glob("test_001_*.png") if not p.stem.endswith(("_truth", "_error")))
+    pair = [Image.open(drawn.with_name(f"{drawn.stem}{end}.png")) for end in ("_truth", "")]
+    assert np.array_equal(np.asarray(Image.open(preview)), np.hstack([np.asarray(picture) for picture in pair]))
 
 
 # ---------------------------------------------------------------- results

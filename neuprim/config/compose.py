@@ -348,6 +348,9 @@ def _resolve_config(
     )
     if form is not None and tree.model.density.get("form", None if earlier else form) != form:
         OmegaConf.update(tree, "model.density", {}, merge=False)  # settings of another form mean nothing to it
+    colour, before = _find_typed_value(values, "model.colour", "form"), tree.model.colour.get("form")
+    if colour is not None and colour != before:
+        tree.model.colour.pop(str(before), None)  # a form's own settings have its name
     other_strategy = strategy is not None and tree.train.population.strategy != strategy
     for a in (*(() if level is None else level.settings), *values):
         try:

@@ -3,7 +3,7 @@
 renderer.KEY=VALUE       any setting of the renderer, over the run's own
 resolution=0.5           render at half the width and height, and upsample bilinearly
 density.NAME=N           a smaller density, for example fewer neurons (Field.reductions)
-colour.NAME=N            a smaller colour: bands of spherical harmonics, terms in time
+colour.NAME=N            a smaller colour: bands of spherical harmonics, lobes, terms in time
 
 A view is drawn as an image, or as layers of one OpenEXR file: linear light, numbers beside it, and the camera and
 conditions in its header.

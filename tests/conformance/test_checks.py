@@ -22,6 +22,7 @@ Check = Callable[[], None]
 VARIANTS: dict[str, tuple[TaskSpec, str | None, dict[str, Any]]] = {
     "static": (STATIC, None, {}),
     "static-gaussian": (STATIC, None, {"density": {"form": "gaussian"}, "sh_degree": 0}),
+    "static-lobes": (STATIC, None, {"colour": {"form": "lobes", "lobes": 2}}),
     "static-edge": (STATIC, None, {"density": {"edge": 1, "gain": True}, "sh_degree": 0}),
     "dynamic": (DYNAMIC, None, {}),
     "dynamic-edge": (

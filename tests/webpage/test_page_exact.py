@@ -21,7 +21,7 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
-from neuprim.tasks.static import SphericalHarmonics
+from neuprim.tasks.static import SphericalHarmonics, SphericalLobes
 from neuprim.webpage import PageView
 from tests.browsers import Tab, open_tab
 from tests.page_models import LIGHT, SETTINGS, camera_at, page_of, random_model
@@ -50,6 +50,22 @@ def error(
 def test_static_models(neurons: int, edge: int, chromium: Any, tmp_path: Path) -> None:
     degree = {0: 0, 2: 1, 5: 2, 8: 3}[neurons]
     model = random_model(CosineDensity(neurons, edge=edge, gain=edge > 0), SphericalHarmonics(degree))
+    page_of(model, tmp_path / "p.html")
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for eye in EYES:
+            assert error(tab, model, camera_at(eye), {}) < ERROR
+        assert tab.faults == []
+
+
+@pytest.mark.parametrize("lobes", [0, 1, 3])
+def test_colours_of_lobes(lobes: int, chromium: Any, tmp_path: Path) -> None:
+    """Some have no axis, the shortest that has one, or a sharpness beyond the limit."""
+    model = random_model(CosineDensity(2, edge=2), SphericalLobes(lobes))
+    if lobes:
+        model.params["lobe_axis"][:5] = 0
+        model.params["lobe_axis"][5:10] *= 1e-20
+        model.params["lobe_log_sharpness"][10:20] = torch.linspace(-50, 50, 10)[:, None]
+        model.params["lobe_amplitude"] *= 3
     page_of(model, tmp_path / "p.html")
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for eye in EYES:

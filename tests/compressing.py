@@ -47,6 +47,7 @@ FIELDS: dict[str, tuple[str, Callable[[], tuple[DensityField, ColourField]]]] = 
     "soft": ("static", lambda: (CosineDensity(2, edge=2, gain=True), field("static", "SphericalHarmonics", degree=1))),
     "bare": ("static", lambda: (CosineDensity(0), field("static", "SphericalHarmonics", degree=0))),
     "grey": ("static", lambda: (CosineDensity(1), field("static", "SphericalHarmonics", degree=2, channels=1))),
+    "lobes": ("static", lambda: (CosineDensity(2), field("static", "SphericalLobes", lobes=2))),
     "dynamic": (
         "dynamic",
         lambda: (

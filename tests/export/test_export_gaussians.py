@@ -211,6 +211,25 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
     assert np.allclose(found[0.5].rows["f_dc_0"] - found[0.25].rows["f_dc_0"], 0.1 * 0.25, atol=1e-6)
 
 
+def test_colours_of_lobes_are_fitted_and_the_loss_is_stated(tmp_path: Path) -> None:
+    model, generator = marked.static_model(), torch.Generator().manual_seed(2)
+    task = load_task("static")
+    assert task.fields is not None
+    params = {name: value for name, value in model.params.items() if name != "sh_rest"}
+    params |= {
+        "lobe_amplitude": 0.2 * torch.rand(5, 2, 3, generator=generator),
+        "lobe_axis": torch.randn(5, 2, 3, generator=generator),
+        "lobe_log_sharpness": torch.full((5, 2), 1.0),
+    }
+    run = marked.static_run(
+        tmp_path / "run",
+        Primitives(model.density, task.fields["SphericalLobes"](lobes=2), params),  # type: ignore[call-arg, arg-type]
+    )
+    report = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["views=orbit"])
+    assert any("no harmonics of the view; fitted" in note for note in report.notes) and report.errors["psnr"] > 15
+    assert 0 < fit_export_harmonics(open_run(run), {}).residual < 0.02
+
+
 def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> None:
     task = load_task("relight")
     assert task.fields is not None

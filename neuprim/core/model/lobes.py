@@ -23,8 +23,6 @@ from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
 AMPLITUDE, AXIS, LOG_SHARPNESS = "lobe_amplitude", "lobe_axis", "lobe_log_sharpness"
 """Names of the parameters (N, L, C), (N, L, 3) and (N, L)."""
 
-_NEARLY_UNIT = 0.25  # how far the length of a canonical axis may be from 1: what its quantisation leaves
-
 
 def lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
@@ -85,13 +83,6 @@ def random_lobe_axes(count: int, lobes: int, generator: torch.Generator) -> Tens
     """Draw (count, lobes, 3) float32 unit vectors, uniform over the sphere."""
     drawn = torch.randn((count, lobes, 3), generator=generator, dtype=torch.float64)
     return _unit_or_zero(drawn).float()
-
-
-def unit_lobe_axes(axis: Tensor) -> Tensor:
-    """Scale axes (N, L, 3) to length 1; zeros and what is nearly of that length stay as they are."""
-    length = axis.detach().double().norm(dim=-1, keepdim=True)
-    unit = _unit_or_zero(axis.detach().double()).to(axis)
-    return torch.where((length - 1).abs() <= _NEARLY_UNIT, axis.detach(), unit)
 
 
 def reduce_lobes(params: Params, keep: int) -> dict[str, Tensor]:

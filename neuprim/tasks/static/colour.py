@@ -109,9 +109,6 @@ class SphericalLobes(ColourField):
         names = (AMPLITUDE, AXIS, LOG_SHARPNESS)
         return tuple(PrunableUnit(f"lobe {j}", dict.fromkeys(names, (j,))) for j in range(self.lobes))
 
-    def canonicalize(self, params: Params) -> dict[str, Tensor]:
-        return {**params, AXIS: lobes.unit_lobe_axes(params[AXIS])} if self.lobes else dict(params)
-
     def script(self) -> str:
         return read_script(__package__, "lobes.js")
 

@@ -21,12 +21,15 @@ from neuprim.tasks.static.colour import SphericalHarmonics, SphericalLobes
 __all__ = ["TASK", "SphericalHarmonics", "SphericalLobes"]
 
 
+_USUAL_LOBES = 2  # of a primitive, where model.colour.lobes says nothing
+
+
 def _build_static_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     chosen = dict(model["density"])
     gaussian = chosen.pop("form", "cosine") == "gaussian"
     density = GaussianDensity() if gaussian else CosineDensity(model["neurons"], **chosen)
     if model["colour"].get("form") == "lobes":
-        return density, SphericalLobes(model["colour"].get("lobes", 1), dataset.channels)
+        return density, SphericalLobes(model["colour"].get("lobes", _USUAL_LOBES), dataset.channels)
     return density, SphericalHarmonics(model["sh_degree"], dataset.channels, model["sh_every"])
 
 
@@ -46,7 +49,7 @@ def _check_colour_settings(colour: Mapping[str, Any], degree: int) -> None:
             raise ConfigError(f"model.colour.lobes={colour['lobes']}: expected none without model.colour.form=lobes")
         return
     try:
-        SphericalLobes(colour.get("lobes", 1))
+        SphericalLobes(colour.get("lobes", _USUAL_LOBES))
     except ValueError as error:
         raise ConfigError(f"model.colour.lobes={colour['lobes']}: {error}") from error
     if degree != ModelSettings.sh_degree:

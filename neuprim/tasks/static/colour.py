@@ -77,7 +77,7 @@ class SphericalLobes(ColourField):
     and the logarithm of its sharpness s_l. Lobes start at amplitude zero around random axes.
     """
 
-    def __init__(self, lobes: int = 1, channels: int = 3) -> None:
+    def __init__(self, lobes: int = 2, channels: int = 3) -> None:
         _check_lobe_count(lobes)
         _check_channels(channels)
         self.lobes, self.channels = lobes, channels

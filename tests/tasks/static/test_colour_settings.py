@@ -17,13 +17,13 @@ def colour(*words: str) -> object:
 
 
 def test_forms() -> None:
-    default, one, three = (
+    default, two, three = (
         colour(),
         colour("model.colour.form=lobes"),
         colour("model.colour.form=lobes", "model.colour.lobes=3"),
     )
     assert isinstance(default, SphericalHarmonics) and default.degree == 3
-    assert isinstance(one, SphericalLobes) and one.settings() == {"lobes": 1, "channels": 3}
+    assert isinstance(two, SphericalLobes) and two.settings() == {"lobes": 2, "channels": 3}
     assert isinstance(three, SphericalLobes) and three.lobes == 3
 
 

@@ -114,9 +114,10 @@ def worst_region(view: str, rendered: Tensor, truth: Tensor) -> Region:
     """
     height, width = truth.shape[:2]
     side = min(max(round(_SIDE_SHARE * min(height, width)), MIN_SIDE), height, width)
-    error = (rendered.double() - truth.double()).square().mean(-1)[None, None]
+    sums = F.pad((rendered - truth).square().mean(-1).double().cumsum(0).cumsum(1), (1, 0, 1, 0))
     stride = max(side // _STEPS, 1)
-    means = F.avg_pool2d(error, side, stride)[0, 0]
+    right = sums[:, side:] - sums[:, :-side]
+    means = (right[side:] - right[:-side])[::stride, ::stride] / side**2
     row, column = divmod(int(means.argmax()), means.shape[1])
     mse = float(means[row, column])
     return Region(view, column * stride, row * stride, side, -10 * math.log10(mse) if mse > 0 else math.inf)

@@ -14,6 +14,7 @@ import torch
 
 from neuprim.config import Job, RunConfig, current_config_provenance, find_config_plugins
 from neuprim.core.channels import Channels, find_channels
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset
 from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.dataset_check import check_dataset_views
@@ -235,10 +236,11 @@ def measure_run_curve_point(trainer: Trainer) -> float:
     views, background = trainer.dataset.test, trainer.dataset.background
     chosen = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
     total = 0.0
-    for i in chosen:
-        pixels = views.pixels(i)
-        rendered = render_image(trainer.model, views.view(i), trainer.renderer, background)
-        total += min(psnr(rendered, pixels.over(background), pixels.mask), _CURVE_PSNR_MAX)
+    with limit_threads(trainer.renderer.threads):
+        for i in chosen:
+            pixels = views.pixels(i)
+            rendered = render_image(trainer.model, views.view(i), trainer.renderer, background)
+            total += min(psnr(rendered, pixels.over(background), pixels.mask), _CURVE_PSNR_MAX)
     return total / len(chosen)
 
 

@@ -24,6 +24,7 @@ from torch import Tensor
 from neuprim.config import Job
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.data.dataset_check import check_dataset_views, check_pixels
 from neuprim.core.data.starting_points import GIVE_POINTS
@@ -114,37 +115,43 @@ def measure_views(
         on_view: called as ``on_view(index, view, rendered, truth)`` for each, for example to keep pictures.
         render_view: (model, view, background) -> image, in place of :func:`render_image` with the settings.
     """
-    views, background, channels = dataset.test, dataset.background, find_channels(task, dataset)
+    draw = render_view or (lambda model, view, background: render_image(model, view, settings, background))
     result = []
-    for i in range(len(views)):
-        view, pixels = views.view(i), views.pixels(i)
-        check_pixels("test", view, pixels, dataset.channels)
-        truth = pixels.over(background)
-        start = time.perf_counter()
-        rendered = (
-            render_view(model, view, background) if render_view else render_image(model, view, settings, background)
-        )
-        seconds = time.perf_counter() - start
-        empty = bool((rendered == background).all())
-        if pixels.mask is not None:
-            rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        mask = call_task_mask(task, dataset, i)
-        more = _run_display_metrics(rendered, truth, dataset, channels, pixels.mask)
-        more |= _mask_metrics(rendered, truth, dataset, mask) | _table_metrics(rendered, truth, channels, lpips)
-        if pixels.alpha is None:
-            more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
-        more |= call_task_metrics(task, dataset, i, rendered, truth)
-        black = psnr(background.to(truth).expand_as(truth), truth, pixels.mask)
-        score = psnr(rendered, truth, pixels.mask)
-        result.append(ViewMetrics(view.name, score, ssim(rendered, truth), seconds, black, more, empty))
-        if on_view is not None:
-            on_view(i, view, rendered, truth)
+    with limit_threads(settings.threads):
+        for i in range(len(dataset.test)):
+            start = time.perf_counter()
+            rendered = draw(model, dataset.test.view(i), dataset.background)
+            metrics, rendered, truth = _measure_view(rendered, time.perf_counter() - start, task, dataset, i, lpips)
+            result.append(metrics)
+            if on_view is not None:
+                on_view(i, dataset.test.view(i), rendered, truth)
     if all(view.empty for view in result):
         warn_once(
             f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; "
             f"expected starting points where the cameras look: {GIVE_POINTS}"
         )
     return result
+
+
+def _measure_view(
+    rendered: Tensor, seconds: float, task: TaskSpec, dataset: Dataset, index: int, lpips: Lpips | None
+) -> tuple[ViewMetrics, Tensor, Tensor]:
+    """Measure one view of the test split; returns its render, with the truth where a mask hides it, and its truth."""
+    view, pixels, background = dataset.test.view(index), dataset.test.pixels(index), dataset.background
+    channels = find_channels(task, dataset)
+    check_pixels("test", view, pixels, dataset.channels)
+    truth, empty = pixels.over(background), bool((rendered == background).all())
+    if pixels.mask is not None:
+        rendered = torch.where(pixels.mask[..., None], rendered, truth)
+    mask = call_task_mask(task, dataset, index)
+    more = _run_display_metrics(rendered, truth, dataset, channels, pixels.mask)
+    more |= _mask_metrics(rendered, truth, dataset, mask) | _table_metrics(rendered, truth, channels, lpips)
+    if pixels.alpha is None:
+        more["psnr_gain"] = psnr_gain(rendered, truth, pixels.mask)
+    more |= call_task_metrics(task, dataset, index, rendered, truth)
+    black = psnr(background.to(truth).expand_as(truth), truth, pixels.mask)
+    score = psnr(rendered, truth, pixels.mask)
+    return ViewMetrics(view.name, score, ssim(rendered, truth), seconds, black, more, empty), rendered, truth
 
 
 def measure_quality(

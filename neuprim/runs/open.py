@@ -22,6 +22,7 @@ from neuprim.config import Job, RunConfig
 from neuprim.config.stored_run import refuse_untrusted_run_links, refuse_untrusted_settings
 from neuprim.core.cameras.world import World
 from neuprim.core.checkpoint import load_model_checkpoint
+from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset, View
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.extensions import TrainedModel
@@ -131,7 +132,7 @@ def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
     if isinstance(job, StoredRun):
         context = replace(context, world=job.world)
     scene, source = job.scene, job.plugins.scene
-    with attribute_errors(source, "load"):
+    with attribute_errors(source, "load"), limit_threads(job.config.renderer.threads):
         dataset = scene.spec.load(job.config.scene, context)
     if not isinstance(dataset, Dataset):
         found = f"a {type(dataset).__name__}" if dataset is not None else "None"

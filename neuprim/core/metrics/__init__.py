@@ -10,7 +10,7 @@ from neuprim.core.metrics.image import (
     ssim,
     ssim_3dgs,
 )
-from neuprim.core.metrics.ssim_float64 import SSIM_SIGMA, SSIM_WINDOW
+from neuprim.core.metrics.image_kernels import SSIM_SIGMA, SSIM_WINDOW
 
 __all__ = [
     "SSIM_SIGMA",

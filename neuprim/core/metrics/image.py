@@ -16,13 +16,19 @@ from torch import Tensor
 from torch.nn.functional import pad
 
 from neuprim.core.errors import DataError, NonFiniteError
-from neuprim.core.metrics.ssim_float64 import SSIM_WINDOW, mean_ssim
+from neuprim.core.metrics.image_kernels import SSIM_WINDOW, mean_ssim, sum_squared_errors
 
 _MAX_NAMED = 6  # views in one line; metrics.json names all
 
 
 def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     """Return both images as detached float64 (H, W, C) on the CPU, or raise DataError or NonFiniteError."""
+    first, second = _check_images(rendered, truth)
+    return first.double(), second.double()
+
+
+def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
+    """As :func:`comparable_images`; both float32 stay so."""
     images = {"rendered": rendered, "truth": truth}
     for name, image in images.items():
         if not image.is_floating_point():
@@ -34,11 +40,13 @@ def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     if rendered.shape != truth.shape:
         raise DataError(f"rendered image has shape {tuple(rendered.shape)} but its truth has {tuple(truth.shape)}")
     for name, image in images.items():
+        if math.isfinite(image.detach().sum().item()):
+            continue
         bad = int((~torch.isfinite(image)).sum())
-        if bad:
+        if bad:  # a sum may overflow
             raise NonFiniteError(f"{name} image: {bad} of {image.numel()} values are NaN or infinite")
-    first, second = (image.detach().cpu().double() for image in images.values())
-    return first, second
+    first, second = (image.detach().cpu() for image in images.values())
+    return (first, second) if first.dtype == second.dtype == torch.float32 else (first.double(), second.double())
 
 
 def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
@@ -46,19 +54,20 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
     ``mask``: (H, W) bool of pixels that count; ``peak``: the value that counts as full signal.
     """
-    first, second = comparable_images(rendered, truth)
+    first, second = _check_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
         raise DataError(f"peak must be a positive number, found {peak}")
-    squares = (first - second).square()
+    count = first.numel()
     if mask is not None:
         if mask.dtype != torch.bool or mask.shape != first.shape[:2]:
             raise DataError(
                 f"mask: expected bool of shape {tuple(first.shape[:2])}, found {mask.dtype} of {tuple(mask.shape)}"
             )
-        squares = squares[mask.cpu()]
-        if squares.numel() == 0:
+        mask = mask.cpu()
+        count = int(mask.sum()) * first.shape[2]
+        if count == 0:
             raise DataError("mask leaves no pixel to compare")
-    error = squares.mean().item()
+    error = sum_squared_errors(first, second, mask) / count
     return math.inf if error == 0.0 else 20.0 * math.log10(peak) - 10.0 * math.log10(error)
 
 
@@ -78,7 +87,7 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     image ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data
     range L. Equal to kornia's in float64.
     """
-    first, second = comparable_images(rendered, truth)
+    first, second = _check_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
         raise DataError(f"peak must be a positive number, found {peak}")
     fitting = min(first.shape[0], first.shape[1])
@@ -86,7 +95,7 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
         return mean_ssim(first, second, float(peak))
     from kornia.metrics import ssim as ssim_map  # slow to import, and only tiny images need it
 
-    first, second = (image.permute(2, 0, 1)[None].contiguous() for image in (first, second))
+    first, second = (image.double().permute(2, 0, 1)[None].contiguous() for image in (first, second))
     # kornia's eps would keep equal dark images below 1; the two constants already keep the denominator positive.
     window = fitting - 1 + fitting % 2
     return ssim_map(first, second, window_size=window, max_val=float(peak), eps=0.0, padding="valid").mean().item()
@@ -98,7 +107,7 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
     As :func:`ssim` of values 0 to 1, but every pixel has a whole window, and beyond the image both are black. The mean
     is mostly higher. Nothing is quantised, as those tools do.
     """
-    first, second = comparable_images(rendered, truth)
+    first, second = _check_images(rendered, truth)
     border = (0, 0, *(SSIM_WINDOW // 2,) * 4)
     return mean_ssim(pad(first, border), pad(second, border), 1.0)
 

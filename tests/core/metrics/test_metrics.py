@@ -64,6 +64,39 @@ def test_psnr_mask_selects_pixels() -> None:
     assert psnr(rendered, truth, mask) == pytest.approx(20.0 + 10 * math.log10(2), abs=1e-5)
 
 
+@pytest.mark.parametrize("channels", [1, 3, 5])
+@pytest.mark.parametrize("scale", [1e-8, 1.0, 1e15])
+def test_psnr_equals_the_formula_in_float64(channels: int, scale: float) -> None:
+    """More pixels than are summed at a time; dtypes, masks and layouts."""
+    rendered, truth = (scale * image for image in pair(230, 190, channels))
+    mask = torch.rand(230, 190, generator=torch.Generator().manual_seed(3)) < 0.3
+    turned = rendered.float().transpose(0, 1).contiguous().transpose(0, 1)
+    for first, second in (
+        (rendered, truth),
+        (rendered.float(), truth.float()),
+        (turned, truth),
+        (turned, truth.half()),
+    ):
+        if not bool(torch.isfinite(second).all()):
+            continue
+        squares = (first.double() - second.double()).square()
+        for chosen in (None, mask, mask.T.contiguous().T):
+            mean = float((squares if chosen is None else squares[chosen]).mean())
+            found = psnr(first, second, chosen, peak=2.0)
+            assert found == pytest.approx(20 * math.log10(2.0) - 10 * math.log10(mean), abs=1e-9)
+            with limit_threads(1):
+                assert psnr(first, second, chosen, peak=2.0) == found, "any number of threads gives the same bits"
+
+
+def test_large_finite_values_are_not_taken_for_infinite() -> None:
+    image = torch.full((12, 12, 3), 3e38)
+    assert psnr(image, image) == math.inf and psnr(image, -image) < -700
+    bad, hidden = image.clone(), torch.ones(12, 12, dtype=torch.bool)
+    bad[2, 3, 1], hidden[2, 3] = math.inf, False
+    with pytest.raises(NonFiniteError, match="truth image: 1 of 432"):
+        psnr(image, bad, hidden)
+
+
 def test_identical_images() -> None:
     image, _ = pair(20, 17, 3)
     assert psnr(image, image) == math.inf

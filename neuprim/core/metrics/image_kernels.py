@@ -1,11 +1,13 @@
-"""SSIM of two images in float64, fused and separable, on all cores."""
+"""SSIM and squared error of two images, in float64 without copies of them, on all cores."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import numpy as np
 from torch import Tensor
 
-from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.compute.threads import parallel_for
 
 SSIM_WINDOW = 11  # taps of the Gaussian window per axis (Wang et al. 2004)
@@ -17,6 +19,7 @@ _TAPS = np.exp(-((np.arange(SSIM_WINDOW) - SSIM_WINDOW // 2) ** 2) / (2 * SSIM_S
 _TAPS /= _TAPS.sum()
 _ROWS = 16  # rows per band; fixed, so that sums do not depend on the number of threads
 _BLOCK = 512  # windows of a row at a time, so that moments stay in the nearest cache
+_PIXELS = 1 << 15  # pixels whose errors are summed at a time
 
 
 @inline
@@ -81,11 +84,35 @@ def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
     c1 = (0.01 peak)^2, c2 = (0.03 peak)^2.
 
     Args:
-        first, second: (H, W, C) float64 of at least 11 x 11 pixels.
+        first, second: (H, W, C) float32 or float64, of at least 11 x 11 pixels.
     """
     height, width, channels = first.shape
-    x, y = (np.ascontiguousarray(image.numpy()).reshape(-1) for image in (first, second))
+    x, y = _flat_values(first), _flat_values(second)
     rows, columns = height - SSIM_WINDOW + 1, width - SSIM_WINDOW + 1
     constants = (0.01 * peak) ** 2, (0.03 * peak) ** 2
     sums = parallel_for(_sum_ssim_of_rows, rows, _ROWS, 0, x, y, height, channels, *constants)
     return float(sum(sums)) / (rows * columns * channels)
+
+
+@exact_kernel
+def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignore[no-untyped-def]
+    """Over pixels start:stop, of those that are counted; all where ``counted`` is empty."""
+    total = 0.0
+    for pixel in range(start, stop):
+        if counted.size == 0 or counted[pixel]:
+            for i in range(pixel * channels, (pixel + 1) * channels):
+                difference = np.float64(x[i]) - np.float64(y[i])
+                total += difference * difference
+    return total
+
+
+def sum_squared_errors(first: Tensor, second: Tensor, mask: Tensor | None) -> float:
+    """Sum of the squared differences of (H, W, C) images, float32 or float64, where an (H, W) bool mask is True."""
+    channels, count = first.shape[-1], first.shape[0] * first.shape[1]
+    counted = np.empty(0, np.bool_) if mask is None else _flat_values(mask)
+    images = _flat_values(first), _flat_values(second)
+    return float(sum(parallel_for(_sum_squares_of_pixels, count, _PIXELS, 0, *images, counted, channels)))
+
+
+def _flat_values(image: Tensor) -> Any:
+    return image.contiguous().numpy().reshape(-1)

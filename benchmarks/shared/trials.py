@@ -15,7 +15,7 @@ from neuprim.config.command_settings import LauncherSettings
 from neuprim.core.compute.threads import cpu_name
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import Events, Fitted, compile_run_kernels, prepare_training, train_to_end
-from neuprim.runs.launch.jobs import JobResult, LaunchJob
+from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
 from neuprim.runs.launch.launcher import launch_jobs
 from shared.tables import read_trials, update_record
 
@@ -81,28 +81,44 @@ def train_job(data: tuple[Trial, Sequence[str] | Measure], attempt: int, events:
 
 
 def run_all(
-    trials: Sequence[Trial], path: Path, wanted: Sequence[str] | Measure, jobs: int = 1, **entries: Any
+    trials: Sequence[Trial],
+    path: Path,
+    wanted: Any,
+    jobs: int = 1,
+    call: str = f"{__name__}:train_job",
+    **entries: Any,
 ) -> None:
-    """Train what the record at ``path`` does not have yet, ``jobs`` at a time, and write it after every one.
+    """Do what the record at ``path`` does not have yet, ``jobs`` at a time, and write it after every one.
 
     Args:
         wanted: names of metrics, of which those that a task has are recorded, or a function of a module that makes the
-            numbers of the record.
+            numbers of the record; what else ``call`` takes.
+        call: the function of a job, called with ``(trial, wanted)``, the attempt and a listener of events.
         entries: further entries of the record.
     """
     known = {row["trial"] for row in read_trials(path)}
     waiting = [trial for trial in trials if trial.name not in known]
+    shown = dict.fromkeys(range(len(waiting)), 0)
+
+    def say(text: str) -> None:
+        print(f"{time.strftime('%H:%M')} {text}", flush=True)
 
     def keep(number: int, result: JobResult) -> None:
         if result.state == "done":
             row = result.value
             rows = sorted([*read_trials(path), row], key=lambda r: r["trial"])
             update_record(path, **{"cpu": cpu_name(), **entries, "trials": rows})
-            print(f"{time.strftime('%H:%M')} {row['trial']}: {row.get('psnr', float('nan')):.2f} dB", flush=True)
+            say(f"{row['trial']}: {row.get('psnr', float('nan')):.2f} dB")
 
-    work = [LaunchJob(trial.name, f"{__name__}:train_job", (trial, wanted)) for trial in waiting]
+    def show(number: int, status: JobStatus) -> None:
+        quarters = int(4 * status.progress)
+        if quarters > shown[number]:
+            shown[number] = quarters
+            say(f"{waiting[number].name}: {status.progress:.0%} of the training")
+
+    work = [LaunchJob(trial.name, call, (trial, wanted)) for trial in waiting]
     settings = LauncherSettings("processes", workers=jobs, threads=1)
-    results = launch_jobs(work, settings, path.parent / f".{path.stem}-launch", on_result=keep)
+    results = launch_jobs(work, settings, path.parent / f".{path.stem}-launch", show, keep)
     failed = [
         f"{trial.name}: {result.trace or result.line}"
         for trial, result in zip(waiting, results, strict=True)

@@ -46,11 +46,6 @@ def budgets(script: ModuleType) -> str:
     return f"{tables}\n\n{script.describe_falls(runs)}"
 
 
-def photographs(script: ModuleType) -> str:
-    runs = record_of(script)["trials"]
-    return f"{script.table(runs)}\n\n{script.caption(runs)}"
-
-
 def effort(script: ModuleType) -> str:
     runs = {scene: script.read_trials(script.record_of(scene)) for scene in script.TITLES}
     return titled(script, {scene: script.table(own, scene) for scene, own in runs.items()})
@@ -64,8 +59,8 @@ def reports(script: ModuleType) -> str:
 TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "results": ("README.md", "readme", lambda s: s.results_table()),
     "budgets": ("docs/budgets.md", "budget", budgets),
-    "photographs": ("docs/static.md", "photographs", photographs),
-    "static-quality": ("docs/static.md", "static_quality", lambda s: s.table(record_of(s))),
+    "static": ("docs/static.md", "static", lambda s: s.table(record_of(s))),
+    "full-size": ("README.md", "static", lambda s: s.readme_table(record_of(s))),
     "relight-quality": ("docs/relighting.md", "relight_quality", lambda s: s.quality_table(record_of(s))),
     **{
         name: ("docs/dynamic.md", "dynamic_quality", lambda s, name=name: s.make_tables(record_of(s))[name])

@@ -31,6 +31,7 @@ from neuprim.runs.open import lock_run_directory, make_run_scene_context, model_
 from neuprim.runs.sweep import LaunchedRun, LaunchRecord, launch_missing_runs, read_launch_record
 from neuprim.runs.training import (
     BetweenSteps,
+    RunPreview,
     count_run_finetune_steps,
     make_run_finetune_trainer,
     train_in_directory,
@@ -74,16 +75,17 @@ def run(
             disk before is intact.
         RankError: another rank ended; what was trained is in the checkpoint.
     """
-    directory = config.output_dir
+    directory, preview = config.output_dir, RunPreview(events, between)
     first = group is None or group.is_first
     if group is not None:
         refuse_chunks(config, "several ranks train one model together")
     with lock_run_directory(directory) if first else nullcontext(), find_config_plugins(config).attribute_errors():
         if is_chunked(config):
-            fitted, interrupted = train_in_chunks(config, events, launcher, between)
+            fitted, interrupted = train_in_chunks(config, events, launcher, preview)
         else:
-            fitted, interrupted = train_in_directory(config, events, between=between, group=group)
+            fitted, interrupted = train_in_directory(config, events, between=preview, group=group)
         if first:
+            preview.finish(fitted)
             events(Finishing("measuring held-out views"))
             events(Note(format_metrics(evaluate_fitted(fitted, directory))))
     if interrupted:

@@ -143,8 +143,6 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
     curve, saved = config.output_dir / CURVE_FILE, config.output_dir / "checkpoint.safetensors"
     cut_run_curve(curve, trainer.step)
     last_saved, interrupted = time.monotonic(), False
-    preview, wait = config.output_dir / PREVIEW_FILE, PREVIEW_SECONDS
-    preview_due = trainer.elapsed + wait
     try:
         with interruptible_run(terminated=trainer.ranks > 1) as stop, use_one_torch_thread_for_run():
             trainer.stop_requested = stop.is_set
@@ -164,13 +162,6 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
                     with _warn_of_unwritable_run_file(fitted, saved):
                         save_run_training(fitted)
                     last_saved = time.monotonic()
-                if trainer.elapsed >= preview_due:
-                    with _warn_of_unwritable_run_file(fitted, preview):
-                        write_run_preview(fitted, preview)
-                        if wait == PREVIEW_SECONDS:
-                            events(Note(f"a first picture, renewed as the training goes on: {preview}"))
-                    wait *= 2
-                    preview_due = trainer.elapsed + wait
                 between(fitted, stop)
                 if trainer.stopping:
                     interrupted = True
@@ -179,22 +170,48 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
         save_run_training(fitted)
         raise
     save_run_training(fitted)
-    if wait > PREVIEW_SECONDS:
-        with _warn_of_unwritable_run_file(fitted, preview):
-            write_run_preview(fitted, preview)
     return interrupted
 
 
-def write_run_preview(fitted: Fitted, path: Path) -> None:
-    """Write the middle held-out view, ground truth on the left and the model as it is now on the right.
+class RunPreview:
+    """A function to call between steps, which writes a picture of the model now and then: the middle held-out view,
+    ground truth on the left.
 
-    Raises OSError; a picture that was there is intact then.
+    Args:
+        events: gets the name of the file when it is there.
+        between: is called, too.
     """
-    test, background = fitted.dataset.test, fitted.dataset.background
-    middle, display = len(test) // 2, fitted.channels.display
-    rendered = render_image(fitted.model, test.view(middle), fitted.trainer.renderer, background)
-    path.parent.mkdir(exist_ok=True)
-    images.write_png(path, torch.cat([display(x) for x in (test.pixels(middle).over(background), rendered)], dim=1))
+
+    def __init__(self, events: Events, between: BetweenSteps) -> None:
+        self._events, self._between = events, between
+        self._wait, self._due, self._written = PREVIEW_SECONDS, -1.0, False
+
+    def __call__(self, fitted: Fitted, stop: threading.Event) -> None:
+        self._between(fitted, stop)
+        elapsed = fitted.trainer.elapsed
+        if self._due < 0:  # before the first step
+            self._due = elapsed + self._wait
+        elif elapsed >= self._due:
+            self._write(fitted)
+            self._wait *= 2
+            self._due = elapsed + self._wait
+
+    def finish(self, fitted: Fitted) -> None:
+        """Show the final model, where there was a picture before."""
+        if self._written:
+            self._write(fitted)
+
+    def _write(self, fitted: Fitted) -> None:
+        test, background, display = fitted.dataset.test, fitted.dataset.background, fitted.channels.display
+        middle, path = len(test) // 2, fitted.config.output_dir / PREVIEW_FILE
+        rendered = render_image(fitted.model, test.view(middle), fitted.trainer.renderer, background)
+        pair = [display(x) for x in (test.pixels(middle).over(background), rendered)]
+        with _warn_of_unwritable_run_file(fitted, path):
+            path.parent.mkdir(exist_ok=True)
+            images.write_png(path, torch.cat(pair, dim=1))
+            if not self._written:
+                self._events(Note(f"a first picture, renewed as the training goes on: {path}"))
+            self._written = True
 
 
 def _train_run_as_follower(trainer: Trainer) -> bool:

@@ -94,24 +94,25 @@ class _PrimitiveRows(torch.autograd.Function):
 
 
 @strict
-def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
-    w, x, y, z = (
-        np.float64(q[0]),
-        np.float64(q[1]),
-        np.float64(q[2]),
-        np.float64(q[3]),
-    )  # float32 squares would scale the rotation
+def ellipsoid_rotation(w, x, y, z):  # type: ignore[no-untyped-def]
+    """Return 1/|q| and the rotation of a float64 quaternion, row by row: float32 squares would scale it."""
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
-    out[0, 0] = 1 - 2 * (y * y + z * z)
-    out[0, 1] = 2 * (x * y - w * z)
-    out[0, 2] = 2 * (x * z + w * y)
-    out[1, 0] = 2 * (x * y + w * z)
-    out[1, 1] = 1 - 2 * (x * x + z * z)
-    out[1, 2] = 2 * (y * z - w * x)
-    out[2, 0] = 2 * (x * z - w * y)
-    out[2, 1] = 2 * (y * z + w * x)
-    out[2, 2] = 1 - 2 * (x * x + y * y)
+    return (
+        n, 1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+
+
+@strict
+def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
+    """The same into ``out`` (3, 3); returns 1/|q|."""
+    n, xx, xy, xz, yx, yy, yz, zx, zy, zz = ellipsoid_rotation(
+        np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
+    )
+    out[0, 0], out[0, 1], out[0, 2], out[1, 0], out[1, 1], out[1, 2] = xx, xy, xz, yx, yy, yz
+    out[2, 0], out[2, 1], out[2, 2] = zx, zy, zz
     return n
 
 

@@ -26,10 +26,10 @@ from neuprim.core.render.cpu.prepare import (
     PrimitiveArrays,
     Projected,
     View,
-    prepare_backward,
     prepare_primitives,
     prepare_wide,
 )
+from neuprim.core.render.cpu.prepare_backward import prepare_backward
 from neuprim.core.render.cpu.tiles import FrameArrays, TileLists, bin_primitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.render.rasterize import (

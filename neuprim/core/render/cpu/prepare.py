@@ -1,4 +1,4 @@
-"""The per-primitive stage, in float64: anchors, whitening, exact bounds; forward and backward.
+"""The per-primitive stage, in float64: anchors, whitening, exact bounds.
 
 Each primitive is anchored at its own projected centre, so that whitened rays are affine in the pixel offset and float32
 never sees the distance to the camera (method: "Line integral"). Anchor and unit of t are constants without gradient.
@@ -12,9 +12,35 @@ import numpy as np
 
 from neuprim.core.compute.kernels import borrow_arrays, exact_kernel, release_array, strict
 from neuprim.core.model.edge import NORMS
-from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
+from neuprim.core.render.cpu.blocks import (
+    AXES,
+    BIGGEST,
+    BLOCK,
+    BOX,
+    CENTRE,
+    FASTEST,
+    FLOAT64,
+    MOST,
+    REACH,
+    SPAN,
+    SQUARE,
+    STATUS,
+    SZZ,
+    TC,
+    TOTAL,
+    UX,
+    UY,
+    B,
+    M,
+    allocate_block,
+    dot3,
+    fill_block,
+    load3,
+    store3,
+    store_row,
+)
 
 Array = np.ndarray[Any, Any]
 
@@ -75,19 +101,6 @@ class Projected(NamedTuple):
         )
 
 
-class _Scratch(NamedTuple):
-    """``work`` (10, 3): rows 0..2 return B, 3 the axes s/m, 4 the centre; ``waves`` (K, 4); rising ``rate`` (K,)."""
-
-    work: Array
-    waves: Array
-    rate: Array
-
-
-@strict
-def _scratch(K):  # type: ignore[no-untyped-def]
-    return _Scratch(np.empty((10, 3)), np.empty((K, 4)), np.empty(K))
-
-
 @strict
 def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
     """Whether no chord can reach the depth ``least``: no half chord is longer than the longest semi-axis."""
@@ -109,93 +122,6 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _cross_product(a, b, out):  # type: ignore[no-untyped-def]
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
-
-
-@strict
-def _dot_product(a, b):  # type: ignore[no-untyped-def]
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@strict
-def project_primitive_frame(mean, log_scale, quat, view, local, B, axes, c, anchor):  # type: ignore[no-untyped-def]
-    """Fill camera-axes orientation B, axes s/m, centre c and anchor (depth, pixel x, y); returns (m, 1/|q|).
-
-    The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
-    """
-    R, t = view.R, view.t
-    n = fill_ellipsoid_rotation(quat, local)
-    top = max(np.float64(log_scale[0]), np.float64(log_scale[1]), np.float64(log_scale[2]))
-    m = np.exp(top)
-    for i in range(3):
-        axes[i] = np.exp(np.float64(log_scale[i]) - top)
-        c[i] = R[i, 0] * mean[0] + R[i, 1] * mean[1] + R[i, 2] * mean[2] + t[i]
-        for j in range(3):
-            B[i, j] = R[i, 0] * local[0, j] + R[i, 1] * local[1, j] + R[i, 2] * local[2, j]
-    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    if c[2] > P.ANCHOR_RADII * m and c[2] + m > view.near:
-        anchor[0] = m * np.float64(np.float32(c[2] / m))
-        anchor[1] = np.float64(np.float32(fx * c[0] / c[2] + cx))
-        anchor[2] = np.float64(np.float32(fy * c[1] / c[2] + cy))
-    else:  # the centre is near or behind the camera, or nothing is seen of it: anchor at the camera itself
-        anchor[0] = 0.0
-        anchor[1] = np.float64(np.float32(cx))
-        anchor[2] = np.float64(np.float32(cy))
-    return m, n
-
-
-@strict
-def _fill_wide_row(i, parameters, view, scratch, order, row):  # type: ignore[no-untyped-def]
-    """Fill the float64 row of primitive ``i`` and ``order[i]``; returns (m, whether all is finite, largest number)."""
-    means, log_scales, quats, W1, b1, w2, b2 = parameters
-    work, waves, rate = scratch
-    near, turns, K = view.near, view.turns, W1.shape[1]
-    B, axes, c, local, anchor, w = work[0:3], work[3], work[4], work[5:8], work[8], work[9]
-    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    m, _ = project_primitive_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
-    tc = anchor[0] / m
-    u, v = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy
-    w[0], w[1], w[2] = tc * u - c[0] / m, tc * v - c[1] / m, tc - c[2] / m
-    biggest, total, aa, xe, ye = 0.0, 0.0, 0.0, 0.0, 0.0
-    for a in range(3):
-        A0, A1, A2 = B[0, a] / axes[a], B[1, a] / axes[a], B[2, a] / axes[a]  # m S^-1 B^T
-        e0, ex, ey, xa = A0 * u + A1 * v + A2, A0 / fx, A1 / fy, A0 * w[0] + A1 * w[1] + A2 * w[2]
-        row[P.E0 + a], row[P.EX + a], row[P.EY + a], row[P.XA + a] = e0, ex, ey, xa
-        aa, xe, ye = aa + e0 * e0, xe + ex * e0, ye + ey * e0
-        biggest = max(biggest, abs(xa), abs(e0))
-        total += e0 + ex + ey + xa
-    tu, tv = -tc * xe / aa, -tc * ye / aa
-    for a in range(3):
-        row[P.XU + a], row[P.XV + a] = tc * row[P.EX + a] + tu * row[P.E0 + a], tc * row[P.EY + a] + tv * row[P.E0 + a]
-    row[P.TC], row[P.TU], row[P.TV], row[P.UX], row[P.UY] = tc, tu, tv, anchor[1], anchor[2]
-    row[P.NEAR], row[P.OFFSET], row[P.UNIT], row[P.ANCHOR_Z] = (near - anchor[0]) / m, b2[i], m, anchor[0]
-    biggest = max(biggest, tc, abs(row[P.NEAR]), m, abs(row[P.OFFSET]))
-    total += tc + row[P.NEAR] + m + row[P.OFFSET]
-    for k in range(K):
-        for a in range(3):
-            waves[k, a] = (
-                turns * axes[a] * (W1[i, k, 0] * local[0, a] + W1[i, k, 1] * local[1, a] + W1[i, k, 2] * local[2, a])
-            )
-        speed = np.sqrt(waves[k, 0] * waves[k, 0] + waves[k, 1] * waves[k, 1] + waves[k, 2] * waves[k, 2])
-        waves[k, 3] = speed
-        biggest = max(biggest, speed, abs(np.float64(w2[i, k])))
-        total += speed + turns * np.float64(b1[i, k]) + w2[i, k]
-    for k in range(K):
-        # counting the slower ones sorts without a branch; neurons as fast keep their order
-        at, speed = np.int64(0), waves[k, 3]
-        for j in range(K):
-            at += np.int64((waves[j, 3] < speed) | ((waves[j, 3] == speed) & (j < k)))
-        o, phase = P.NEURONS + P.PER_NEURON * at, turns * np.float64(b1[i, k])
-        rate[at], order[i, at] = speed, k
-        row[o + P.WX], row[o + P.WY], row[o + P.WZ] = waves[k, 0], waves[k, 1], waves[k, 2]
-        row[o + P.PHASE], row[o + P.AMPLITUDE] = phase - np.rint(phase), w2[i, k]
-    return m, np.isfinite(total), biggest
-
-
-@strict
 def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
     """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes."""
     means, log_scales, quats, W1, b1, _, _ = parameters
@@ -210,50 +136,170 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 
 
 @strict
-def _silhouette_screen_extent(c, m, B, axes, focal, middle, axis, s22, square):  # type: ignore[no-untyped-def]
+def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
     """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels.
 
-    Tangents as in ``screen_boxes`` of the reference, in units of m; ``s22``: S_zz of the whole ellipsoid.
+    Tangents as in ``screen_boxes`` of the reference, in units of m; ``b``, ``towards``: rows of B of the screen axis
+    and of depth; ``s22``: S_zz of the whole ellipsoid.
     """
-    z, ci, szz = c[2] / m, c[axis] / m, square * s22
-    sii = square * ((B[axis, 0] * axes[0]) ** 2 + (B[axis, 1] * axes[1]) ** 2 + (B[axis, 2] * axes[2]) ** 2)
-    siz = square * (
-        B[axis, 0] * B[2, 0] * axes[0] ** 2 + B[axis, 1] * B[2, 1] * axes[1] ** 2 + B[axis, 2] * B[2, 2] * axes[2] ** 2
-    )
+    (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
+    sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)
+    siz = square * (b0 * d0 * s0**2 + b1 * d1 * s1**2 + b2 * d2 * s2**2)
     D = z * z * sii - 2 * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
     root, mid, den = np.sqrt(max(D, 0.0)), ci * z - siz, z * z - szz
     return focal * (mid - root) / den + middle, focal * (mid + root) / den + middle
 
 
 @strict
-def _longest_half_chord(c, m, reach, row, view, e0, ex, ey):  # type: ignore[no-untyped-def]
+def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length):  # type: ignore[no-untyped-def]
     """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes.
 
     A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
-    slopes.
+    slopes. 1 where the anchor is not the centre.
     """
-    if row[P.TC] == 0.0:  # the anchor is not the centre
-        return 1.0
     u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
     du, dv = wide * (1.0 + u), wide * (1.0 + v)
-    least = (
-        np.sqrt(_dot_product(e0, e0))
-        - view.fx * du * np.sqrt(_dot_product(ex, ex))
-        - view.fy * dv * np.sqrt(_dot_product(ey, ey))
-    )
+    least = e_length - fx * du * ex_length - fy * dv * ey_length
     most = np.sqrt(1.0 + (u + du) ** 2 + (v + dv) ** 2)
-    return most / least if least > most else 1.0
+    return most / least if (tc != 0.0) & (least > most) else 1.0
+
+
+@strict
+def _cross(a, b):  # type: ignore[no-untyped-def]
+    return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
+
+
+@strict
+def _moment_slope(x, e, axis, tc):  # type: ignore[no-untyped-def]
+    """How the moment x x e of the ray changes along a screen axis."""
+    a, b = _cross(x, axis), _cross(axis, e)
+    return a[0] + tc * b[0], a[1] + tc * b[1], a[2] + tc * b[2]
+
+
+@strict
+def _rounded(x):  # type: ignore[no-untyped-def]
+    return np.float64(np.float32(x))
+
+
+@strict
+def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
+    """Fill silhouettes, boxes, status and FLOAT64 of a block's primitives."""
+    fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
+    width, height, soft = float(view.width), float(view.height), edge > 0
+    for k in range(BLOCK):
+        m, axes, towards = S[M + k], load3(S, AXES, k), load3(S, B + 6 * BLOCK, k)
+        e, ex, ey = load3(S, BLOCK * P.E0, k), load3(S, BLOCK * P.EX, k), load3(S, BLOCK * P.EY, k)
+        szz = m * m * ((towards[0] * axes[0]) ** 2 + (towards[1] * axes[1]) ** 2 + (towards[2] * axes[2]) ** 2)
+        lengths = np.sqrt(dot3(e, e)), np.sqrt(dot3(ex, ex)), np.sqrt(dot3(ey, ey))
+        reach = np.sqrt(szz)
+        S[SZZ + k], S[REACH + k] = szz, reach
+        S[SQUARE + k] = _longest_half_chord(load3(S, CENTRE, k), m, reach, S[TC + k], fx, fy, *lengths)
+    for k in range(BLOCK):
+        S[SQUARE + k] = _visible_square(S[MOST + k], S[SQUARE + k], edge, least)
+    for k in range(BLOCK):
+        m, tc, reach, square, s22 = S[M + k], S[TC + k], S[REACH + k], S[SQUARE + k], S[SZZ + k] / (S[M + k] * S[M + k])
+        c, axes, towards = load3(S, CENTRE, k), load3(S, AXES, k), load3(S, B + 6 * BLOCK, k)
+        z, x, y = c[2] / m, load3(S, B, k), load3(S, B + 3 * BLOCK, k)
+        x0, x1 = _silhouette_screen_extent(z, c[0] / m, s22, square, x, axes, towards, fx, cx)
+        y0, y1 = _silhouette_screen_extent(z, c[1] / m, s22, square, y, axes, towards, fy, cy)
+        whole = c[2] - reach > 1e-3 * reach  # in front of the camera plane: the silhouette is an ellipse
+        x0, x1 = max(0.0, np.ceil(x0 - 0.5)) if whole else 0.0, min(width, np.floor(x1 - 0.5) + 1) if whole else width
+        y0, y1 = max(0.0, np.ceil(y0 - 0.5)) if whole else 0.0, min(height, np.floor(y1 - 0.5) + 1) if whole else height
+        S[BOX + k], S[BOX + BLOCK + k], S[BOX + 2 * BLOCK + k], S[BOX + 3 * BLOCK + k] = x0, y0, x1, y1
+        reached, beyond = c[2] + reach > near, S[BIGGEST + k] > P.FLOAT32_MAX
+        drawn = reached & (x1 > x0) & (y1 > y0) & (not (whole & (square == 0.0)))
+        # beyond float32: a scale or weight, or so small against its distance that no pixel centre can hit it
+        bad = (not (abs(S[TOTAL + k]) < np.inf)) | (reached & beyond & (m > 1.0))
+        status = P.VISIBLE if drawn & (not beyond) else P.CULLED
+        S[STATUS + k] = P.NON_FINITE if bad else status
+    for k in range(BLOCK):
+        tc, square, c, reach = S[TC + k], S[SQUARE + k], load3(S, CENTRE, k), S[REACH + k]
+        e, ex, ey, x = (
+            load3(S, BLOCK * P.E0, k),
+            load3(S, BLOCK * P.EX, k),
+            load3(S, BLOCK * P.EY, k),
+            load3(S, BLOCK * P.XA, k),
+        )
+        # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width by HX, HY
+        k0, ka, kb = _cross(x, e), _moment_slope(x, e, ex, tc), _moment_slope(x, e, ey, tc)
+        q0, q1 = square * dot3(e, e) - dot3(k0, k0), square * dot3(e, ex) - dot3(k0, ka)
+        q2, q3 = square * dot3(e, ey) - dot3(k0, kb), square * dot3(ex, ex) - dot3(ka, ka)
+        q4, q5 = square * dot3(ex, ey) - dot3(ka, kb), square * dot3(ey, ey) - dot3(kb, kb)
+        d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
+        yc = -d1 / d2
+        peak = d0 + d1 * yc
+        ellipse = (c[2] - reach > 1e-3 * reach) & (q3 < 0.0) & (d2 < 0.0) & (peak > 0.0)
+        skew, xc = (-q4 / q3 if ellipse else 0.0), (-(q1 + q4 * yc) / q3 if ellipse else 0.0)
+        hx, hy = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
+        store3(S, SPAN, k, (skew, xc, yc if ellipse else 0.0))
+        S[SPAN + P.HX * BLOCK + k] = hx if ellipse else P.UNBOUNDED
+        S[SPAN + P.HY * BLOCK + k] = hy if ellipse else P.UNBOUNDED
+    for k in range(BLOCK):
+        tc, yc = S[TC + k], S[SPAN + P.YC * BLOCK + k]
+        skew, xc = _rounded(S[SPAN + P.SKEW * BLOCK + k]), _rounded(S[SPAN + P.XC * BLOCK + k])
+        hx, hy = _rounded(S[SPAN + P.HX * BLOCK + k]), _rounded(S[SPAN + P.HY * BLOCK + k])
+        ex, ey, x = load3(S, BLOCK * P.EX, k), load3(S, BLOCK * P.EY, k), load3(S, BLOCK * P.XA, k)
+        ux, uy, c, axes, reach = S[UX + k], S[UY + k], load3(S, CENTRE, k), load3(S, AXES, k), S[REACH + k]
+        ellipse = hy < P.UNBOUNDED
+        # the pixel offsets that meet the silhouette on the screen
+        tall = min(abs(yc) + hy, max(abs(0.5 - uy), abs(height - 0.5 - uy)))
+        broad = min(abs(xc) + abs(skew) * (abs(yc) + hy) + hx, max(abs(0.5 - ux), abs(width - 0.5 - ux)))
+        # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle each
+        # is many radii of its thin axis, and they cancel
+        slide = abs(S[BLOCK * P.TU + k]) * broad + abs(S[BLOCK * P.TV + k]) * tall
+        cancels = slide * (np.sqrt(dot3(ex, ex)) * broad + np.sqrt(dot3(ey, ey)) * tall) > P.FLOAT64_RADII
+        xu, xv = load3(S, BLOCK * P.XU, k), load3(S, BLOCK * P.XV, k)
+        cancels |= abs(xu[0]) * broad + abs(xv[0]) * tall > P.FLOAT64_RADII
+        cancels |= abs(xu[1]) * broad + abs(xv[1]) * tall > P.FLOAT64_RADII
+        cancels |= abs(xu[2]) * broad + abs(xv[2]) * tall > P.FLOAT64_RADII
+        coarse = (S[FASTEST + k] > P.FLOAT64_TURNS) | (max(abs(ux), abs(uy)) > P.FLOAT64_PIXELS)
+        coarse |= dot3(x, x) > P.FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
+        ratio = P.FLOAT64_RATIO_NEAR if tc == 0.0 else P.FLOAT64_RATIO
+        coarse |= min(axes[0], axes[1], axes[2]) * ratio < 1.0
+        # only in float64 are there integrals of cut chords with a soft edge
+        coarse |= soft & (c[2] - reach < near + P.CUT * reach)
+        coarse |= ellipse & cancels
+        S[FLOAT64 + k] = 1.0 if coarse else 0.0
+        # the float64 rows do not slide
+        slide_x, slide_y = (0.0 if coarse else S[BLOCK * P.TU + k]), (0.0 if coarse else S[BLOCK * P.TV + k])
+        S[BLOCK * P.TU + k], S[BLOCK * P.TV + k] = slide_x, slide_y
+        for a in range(3):
+            S[BLOCK * (P.XU + a) + k] = tc * ex[a] if coarse else xu[a]
+            S[BLOCK * (P.XV + a) + k] = tc * ey[a] if coarse else xv[a]
 
 
 @exact_kernel
 def prepare_wide(start, stop, which, parameters, view, order, wide):  # type: ignore[no-untyped-def]
     """Fill the float64 rows of primitives ``which[start:stop]``, which the pixel stage draws in float64."""
-    parameters, view, memory = borrow_arrays(parameters), borrow_arrays(view), _scratch(parameters.W1.shape[1])
-    scratch = borrow_arrays(memory)
-    for n in range(start, stop):
-        wide[n, :] = 0.0
-        _fill_wide_row(which[n], parameters, view, scratch, order, wide[n])
-    release_array(memory)
+    parameters, view, own = borrow_arrays(parameters), borrow_arrays(view), allocate_block(parameters.W1.shape[1])
+    S, waves, rate, block = borrow_arrays(own)
+    for first in range(start, stop, BLOCK):
+        n = min(BLOCK, stop - first)
+        for k in range(n):
+            block[k] = which[first + k]
+        fill_block(block, n, parameters, view, S, waves)
+        for k in range(n):
+            store_row(k, S, waves, rate, order[block[k]], wide[first + k])
+    release_array(own)
+
+
+@strict
+def _store_block(block, n, S, waves, rate, out):  # type: ignore[no-untyped-def]
+    rows, spans, boxes, kinds, order, depth, status, in_float64 = out
+    K = order.shape[1]
+    for k in range(n):
+        i = block[k]
+        store_row(k, S, waves, rate, order[i], rows[i])
+        for pair in range(kinds.shape[1]):
+            fastest = rate[min(2 * pair + 1, K - 1)]
+            kinds[i, pair] = L.SLOW if fastest < L.SLOW_TURNS else (L.MEDIUM if fastest < L.MEDIUM_TURNS else L.FAST)
+        depth[i], status[i] = S[CENTRE + 2 * BLOCK + k], S[STATUS + k]
+        in_float64[i] = S[FLOAT64 + k] > 0.0
+        seen = status[i] == P.VISIBLE
+        for j in range(5):
+            spans[i, j] = S[SPAN + j * BLOCK + k]
+        for j in range(4):
+            boxes[i, j] = np.int32(S[BOX + j * BLOCK + k]) if seen else 0
 
 
 @exact_kernel
@@ -262,190 +308,25 @@ def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type
 
     A primitive that cannot reach it anywhere gets a status, an empty box and a depth of 0 alone.
     """
-    parameters, view = borrow_arrays(parameters), borrow_arrays(view)
-    rows, spans, boxes, kinds, order, depth, status, in_float64 = out
-    w2, b2, near, K = parameters.w2, parameters.b2, view.near, parameters.W1.shape[1]
-    memory, row = _scratch(K), np.zeros(rows.shape[1])
-    scratch = borrow_arrays(memory)
-    work, rate = scratch.work, scratch.rate
-    B, axes, c = work[0:3], work[3], work[4]
-    e0, ex, ey, xa = row[P.E0 : P.EX], row[P.EX : P.EY], row[P.EY : P.XA], row[P.XA : P.XU]
-    k0, ka, kb, tmp = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    parameters, view, out = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(out)
+    w2, b2, boxes = parameters.w2, parameters.b2, out.boxes
+    own = allocate_block(w2.shape[1])
+    S, waves, rate, block = borrow_arrays(own)
+    n = 0
     for i in range(start, stop):
         most = np.float64(b2[i])
-        for k in range(K):
+        for k in range(w2.shape[1]):
             most += abs(np.float64(w2[i, k]))
         if _is_too_faint_to_draw(most, edge, least):  # whatever its place
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
-            in_float64[i], depth[i] = False, 0.0
-            status[i] = P.CULLED if _is_finite_undrawn_primitive(i, parameters, most) else P.NON_FINITE
-            continue
-        m, finite, biggest = _fill_wide_row(i, parameters, view, scratch, order, row)
-        for n in range(kinds.shape[1]):
-            fastest = rate[min(2 * n + 1, K - 1)]
-            kinds[i, n] = L.SLOW if fastest < L.SLOW_TURNS else (L.MEDIUM if fastest < L.MEDIUM_TURNS else L.FAST)
-        for j in range(row.shape[0]):
-            rows[i, j] = row[j]
-        tc = row[P.TC]
-        in_float64[i] = (K > 0 and rate[K - 1] > P.FLOAT64_TURNS) or max(
-            abs(row[P.UX]), abs(row[P.UY])
-        ) > P.FLOAT64_PIXELS
-        in_float64[i] |= _dot_product(xa, xa) > P.FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
-        thinnest = min(axes[0], axes[1], axes[2])
-        in_float64[i] |= thinnest * (P.FLOAT64_RATIO_NEAR if tc == 0.0 else P.FLOAT64_RATIO) < 1.0
-        depth[i] = c[2]
-        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
-        if not finite:
-            status[i] = P.NON_FINITE
-            continue
-        status[i] = P.CULLED
-        szz = m * m * ((B[2, 0] * axes[0]) ** 2 + (B[2, 1] * axes[1]) ** 2 + (B[2, 2] * axes[2]) ** 2)
-        reach = np.sqrt(szz)
-        # only in float64 are there integrals of cut chords with a soft edge
-        in_float64[i] |= edge > 0 and c[2] - reach < near + P.CUT * reach
-        if c[2] + reach <= near:
-            continue
-        if biggest > P.FLOAT32_MAX:
-            if m > 1.0:
-                status[i] = P.NON_FINITE  # a scale or weight beyond float32
-            continue  # so small against its distance that no pixel centre can hit it
-        span = spans[i]
-        span[P.SKEW], span[P.XC], span[P.YC], span[P.HX], span[P.HY] = 0.0, 0.0, 0.0, P.UNBOUNDED, P.UNBOUNDED
-        x0, x1, y0, y1 = 0.0, float(view.width), 0.0, float(view.height)
-        if c[2] - reach > 1e-3 * reach:  # wholly in front of the camera plane: the silhouette is an ellipse
-            s22 = szz / (m * m)
-            square = _visible_square(most, _longest_half_chord(c, m, reach, row, view, e0, ex, ey), edge, least)
-            if square == 0.0:
-                continue
-            x0, x1 = _silhouette_screen_extent(c, m, B, axes, view.fx, view.cx, 0, s22, square)
-            y0, y1 = _silhouette_screen_extent(c, m, B, axes, view.fy, view.cy, 1, s22, square)
-            x0, x1 = max(0.0, np.ceil(x0 - 0.5)), min(float(view.width), np.floor(x1 - 0.5) + 1)
-            y0, y1 = max(0.0, np.ceil(y0 - 0.5)), min(float(view.height), np.floor(y1 - 0.5) + 1)
-            # |r e|^2 - |x x e|^2 > 0 is a quadratic in (du, dv); per row: centre XC + SKEW (dv - YC), half width by HX,
-            # HY
-            _cross_product(xa, e0, k0)
-            _cross_product(xa, ex, ka)
-            _cross_product(ex, e0, tmp)
-            for j in range(3):
-                ka[j] += tc * tmp[j]
-            _cross_product(xa, ey, kb)
-            _cross_product(ey, e0, tmp)
-            for j in range(3):
-                kb[j] += tc * tmp[j]
-            q0 = square * _dot_product(e0, e0) - _dot_product(k0, k0)
-            q1 = square * _dot_product(e0, ex) - _dot_product(k0, ka)
-            q2 = square * _dot_product(e0, ey) - _dot_product(k0, kb)
-            q3 = square * _dot_product(ex, ex) - _dot_product(ka, ka)
-            q4 = square * _dot_product(ex, ey) - _dot_product(ka, kb)
-            q5 = square * _dot_product(ey, ey) - _dot_product(kb, kb)
-            d0, d1, d2 = q1 * q1 - q3 * q0, q1 * q4 - q3 * q2, q4 * q4 - q3 * q5
-            if q3 < 0.0 and d2 < 0.0:
-                yc = -d1 / d2
-                peak = d0 + d1 * yc
-                if peak > 0.0:
-                    span[P.SKEW], span[P.XC], span[P.YC] = -q4 / q3, -(q1 + q4 * yc) / q3, yc
-                    span[P.HX], span[P.HY] = np.sqrt(peak) / -q3, np.sqrt(-peak / d2)
-                    # the pixel offsets that meet the silhouette on the screen
-                    tall = min(abs(yc) + span[P.HY], max(abs(0.5 - row[P.UY]), abs(view.height - 0.5 - row[P.UY])))
-                    broad = abs(span[P.XC]) + abs(span[P.SKEW]) * (abs(yc) + span[P.HY]) + span[P.HX]
-                    broad = min(broad, max(abs(0.5 - row[P.UX]), abs(view.width - 0.5 - row[P.UX])))
-                    # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted
-                    # needle each is many radii of its thin axis, and they cancel
-                    slide = abs(row[P.TU]) * broad + abs(row[P.TV]) * tall
-                    reached = np.sqrt(_dot_product(ex, ex)) * broad + np.sqrt(_dot_product(ey, ey)) * tall
-                    in_float64[i] |= slide * reached > P.FLOAT64_RADII
-                    for a in range(3):
-                        in_float64[i] |= abs(row[P.XU + a]) * broad + abs(row[P.XV + a]) * tall > P.FLOAT64_RADII
-        if in_float64[i]:  # the float64 rows do not slide
-            for a in range(3):
-                rows[i, P.XU + a], rows[i, P.XV + a] = tc * ex[a], tc * ey[a]
-            rows[i, P.TU], rows[i, P.TV] = 0.0, 0.0
-        if x1 > x0 and y1 > y0:
-            boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = int(x0), int(y0), int(x1), int(y1)
-            status[i] = P.VISIBLE
-    release_array(memory)
-
-
-@exact_kernel
-def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
-    """Chain rule from gradient rows to parameters, for the ``touched`` primitives among ``start:stop``.
-
-    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each one's part of dL/d(R | t); empty:
-    unwanted.
-    """
-    view = borrow_arrays(view)
-    means, log_scales, quats, W1, _, _, _ = borrow_arrays(parameters)
-    g_means, g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = out
-    rows, order, R, turns, K = projected.rows, projected.order, view.R, view.turns, W1.shape[1]
-    local, B, A = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    gA, gB, gL = np.empty((3, 3)), np.empty((3, 3)), np.empty((3, 3))
-    axes, c, anchor, ref, w = np.empty(3), np.empty(3), np.empty(3), np.empty(3), np.empty(3)
-    gc, gl, gq, q = np.empty(3), np.empty(3), np.empty(4), np.empty(4)
-    fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
-    for i in range(start, stop):
-        if not touched[i]:
-            continue
-        g = grads[i]
-        m, inverse = project_primitive_frame(means[i], log_scales[i], quats[i], view, local, B, axes, c, anchor)
-        tc = anchor[0] / m
-        ref[0], ref[1], ref[2] = (anchor[1] - cx) / fx, (anchor[2] - cy) / fy, 1.0
-        for j in range(3):
-            w[j] = tc * ref[j] - c[j] / m
-            gc[j] = 0.0
-        for a in range(3):
-            gx = np.float64(g[P.XA + a])
-            row_sum = 0.0
-            for j in range(3):
-                A[a, j] = B[j, a] / axes[a]
-                gA[a, j] = g[P.E0 + a] * ref[j] + gx * w[j]
-            gA[a, 0] += g[P.EX + a] / fx
-            gA[a, 1] += g[P.EY + a] / fy
-            for j in range(3):
-                gB[j, a] = gA[a, j] / axes[a]
-                row_sum += gA[a, j] * A[a, j]
-                gc[j] -= A[a, j] * gx / m
-            gl[a] = -row_sum  # A scales with 1/s_a
-        log_m = -np.float64(g[P.G_LOG_M])  # the density's own 1/m
-        for a in range(3):
-            for j in range(3):
-                gL[a, j] = 0.0
-        for n in range(K):
-            k, o, og = order[i, n], P.NEURONS + P.PER_NEURON * n, P.G_NEURONS + P.PER_NEURON * n
-            for j in range(3):
-                gw = np.float64(g[og + P.WX + j])
-                gl[j] += gw * rows[i, o + P.WX + j]  # W on whitened axes scales with s_j/m
-                log_m -= gw * rows[i, o + P.WX + j]
-                for a in range(3):
-                    gL[a, j] += turns * axes[j] * W1[i, k, a] * gw
-            for a in range(3):
-                g_W1[i, k, a] = turns * (
-                    g[og + P.WX] * axes[0] * local[a, 0]
-                    + g[og + P.WY] * axes[1] * local[a, 1]
-                    + g[og + P.WZ] * axes[2] * local[a, 2]
-                )
-            g_b1[i, k] = turns * g[og + P.PHASE]
-            g_w2[i, k] = g[og + P.AMPLITUDE]
-        g_b2[i] = g[P.G_OFFSET]
-        first = 0
-        for j in range(1, 3):
-            if log_scales[i, j] > log_scales[i, first]:
-                first = j
-        gl[first] += log_m
-        for a in range(3):
-            g_log_scales[i, a] = gl[a]
-            g_means[i, a] = R[0, a] * gc[0] + R[1, a] * gc[1] + R[2, a] * gc[2]
-            for j in range(3):  # B = R local
-                gL[a, j] += R[0, a] * gB[0, j] + R[1, a] * gB[1, j] + R[2, a] * gB[2, j]
-        for j in range(4):
-            q[j] = quats[i, j]
-        ellipsoid_rotation_backward(q, inverse, gL, gq)
-        for j in range(4):
-            g_quats[i, j] = gq[j]
-        if g_view.shape[0] > 0:
-            for a in range(3):
-                for j in range(3):
-                    value = gc[a] * means[i, j]
-                    for b in range(3):
-                        value += gB[a, b] * local[j, b]
-                    g_view[i, a, j] = value
-                g_view[i, a, 3] = gc[a]
+            out.in_float64[i], out.depth[i] = False, 0.0
+            out.status[i] = P.CULLED if _is_finite_undrawn_primitive(i, parameters, most) else P.NON_FINITE
+        else:
+            block[n], S[MOST + n] = i, most
+            n += 1
+        if n == BLOCK or (i + 1 == stop and n > 0):
+            fill_block(block, n, parameters, view, S, waves)
+            _bound_block(S, view, edge, least)
+            _store_block(block, n, S, waves, rate, out)
+            n = 0
+    release_array(own)

@@ -76,6 +76,13 @@ def resolve_threads(threads: int) -> int:
     return threads or _limit.get() or core_count()
 
 
+def chunk_size(count: int, least: int, threads: int) -> int:
+    """How many of ``count`` items :func:`parallel_for` should take at a time: each call costs as much as a few of them,
+    and threads share the work well with eight chunks each of at least ``least`` items. One thread takes all."""
+    threads = resolve_threads(threads)
+    return max(count, 1) if threads == 1 else max(least, count // (8 * threads))
+
+
 def _thread_pool(threads: int) -> ThreadPoolExecutor:
     with _lock:
         if threads not in _pools:

@@ -117,18 +117,23 @@ def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
 
 
 @strict
-def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
-    """dL/dq from dL/dR; the normalisation projects out the radial part."""
-    w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
-    gw = 2 * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
-    gx = 2 * (w * (g[2, 1] - g[1, 2]) + y * (g[0, 1] + g[1, 0]) + z * (g[0, 2] + g[2, 0]) - 2 * x * (g[1, 1] + g[2, 2]))
-    gy = 2 * (w * (g[0, 2] - g[2, 0]) + x * (g[0, 1] + g[1, 0]) + z * (g[1, 2] + g[2, 1]) - 2 * y * (g[0, 0] + g[2, 2]))
-    gz = 2 * (w * (g[1, 0] - g[0, 1]) + x * (g[0, 2] + g[2, 0]) + y * (g[1, 2] + g[2, 1]) - 2 * z * (g[0, 0] + g[1, 1]))
+def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
+    """dL/dq from dL/dR, row by row, and 1/|q|; the normalisation projects out the radial part."""
+    g00, g01, g02, g10, g11, g12, g20, g21, g22 = g
+    w, x, y, z = w * n, x * n, y * n, z * n
+    gw = 2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01))
+    gx = 2 * (w * (g21 - g12) + y * (g01 + g10) + z * (g02 + g20) - 2 * x * (g11 + g22))
+    gy = 2 * (w * (g02 - g20) + x * (g01 + g10) + z * (g12 + g21) - 2 * y * (g00 + g22))
+    gz = 2 * (w * (g10 - g01) + x * (g02 + g20) + y * (g12 + g21) - 2 * z * (g00 + g11))
     dot = gw * w + gx * x + gy * y + gz * z
-    out[0] = (gw - dot * w) * n
-    out[1] = (gx - dot * x) * n
-    out[2] = (gy - dot * y) * n
-    out[3] = (gz - dot * z) * n
+    return (gw - dot * w) * n, (gx - dot * x) * n, (gy - dot * y) * n, (gz - dot * z) * n
+
+
+@strict
+def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
+    """The same of ``g`` (3, 3) into ``out`` (4,)."""
+    rows = g[0, 0], g[0, 1], g[0, 2], g[1, 0], g[1, 1], g[1, 2], g[2, 0], g[2, 1], g[2, 2]
+    out[0], out[1], out[2], out[3] = quaternion_gradient(q[0], q[1], q[2], q[3], n, rows)
 
 
 @exact_kernel
@@ -257,6 +262,7 @@ def _harmonic_colors_backward(start, stop, means, rest, origin, degree, color, g
         x, y, z = x * n, y * n, z * n
         _basis(x, y, z, degree, Y)
         gY[:] = 0.0
+        g_rest[i, bands:] = 0.0
         for c in range(C):
             g = np.float64(grad[i, c]) if color[i, c] > 0 else 0.0
             g_dc[i, c] = C0 * g
@@ -296,7 +302,7 @@ class _HarmonicColors(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
         means, rest = ctx.arrays
-        g_means, g_dc, g_rest = np.empty_like(means), np.empty_like(ctx.color), np.zeros_like(rest)
+        g_means, g_dc, g_rest = np.empty_like(means), np.empty_like(ctx.color), np.empty_like(rest)
         args = (means, rest, ctx.origin, ctx.degree, ctx.color, grad.contiguous().numpy(), g_means, g_dc, g_rest)
         parallel_for(_harmonic_colors_backward, len(means), _CHUNK, 0, *args)
         view = torch.from_numpy(-g_means.sum(0, dtype=np.float64)) if ctx.needs_input_grad[3] else None

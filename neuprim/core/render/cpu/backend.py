@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
-from neuprim.core.compute.threads import parallel_for, resolve_threads
+from neuprim.core.compute.threads import chunk_size, parallel_for, resolve_threads
 from neuprim.core.model.checks import check_primitive_colours_finite, non_finite_primitive_error
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import layout as P
@@ -106,9 +106,8 @@ def _prepare_frame(
     projected = Projected.allocate(count, K)
     view = _rasterizer_view(camera, viewmat, settings.near_plane, request.turns)
     least = P.min_visible_depth(settings.alpha_min)
-    parallel_for(
-        prepare_primitives, count, _PRIMITIVES_PER_CHUNK, threads, parameters, view, request.edge, least, projected
-    )
+    share = chunk_size(count, _PRIMITIVES_PER_CHUNK, threads)
+    parallel_for(prepare_primitives, count, share, threads, parameters, view, request.edge, least, projected)
     bad = np.flatnonzero(projected.status == P.NON_FINITE)
     if bad.size:
         raise non_finite_primitive_error({name: torch.from_numpy(array) for name, array in arrays.items()}, int(bad[0]))
@@ -220,10 +219,10 @@ class _Rasterize(torch.autograd.Function):
             lanes = parallel_for(tiles, *work)
         request.stats.extra["backward_lanes"] = sum(lanes)
         grads, touched = np.empty((count, width), np.float32), np.empty(count, np.bool_)
-        lists, primitives = frame.lists, (count, _PRIMITIVES_PER_CHUNK, threads)
+        lists, primitives = frame.lists, (count, chunk_size(count, _PRIMITIVES_PER_CHUNK, threads), threads)
         parallel_for(sum_tile_pair_gradients, *primitives, lists.first, lists.slots, pair_rows, grads, touched)
         parameters = frame.parameters
-        out = PrimitiveArrays(*(np.zeros(x.shape, np.float32) for x in parameters))
+        out = PrimitiveArrays(*(np.empty(x.shape, np.float32) for x in parameters))
         g_view = np.zeros((count if ctx.needs_input_grad[1] else 0, 3, 4), np.float64)
         parallel_for(
             prepare_backward, *primitives, parameters, frame.view, frame.projected, grads, touched, out, g_view

@@ -16,7 +16,7 @@ from numba.extending import intrinsic
 from numpy.typing import NDArray
 
 from neuprim.core.compute.kernels import copy16, exact_kernel, inline
-from neuprim.core.compute.threads import parallel_for
+from neuprim.core.compute.threads import chunk_size, parallel_for
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
 from neuprim.core.render.cpu.chord import (
@@ -136,7 +136,7 @@ def bin_primitives(
     count = projected.depth.shape[0]
     across, down = -(-width // P.TILE), -(-height // P.TILE)
     first = np.zeros(count + 1, np.int64)
-    parts = parallel_for(_reached_tiles, count, 512, threads, projected, across, first)
+    parts = parallel_for(_reached_tiles, count, chunk_size(count, 512, threads), threads, projected, across, first)
     np.cumsum(first, out=first)
     tiles = np.concatenate(parts) if parts else np.empty(0, np.int32)
     starts = np.zeros((1 if images is None else images[1]) * across * down + 1, np.int64)

@@ -57,7 +57,7 @@ class Pixels:
 
     def over(self, background: Tensor) -> Tensor:
         """Composite over a (C,) colour: (H, W, C). Opaque pixels are returned unchanged."""
-        rgb, alpha = self.rgb, self.alpha
+        rgb, alpha = self.rgb, self.alpha  # in this order: stored images convert both at once
         if alpha is None:
             return rgb
         uncovered, channels = (1.0 - alpha).reshape(-1), rgb.shape[-1]

@@ -180,10 +180,11 @@ class ImageFrame:
 
 
 @exact_kernel
-def _premultiply_dataset_kernel(rgba, rgb):  # type: ignore[no-untyped-def]
+def _premultiply_dataset_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-def]
     scale = np.float32(1.0 / 255.0)
     for i in range(rgba.shape[0]):
         a = np.float32(rgba[i, 3]) * scale
+        alpha[i] = a
         for c in range(3):
             rgb[i, c] = np.float32(rgba[i, c]) * scale * a
 
@@ -212,19 +213,19 @@ class _StoredImage:
             alpha = alpha * (1.0 / 255.0) if self._by_kernel else alpha / 255.0
         return alpha.contiguous()
 
-    @property
-    def rgb(self) -> Tensor:
-        """(H, W, 3) float32, premultiplied."""
+    def planes(self) -> tuple[Tensor, Tensor | None]:
+        """(H, W, 3) float32, premultiplied, and alpha."""
         if self._by_kernel:  # in one pass, as every step needs them
-            rgb = torch.empty(*self.data.shape[:2], 3)
-            _premultiply_dataset_kernel(self.data.reshape(-1, 4).numpy(), rgb.reshape(-1, 3).numpy())
-            return rgb
-        rgb, eight_bit = self.data[..., :3], self.data.dtype == torch.uint8
+            rgb, whole = torch.empty(*self.data.shape[:2], 3), torch.empty(self.data.shape[:2])
+            outputs = rgb.reshape(-1, 3).numpy(), whole.reshape(-1).numpy()
+            _premultiply_dataset_kernel(self.data.reshape(-1, 4).numpy(), *outputs)
+            return rgb, whole
+        rgb, eight_bit, alpha = self.data[..., :3], self.data.dtype == torch.uint8, self.alpha
         if not self.to_linear:
-            return (rgb / 255.0 if eight_bit else rgb.float()).contiguous()
+            return (rgb / 255.0 if eight_bit else rgb.float()).contiguous(), alpha
         rgb = _LINEAR[rgb.int()] if eight_bit else rgb.float()
-        alpha = None if self.premultiplied else self.alpha
-        return ((rgb if alpha is None else rgb * alpha[..., None]) * self.scale).contiguous()
+        rgb = rgb if self.premultiplied or alpha is None else rgb * alpha[..., None]
+        return (rgb * self.scale).contiguous(), alpha
 
     @property
     def _by_kernel(self) -> bool:
@@ -248,7 +249,8 @@ class StoredPixels(Pixels):
     @cached_property
     def rgb(self) -> Tensor:  # type: ignore[override]
         assert self.image is not None
-        return self.image.rgb
+        rgb, self.__dict__["alpha"] = self.image.planes()
+        return rgb
 
     @cached_property
     def alpha(self) -> Tensor | None:  # type: ignore[override]

@@ -94,7 +94,7 @@ def test_a_strided_view_has_the_bits_of_the_whole_image(kind: str, tmp_path: Pat
 
 def test_only_what_is_used_is_converted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     sizes, kernel = [], module._premultiply_dataset_kernel
-    monkeypatch.setattr(module, "_premultiply_dataset_kernel", lambda x, y: sizes.append(len(x)) or kernel(x, y))
+    monkeypatch.setattr(module, "_premultiply_dataset_kernel", lambda x, *y: sizes.append(len(x)) or kernel(x, *y))
     pixels = image_views(tmp_path, "rgba").pixels(0)
     few = pixels.strided(5, 0, 0)
     assert few.alpha is not None and pixels.alpha is not None and not sizes, "silhouettes need no colours"

@@ -33,7 +33,7 @@ commonest keys:
   output_dir=DIR resume=true           where to write; continue an interrupted run
   train.iterations=N train.max_seconds=S
   model.primitives=N model.neurons=K model.sh_degree=D
-  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent
+  train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent|pixel
   renderer.backend=auto|NAME           `neuprim doctor` lists them
   renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N

@@ -24,7 +24,7 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 import torch
 
@@ -53,6 +53,7 @@ from neuprim.core.errors import ConfigError, FormError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.core.model.primitives import Primitives
+from neuprim.core.model.schema import RateUnit
 from neuprim.core.render import render
 from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.task import Supervision, TaskSpec
@@ -162,7 +163,7 @@ def check_parameters_conformance(t: TaskUnderTest) -> None:
         fits = isinstance(spec.shape, tuple) and all(isinstance(n, int) and n >= 0 for n in spec.shape)
         t.require(fits, f"{where}: shape", spec.shape, "a tuple of whole numbers, () for a scalar")
         t.require(math.isfinite(spec.lr) and spec.lr > 0, f"{where}: lr", spec.lr, "a positive rate")
-        t.require(spec.lr_unit in ("absolute", "extent"), f"{where}: lr_unit", spec.lr_unit, "absolute or extent")
+        t.require(spec.lr_unit in get_args(RateUnit), f"{where}: lr_unit", spec.lr_unit, ", ".join(get_args(RateUnit)))
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(1)
         one = t.initial_model()

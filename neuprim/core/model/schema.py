@@ -12,7 +12,7 @@ from torch import Tensor
 
 from neuprim.core.validation import Range, validate_value
 
-RateUnit = Literal["absolute", "extent"]
+RateUnit = Literal["absolute", "extent", "pixel"]
 """What a learning rate is a multiple of; see :class:`ParameterSpec`."""
 
 Params = Mapping[str, Tensor]
@@ -84,7 +84,8 @@ class ParameterSpec:
         lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is kept in every file.
         init: draws the (N, *shape) float32 start value.
         lr_unit: what rates are multiplied by: "absolute", nothing; "extent", the data set's
-            :attr:`~neuprim.core.data.Dataset.extent`. ``train.rate_units.NAME`` overrides it.
+            :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the start.
+            ``train.rate_units.NAME`` overrides it.
     """
 
     name: str

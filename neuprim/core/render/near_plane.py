@@ -1,4 +1,4 @@
-"""The near plane and the extent of a scene, from the depths at which cameras see its points."""
+"""The near plane, the extent and the size of a pixel of a scene, from the depths at which cameras see its points."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from neuprim.core.settings import RenderSettings
 _MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # of which depths are measured
 _SHARE, _CLEARANCE = 1.0 / 400.0, 0.1  # the near plane as a part of the typical and of the nearest depth
 _MIN_EXTENT = 0.01
+_USUAL_FOCAL = 1000.0  # pixels
 _MIN_NEAR = 1e-6  # of the typical depth: a point in a camera's centre does not put the plane there
 
 
@@ -43,6 +44,16 @@ def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]
     """Return the data set's extent, or the median depth of points (N, 3) where that is 100 times as large."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth
+
+
+def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera]) -> float:
+    """Return the side of a pixel, in scene units, at the median depth of points (N, 3).
+
+    The median of the cameras counts; of cameras without a focal length, a thousandth of the depth.
+    """
+    _, depth = nearest_and_median_depth(means, cameras)
+    focal = sorted(camera.fx for camera in cameras if isinstance(camera, Camera))
+    return depth / (focal[len(focal) // 2] if focal else _USUAL_FOCAL)
 
 
 def resolve_near(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:

@@ -23,7 +23,7 @@ from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFi
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import best_render_backend_device
-from neuprim.core.render.near_plane import near_plane_extent, resolve_near
+from neuprim.core.render.near_plane import near_plane_extent, resolve_near, typical_pixel_size
 from neuprim.core.render.output import Contributions, sum_contributions
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.losses import MaxScreenSize, PointLossResult, point_loss, scale_anisotropy
@@ -110,6 +110,7 @@ class Trainer:
     Attributes:
         extent: the unit of position rates and size limits, see
             :func:`~neuprim.core.render.near_plane.near_plane_extent`.
+        pixel: another unit of rates, see :func:`~neuprim.core.render.near_plane.typical_pixel_size`.
         step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
         fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they
             are.
@@ -135,6 +136,7 @@ class Trainer:
         self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
         self.extent = near_plane_extent(dataset.extent, model.params["means"], cameras)
+        self.pixel = typical_pixel_size(model.params["means"], cameras)
         self.device = best_render_backend_device(model, self.renderer, cameras[0], train.view(0).conditions)
         model.params = model.to(self.device).params
         self.loader = PixelLoader(dataset, self.device)
@@ -178,7 +180,7 @@ class Trainer:
             factor *= max((1 - self.progress) / s.cooldown, MIN_COOLDOWN)
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps
-        unit = {"absolute": 1.0, "extent": self.extent}
+        unit = {"absolute": 1.0, "extent": self.extent, "pixel": self.pixel}
         units = {spec.name: unit[s.rate_units.get(spec.name, spec.lr_unit)] for spec in self.model.specs}
         return {spec.name: s.rates.get(spec.name, spec.lr) * units[spec.name] * factor for spec in self.model.specs}
 

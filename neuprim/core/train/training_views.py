@@ -21,7 +21,7 @@ from neuprim.core.data.image_views import StoredPixels
 _MIN_SIDE = 11
 """Pixels along a side that no stride goes below: the window of SSIM."""
 
-_PIXELS_PER_PRIMITIVE = 3.2
+_PIXELS_PER_PRIMITIVE = 2.5
 """Covered pixels of a view that take as long in a step on the CPU as one primitive does."""
 
 _COUNTED_VIEWS = 16
@@ -102,7 +102,7 @@ def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int
         return stride
     divisor = next((divisor for until, divisor in _STRIDE_STAGES if progress < until), None)
     balance = round(math.sqrt(covered / (_PIXELS_PER_PRIMITIVE * primitives)))
-    return 1 if divisor is None else max(balance // divisor, 1)
+    return 1 if divisor is None else max(-(-balance // divisor), 1)
 
 
 def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:

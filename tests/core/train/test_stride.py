@@ -49,6 +49,7 @@ def test_the_automatic_stride_depends_on_sizes_and_gets_finer() -> None:
     unit = training_views._PIXELS_PER_PRIMITIVE
     shares = (0.0, 0.69, 0.7, 0.89, 0.9, 1.0)
     assert [choose_stride("auto", 1000 * unit * 16, 1000, share) for share in shares] == [4, 4, 2, 2, 1, 1]
+    assert [choose_stride("auto", 1000 * unit * 9, 1000, share) for share in (0.0, 0.8, 0.9)] == [3, 2, 1]
     assert [choose_stride("auto", covered, 1000, 0.5) for covered in (0, 1000 * unit, 1000 * unit * 9)] == [1, 1, 3]
     assert {choose_stride(3, 1e9, 10, p) for p in (0.0, 0.95)} == {3}
 

@@ -156,6 +156,10 @@ def test_units_of_rates(plain: Dataset) -> None:
         0.5 * plain.extent
     )
     assert tiny.trainer(plain, 100, rates={"means": 1.6e-4}).rates()["means"] == pytest.approx(1.6e-4 * plain.extent)
+    by_pixel = tiny.trainer(plain, 100, rates={"means": 0.1}, rate_units={"means": "pixel"})
+    cameras = [plain.train.view(i).camera for i in range(len(plain.train))]
+    depth = torch.cat([camera.project(by_pixel.model.params["means"].detach())[1] for camera in cameras]).median()
+    assert by_pixel.rates()["means"] == pytest.approx(0.1 * depth.item() / cameras[0].fx, rel=0.01)
     before = trainer.model.params["means"].detach().clone()
     trainer.train_step()  # the first step of Adam is the rate, whatever the gradient
     assert (trainer.model.params["means"].detach() - before).abs().max().item() == pytest.approx(1.6e-4, rel=0.01)

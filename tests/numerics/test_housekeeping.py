@@ -43,7 +43,7 @@ def test_the_key_of_compiled_kernels_covers_all_that_is_in_them(tmp_path: Path) 
         if missing := frozen - kernel_sources(Path(module.__file__ or "")):
             uncovered[module.__name__] = missing
     assert uncovered == {}
-    names = ("render/cpu/layout.py", "model/sh_constants.py", "model/edge.py")
+    names = ("render/cpu/layout.py", "model/colour_constants.py", "model/edge.py")
     assert {PACKAGE / "core" / name for name in names} <= everything
 
     copy = tmp_path / "neuprim"

@@ -14,10 +14,9 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.errors import FormError
-from neuprim.core.model.lobes_constants import LOG_LIMIT, MOST_LOBES, SHORTEST
+from neuprim.core.model.colour_constants import C0, LOG_LIMIT, MOST_LOBES, SHORTEST
 from neuprim.core.model.schema import Params
 from neuprim.core.model.sh import sh_colors
-from neuprim.core.model.sh_constants import C0
 from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
 
 AMPLITUDE, AXIS, LOG_SHARPNESS = "lobe_amplitude", "lobe_axis", "lobe_log_sharpness"
@@ -59,13 +58,13 @@ def lobe_colors(
     tensors = (means, dc, amplitude, axis, log_sharpness)
     if all(tensor.dtype == torch.float32 for tensor in tensors):
         if device.on_numba(*tensors):
-            from neuprim.core.model import lobes_cpu  # numba, loaded when first needed
+            from neuprim.core.model import colours_cpu  # numba, loaded when first needed
 
-            return lobes_cpu.fused_lobe_colors(*tensors, origin)
+            return colours_cpu.fused_lobe_colors(*tensors, origin)
         if device.on_warp(*tensors):
-            from neuprim.core.model import lobes_warp
+            from neuprim.core.model import colours_warp
 
-            return lobes_warp.fused_lobe_colors(*tensors, origin)
+            return colours_warp.fused_lobe_colors(*tensors, origin)
     centers = means.double()
     direction = _unit_or_zero(centers - device.to_device_like(origin, centers))
     nearness = ((_unit_or_zero(axis.double()) * direction[:, None]).sum(-1) - 1).clamp_max(0.0)

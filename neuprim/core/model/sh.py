@@ -9,9 +9,9 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.errors import FormError
+from neuprim.core.model.colour_constants import C0, C1, C2, C3
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import Params
-from neuprim.core.model.sh_constants import C0, C1, C2, C3
 from neuprim.core.model.tensors import Shape, Sizes, primitive_tensors_fault
 
 
@@ -61,13 +61,13 @@ def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, de
         return (dc * C0 + 0.5).clamp_min(0.0)
     assert rest is not None  # checked above
     if device.on_numba(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
-        from neuprim.core.model.rows import fused_harmonic_colors  # numba, loaded when first needed
+        from neuprim.core.model.colours_cpu import fused_harmonic_colors  # numba, loaded when first needed
 
         return fused_harmonic_colors(means, dc, rest, origin, degree)
     if device.on_warp(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
-        from neuprim.core.model import sh_warp
+        from neuprim.core.model import colours_warp
 
-        return sh_warp.fused_harmonic_colors(means, dc, rest, origin, degree)
+        return colours_warp.fused_harmonic_colors(means, dc, rest, origin, degree)
     offset = means - device.to_device_like(origin, means)
     direction = offset / offset.norm(dim=-1, keepdim=True).clamp_min(1e-30)
     bands = sh_basis(direction, degree)[:, 1:]

@@ -10,10 +10,10 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.model import lobes, sh
+from neuprim.core.model.colour_constants import MOST_LOBES
 from neuprim.core.model.fields import ColourField, Conditions, Constant, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.lobes import AMPLITUDE, AXIS, LOG_SHARPNESS
-from neuprim.core.model.lobes_constants import MOST_LOBES
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 

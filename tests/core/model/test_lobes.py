@@ -12,8 +12,8 @@ from torch import Tensor
 
 from neuprim.core.errors import FormError
 from neuprim.core.model import lobes
+from neuprim.core.model.colour_constants import LOG_LIMIT, SHORTEST
 from neuprim.core.model.cosine import CosineDensity
-from neuprim.core.model.lobes_constants import LOG_LIMIT, SHORTEST
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.tasks.static import SphericalLobes
@@ -28,7 +28,7 @@ NAMES = ("means", "dc", "amplitude", "axis", "log_sharpness", "origin")
 def on_blocks(**tensors: Tensor) -> Tensor:
     """The GPU's kernels, on Warp's CPU blocks."""
     pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
-    from neuprim.core.model.lobes_warp import fused_lobe_colors
+    from neuprim.core.model.colours_warp import fused_lobe_colors
 
     return fused_lobe_colors(**tensors)
 

@@ -113,7 +113,7 @@ def on_blocks(
 ) -> torch.Tensor:
     """The card's kernels, on Warp's CPU blocks."""
     pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
-    from neuprim.core.model.sh_warp import fused_harmonic_colors
+    from neuprim.core.model.colours_warp import fused_harmonic_colors
 
     return fused_harmonic_colors(means, dc, rest, origin, degree)
 

@@ -1,4 +1,5 @@
-"""Factors of the real spherical harmonics up to degree 3, with the signs of 3D Gaussian splatting, for all kernels."""
+"""Constants of colours, for all kernels: factors of the real spherical harmonics up to degree 3, with the signs of 3D
+Gaussian splatting, and limits of lobes."""
 
 from __future__ import annotations
 
@@ -23,3 +24,12 @@ C3 = (
     math.sqrt(105.0 / (16.0 * math.pi)),
     -math.sqrt(35.0 / (32.0 * math.pi)),
 )
+
+MOST_LOBES = 8
+
+LOG_LIMIT = 20.0
+"""Logarithms of sharpness count as no further from 0 than this, and get no gradient beyond."""
+
+SHORTEST = 1e-24
+"""Vectors that are not longer have no direction: the unit vector is zero and passes no gradient. The limit keeps
+gradients of float32 numbers finite."""

@@ -40,7 +40,7 @@ def test_rates_begin_above_those_of_the_run_s_end_and_fall_to_next_to_nothing(ru
     spec = next(s for s in model.specs if s.name == "b2")
     usual = config.train.rates.get("b2", spec.lr) * config.train.final_rate
     assert trainer.rates()["b2"] == pytest.approx(LEAST_START * usual, rel=1e-6)
-    means = config.train.rates["means"] * config.train.final_rate * dataset.extent
+    means = config.train.rates["means"] * config.train.final_rate * trainer.pixel
     assert trainer.rates()["means"] == pytest.approx(LEAST_START * means, rel=1e-6)
     for _ in range(40):
         trainer.train_step()

@@ -16,7 +16,7 @@ from neuprim.core.settings import RenderSettings
 _MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # of which depths are measured
 _SHARE, _CLEARANCE = 1.0 / 400.0, 0.1  # the near plane as a part of the typical and of the nearest depth
 _MIN_EXTENT = 0.01
-_USUAL_FOCAL = 1000.0  # pixels
+_LARGEST_PIXEL = 1.0 / 250.0  # of the extent: coarse images allow no larger steps, as primitives are small, too
 _MIN_NEAR = 1e-6  # of the typical depth: a point in a camera's centre does not put the plane there
 
 
@@ -46,14 +46,15 @@ def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]
     return extent if extent >= _MIN_EXTENT * depth else depth
 
 
-def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """Return the side of a pixel, in scene units, at the median depth of points (N, 3).
+def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: float) -> float:
+    """Return the side of a pixel, in scene units, at the median depth of points (N, 3), at most 1/250 of the extent.
 
-    The median of the cameras counts; of cameras without a focal length, a thousandth of the depth.
+    The median of the cameras' focal lengths counts; cameras without one have pixels of the largest size.
     """
     _, depth = nearest_and_median_depth(means, cameras)
     focal = sorted(camera.fx for camera in cameras if isinstance(camera, Camera))
-    return depth / (focal[len(focal) // 2] if focal else _USUAL_FOCAL)
+    largest = _LARGEST_PIXEL * extent
+    return min(depth / focal[len(focal) // 2], largest) if focal else largest
 
 
 def resolve_near(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:

@@ -119,7 +119,8 @@ class TrainSettings:
         rates: learning rate by parameter name, over the specs' own.
         rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene
             units a step), "extent" (times the scene's extent, so that it does not depend on the scale) or "pixel"
-            (times the size of a pixel at the median depth of the start: sharper images need smaller steps).
+            (times the size of a pixel at the median depth of the start, at most 1/250 of the extent: sharper images
+            need smaller steps).
         final_rate: the rates decay exponentially to this fraction of themselves; 1 is constant.
         cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing; 0 for none.
         adam_beta2: decay of Adam's second moment per step, in [0, 1).

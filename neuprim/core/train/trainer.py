@@ -136,7 +136,7 @@ class Trainer:
         self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
         self.extent = near_plane_extent(dataset.extent, model.params["means"], cameras)
-        self.pixel = typical_pixel_size(model.params["means"], cameras)
+        self.pixel = typical_pixel_size(model.params["means"], cameras, self.extent)
         self.device = best_render_backend_device(model, self.renderer, cameras[0], train.view(0).conditions)
         model.params = model.to(self.device).params
         self.loader = PixelLoader(dataset, self.device)

@@ -26,8 +26,9 @@ from neuprim.core import checkpoint, errors
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimWarning
 from neuprim.core.io.files import write_text
+from neuprim.core.train.trainer import Trainer
 from neuprim.runs import training
-from neuprim.runs.fit import Event, Note, measure_run_curve_point, prepare_training, train_to_end
+from neuprim.runs.fit import Event, Note, compile_run_kernels, measure_run_curve_point, prepare_training, train_to_end
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics, result_files
 from neuprim.runs.render_images import RenderRequest, render_run
@@ -442,6 +443,16 @@ def test_a_count_that_is_not_reached_is_said(
     train_to_end(fitted, events.append)
     notes = [event.text for event in events if isinstance(event, Note)]
     assert len(notes) == 1 and said in notes[0]
+
+
+def test_kernels_of_points_are_compiled_before_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    scene = "task=dynamic scene=smoke_fire scene.size=16 scene.timesteps=4 scene.cameras=4 scene.resolution=16"
+    fitted = prepare_training(compose([*scene.split(), "model.primitives=20", f"output_dir={tmp_path / 'out'}"]))
+    assert fitted.trainer.settings.supervision == "both" and fitted.trainer.settings.voxels_every > 1
+    compared, compare = [], Trainer._compare_points
+    monkeypatch.setattr(Trainer, "_compare_points", lambda *own: compared.append(1) or compare(*own))  # type: ignore[func-returns-value]
+    compile_run_kernels(fitted.trainer)
+    assert compared == [1] and fitted.trainer.step == 0
 
 
 def test_a_sequence_is_judged_by_held_out_training_views(tmp_path: Path) -> None:

@@ -203,9 +203,9 @@ class RunPreview:
 
     def _write(self, fitted: Fitted) -> None:
         test, background, display = fitted.dataset.test, fitted.dataset.background, fitted.channels.display
-        middle, path = len(test) // 2, fitted.config.output_dir / PREVIEW_FILE
-        rendered = render_image(fitted.model, test.view(middle), fitted.trainer.renderer, background)
-        pair = [display(x) for x in (test.pixels(middle).over(background), rendered)]
+        index, path = 3 * len(test) // 4, fitted.config.output_dir / PREVIEW_FILE  # not the first of a film
+        rendered = render_image(fitted.model, test.view(index), fitted.trainer.renderer, background)
+        pair = [display(x) for x in (test.pixels(index).over(background), rendered)]
         with _warn_of_unwritable_run_file(fitted, path):
             path.parent.mkdir(exist_ok=True)
             images.write_png(path, torch.cat(pair, dim=1))

@@ -33,7 +33,7 @@ from shared.cubins import compile_kernel, read_resources
 from shared.tables import DOCS, RESULTS, Table, between_markers, make_table, read_record
 
 from neuprim.core.compute.warp import BLOCK
-from neuprim.core.model import sh_warp
+from neuprim.core.model import colours_warp
 from neuprim.core.render.cuda import backward, binning, colour_net, float64, forward, prepare, prepare_backward
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import KernelForm
@@ -69,7 +69,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         return
     if name == BESIDE:
         for title, made in (
-            ("harmonics", sh_warp._harmonic_kernels(3)),
+            ("harmonics", colours_warp._harmonic_kernels(3)),
             ("Adam", kernels_warp.adam_kernels()),
             ("SSIM", kernels_warp.ssim_loss_kernels()),
         ):

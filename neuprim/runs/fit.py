@@ -313,7 +313,7 @@ def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> 
     model = trainer.model
     rows = torch.arange(0, model.count, max(model.count // 64, 1))  # some of them are active in the view
     few = Primitives(model.density, model.colour, model.rows(rows))
-    settings = replace(trainer.settings, voxels_every=1)  # the step has a view and points
+    settings = replace(trainer.settings, stride=1, voxels_every=1)  # the step has a whole view and points
     trial = Trainer(few, trainer.dataset, trainer.loss, settings, trainer.renderer, 0)
     trial.step = max(trial.settings.iterations or 1, 1)
     trial.elapsed = trial.settings.max_seconds or 0.0  # at the end of the budget every band of colour is in use

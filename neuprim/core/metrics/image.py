@@ -42,8 +42,8 @@ def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
     for name, image in images.items():
         if math.isfinite(image.detach().sum().item()):
             continue
-        bad = int((~torch.isfinite(image)).sum())
-        if bad:  # a sum may overflow
+        bad = int((~torch.isfinite(image)).sum())  # none where the sum alone overflowed
+        if bad:
             raise NonFiniteError(f"{name} image: {bad} of {image.numel()} values are NaN or infinite")
     first, second = (image.detach().cpu() for image in images.values())
     return (first, second) if first.dtype == second.dtype == torch.float32 else (first.double(), second.double())

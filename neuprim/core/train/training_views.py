@@ -86,8 +86,10 @@ def count_covered_pixels(views: ViewSet) -> float:
     """Mean number of pixels of a training view that show something: with alpha above 0, and not masked."""
     chosen = range(0, len(views), -(-len(views) // _COUNTED_VIEWS))
     total = 0
-    for pixels in map(views.pixels, chosen):
-        covered = torch.ones(pixels.rgb.shape[:2], dtype=torch.bool) if pixels.alpha is None else pixels.alpha > 0
+    for index in chosen:
+        camera, pixels = views.view(index).camera, views.pixels(index)
+        alpha = pixels.alpha  # stored images are not converted for colours
+        covered = torch.ones(camera.height, camera.width, dtype=torch.bool) if alpha is None else alpha > 0
         total += int((covered if pixels.mask is None else covered & pixels.mask).sum())
     return total / len(chosen)
 

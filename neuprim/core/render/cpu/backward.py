@@ -303,9 +303,10 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
                 copy16(S, L.DEPTH + k, depths, first_lane[q] + k)
             # where nothing but the gradients asks for chords, they are those of the lanes that have a gradient
             later = slots[i] < 0 and net is None and not with_depth
+            cut = False
             if not later:
                 evaluated += n16
-                lanes_with_slopes(S, D, V, n16, bounds, frame, pair, edge)
+                cut = lanes_with_slopes(S, D, V, n16, frame, pair, edge)
             lane_opacities(S, n16, frame.alpha_min, frame.alpha_max)
             for k in range(n, n16):
                 S[L.GRAD + k] = f(0)
@@ -354,10 +355,10 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
                 lane_chords(S, n16, frame, pair, False, True, edge)
                 for k in range(n16):
                     S[L.GMID + k] = f(0)
-            neuron_gradients(S, V, n16, p, frame.kinds[i], neurons, edge, slots[i] >= 0, out)
+            neuron_gradients(S, V, n16, p, frame.kinds[i], neurons, edge, slots[i] >= 0, cut, out)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
-            chord_gradient(S, n16, p, out, edge, slots[i] >= 0)
+            chord_gradient(S, n16, p, out, edge, cut)
     for own in (lanes, slopes, pixels, weights, rays, totals, lives):
         release_array(own)
     release_array(wide_lanes)

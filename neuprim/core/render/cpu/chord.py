@@ -190,23 +190,13 @@ def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _hard_sincs_fast(v, w):  # type: ignore[no-untyped-def]
-    """Any v and w: sinc(2 pi v) = sinc(2 pi r) r/v with r = v - rint(v), exactly reduced."""
-    r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
-    x, y = sinc_turns(r * r), sinc_turns(s * s)
-    return x if a else x * r * iv, y if b else y * s * iw
-
-
-@inline
-def _hard_slopes_fast(v, w):  # type: ignore[no-untyped-def]
-    """d sinc/dv = (cos - sinc)/v beyond half a turn."""
-    r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
-    y, z = r * r, s * s
-    x, u = sinc_turns(y), sinc_turns(z)
-    sx, su = x if a else x * r * iv, u if b else u * s * iw
-    dx = dsinc_turns(y) * _TWO * v if a else (cos_turns(y) - sx) * iv
-    du = dsinc_turns(z) * _TWO * w if b else (cos_turns(z) - su) * iw
-    return sx, dx, su, du
+def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
+    """sinc(2 pi v) and its derivative by v of v = whole + r, iv = 1/v: r/v sinc(2 pi r), and (cos - sinc)/v beyond half
+    a turn; where ``near``, the polynomials."""
+    z = r * r
+    x = sinc_turns(z)
+    b = x if near else x * r * iv
+    return b, dsinc_turns(z) * _TWO * v if near else (cos_turns(z) - b) * iv
 
 
 def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
@@ -270,12 +260,12 @@ def _medium_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
     return profiles, slopes
 
 
-def _fast_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
+def _soft_reduced(p: int) -> Kernel:
     value, slope = _horner_polynomial(_SLOW[p]), _horner_polynomial(_SLOW_SLOPE[p])
     first = p == 1
 
     @inline
-    def one(v, near, r, iv):  # type: ignore[no-untyped-def]
+    def reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
         """(B_p, dB_p/dv) of v = whole + r, iv = 1/v; the polynomial where ``near``."""
         z, iz = r * r, iv * f(1 / TAU)  # iz = 1/(2 pi v)
         b0, cosine = sinc_turns(z) * r * iv, cos_turns(z)
@@ -288,30 +278,38 @@ def _fast_chord_profiles(p: int) -> tuple[Kernel, Kernel]:
         y = v * v if near else f(0)
         return value(y) if near else b, slope(y) * f(2) * v if near else db
 
+    return reduced
+
+
+def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
+    """Any v and w."""
+
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
         r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
-        return one(v, a, r, iv)[0], one(w, b, s, iw)[0]
+        return reduced(v, a, r, iv)[0], reduced(w, b, s, iw)[0]
 
     @inline
     def slopes(v, w):  # type: ignore[no-untyped-def]
         r, s, a, b, iv, iw = _reduced_chord_rates(v, w)
-        x, dx = one(v, a, r, iv)
-        y, dy = one(w, b, s, iw)
+        x, dx = reduced(v, a, r, iv)
+        y, dy = reduced(w, b, s, iw)
         return x, dx, y, dy
 
     return profiles, slopes
 
 
-_soft_slow, _soft_medium, _soft_fast = (
-    (kind(1), kind(2)) for kind in (_slow_chord_profiles, _medium_chord_profiles, _fast_chord_profiles)
-)
+_soft_slow, _soft_medium = ((kind(1), kind(2)) for kind in (_slow_chord_profiles, _medium_chord_profiles))
+_reduced = (_hard_reduced, _soft_reduced(1), _soft_reduced(2))
+_fast = tuple(_fast_chord_profiles(reduced) for reduced in _reduced)
 profiles_slow = compile_dispatch_by_length(_hard_sincs_slow, _soft_slow[0][0], _soft_slow[1][0])
 profiles_medium = compile_dispatch_by_length(_hard_sincs_medium, _soft_medium[0][0], _soft_medium[1][0])
-profiles_fast = compile_dispatch_by_length(_hard_sincs_fast, _soft_fast[0][0], _soft_fast[1][0])
+profiles_fast = compile_dispatch_by_length(*(profiles for profiles, _ in _fast))
 slopes_slow = compile_dispatch_by_length(_hard_slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
 slopes_medium = compile_dispatch_by_length(_hard_slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
-slopes_fast = compile_dispatch_by_length(_hard_slopes_fast, _soft_fast[0][1], _soft_fast[1][1])
+slopes_fast = compile_dispatch_by_length(*(slopes for _, slopes in _fast))
+# (edge, v, whether |v| <= 1/2, v less its nearest whole number, 1/v or 1) -> B_p(2 pi v) and its derivative by v
+reduced_profile = compile_dispatch_by_length(*_reduced)
 
 
 _MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]

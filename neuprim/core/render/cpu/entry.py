@@ -129,7 +129,7 @@ def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge): 
             continue
         n16 = ((n + 15) // 16) * 16
         evaluated += n16
-        chord_field_values(S, D, n16, bounds, frame, pair, False, True, edge)
+        chord_field_values(S, D, n16, frame, pair, False, True, edge)
         lane_optical_depths(S, n16, edge)
         lane_opacities(S, n16, frame.alpha_min, frame.alpha_max)
         if net is not None:
@@ -302,7 +302,7 @@ def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # ty
             n = _gather_lanes(lanes, frame, pair)
             n16 = ((n + 15) // 16) * 16
             evaluated += n16
-            lanes_with_slopes(S, D, V, n16, lanes.bounds, frame, pair, edge)
+            cut = lanes_with_slopes(S, D, V, n16, frame, pair, edge)
             for k in range(n16):
                 S[L.GRAD + k], S[L.GMID + k], S[L.DEPTH + k] = f(0), f(0), f(0)
             if net is not None:
@@ -320,11 +320,10 @@ def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # ty
                             S[L.RAY_COLOUR + (C + c) * L.LANES + k] = values[s, H_WEIGHT] * image.rgb[Y, X, c]
                 if with_depth:
                     S[L.GMID + k] = values[s, H_WEIGHT] * image.z[Y, X] * p[P.UNIT]
-            in_float64 = frame.slots[i] >= 0
-            neuron_gradients(S, V, n16, p, frame.kinds[i], neurons, edge, in_float64, out)
+            neuron_gradients(S, V, n16, p, frame.kinds[i], neurons, edge, frame.slots[i] >= 0, cut, out)
             if net is not None:
                 ray_colour_gradient(S, waves, n16, i, net, C, out, color_at)
-            chord_gradient(S, n16, p, out, edge, in_float64)
+            chord_gradient(S, n16, p, out, edge, cut)
     release_array(own_lanes)
     release_array(own_hits)
     return evaluated

@@ -1,6 +1,7 @@
 """The float64 pixel stage, for the few primitives that float32 cannot follow; results are rounded to float32 lanes.
 
-Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from
+The chords of most are whole, and then the functions of the float32 stage follow from phases that are reduced in
+float64. Where the near plane cuts a chord with a soft edge they do not: along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from
 there to the middle. Its p-th power is a polynomial q; the mean of q cos(phase + z u) follows from the moments
 
     C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),
@@ -14,10 +15,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from neuprim.core.compute.kernels import compile_dispatch_by_length, inline
+from neuprim.core.compute.kernels import inline
 from neuprim.core.render import layout as P
 from neuprim.core.render.cpu import layout as L
-from neuprim.core.render.cpu.chord import TAU, cos_turns, dsinc_turns, sinc_turns
+from neuprim.core.render.cpu.chord import TAU, chord_edge_fade, cos_turns, reduced_profile, sinc_turns
 
 f = np.float32
 _PI2 = 2.0 * np.pi
@@ -31,57 +32,51 @@ FLOAT64_SCRATCH = L.lane_array(10)
 
 
 @inline
-def chords_float64(S, X, n, bounds, frame, pair, with_mid, backward):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.tiles.lane_chords` from the float64 row; beyond ``bounds`` is padding."""
-    p, depth_floor = frame.wide[frame.slots[pair.i]], frame.depth_floor
-    at = 0
-    for y in range(pair.y0, pair.y1):
-        dv = pair.ty + y + 0.5 - p[P.UY]
-        for x in range(bounds[y], bounds[y + P.TILE]):
-            du = pair.tx + x + 0.5 - p[P.UX]
-            gx = du * p[P.EX] + dv * p[P.EY]
-            gy = du * p[P.EX + 1] + dv * p[P.EY + 1]
-            gz = du * p[P.EX + 2] + dv * p[P.EY + 2]
-            ex, ey, ez = p[P.E0] + gx, p[P.E0 + 1] + gy, p[P.E0 + 2] + gz
-            mx, my, mz = p[P.XA] + p[P.TC] * gx, p[P.XA + 1] + p[P.TC] * gy, p[P.XA + 2] + p[P.TC] * gz
-            ia = 1.0 / (ex * ex + ey * ey + ez * ez)
-            tm = -(mx * ex + my * ey + mz * ez) * ia
-            px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
-            D = 1.0 - (px * px + py * py + pz * pz)
-            h = np.sqrt(max(D, 0.0) * ia)
-            t0, t1 = tm - h, tm + h
-            uncut = f(1) if t0 > p[P.NEAR] else f(0)
-            t0 = max(t0, p[P.NEAR])
-            mid = 0.5 * (t0 + t1)
-            half = max(0.5 * (t1 - t0), 0.0)
-            shift = mid - tm
-            qx, qy, qz = px + shift * ex, py + shift * ey, pz + shift * ez
-            X[at + _Q0], X[at + _Q1], X[at + _Q2] = qx, qy, qz
-            X[at + _V0], X[at + _V1], X[at + _V2] = ex * half, ey * half, ez * half
-            S[L.QX + at], S[L.QY + at], S[L.QZ + at] = f(qx), f(qy), f(qz)
-            S[L.EXL + at], S[L.EYL + at], S[L.EZL + at] = f(ex), f(ey), f(ez)
-            X[at + _INNER], X[at + _SHIFT], X[at + _SQUARE], X[at + _HALF] = D, shift, 1.0 / ia, half
-            S[L.HALF + at] = f(half)
-            S[L.FIELD + at] = f(p[P.OFFSET])
-            if with_mid:
-                S[L.MID + at] = f(mid)
+def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+    """As :func:`~neuprim.core.render.cpu.tiles.lane_chords` from the float64 row; returns whether a chord is cut."""
+    p, fx0, fy0 = frame.wide[frame.slots[pair.i]], pair.tx + 0.5, pair.ty + 0.5
+    e0, e1, e2, tc, near = p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.TC], p[P.NEAR]
+    x0, x1, x2, y0, y1, y2 = p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2]
+    a0, a1, a2, offset = p[P.XA], p[P.XA + 1], p[P.XA + 2], f(p[P.OFFSET])
+    fx0, fy0, depth_floor, cut = fx0 - p[P.UX], fy0 - p[P.UY], frame.depth_floor, f(0)
+    for k in range(n):
+        pixel = S[L.PIXEL + k]
+        y = np.floor(pixel * f(1 / P.TILE))
+        du, dv = fx0 + np.float64(pixel - y * f(P.TILE)), fy0 + np.float64(y)
+        gx, gy, gz = du * x0 + dv * y0, du * x1 + dv * y1, du * x2 + dv * y2
+        ex, ey, ez = e0 + gx, e1 + gy, e2 + gz
+        mx, my, mz = a0 + tc * gx, a1 + tc * gy, a2 + tc * gz
+        ia = 1.0 / (ex * ex + ey * ey + ez * ez)
+        tm = -(mx * ex + my * ey + mz * ez) * ia
+        px, py, pz = mx + tm * ex, my + tm * ey, mz + tm * ez
+        D = 1.0 - (px * px + py * py + pz * pz)
+        h = np.sqrt(max(D, 0.0) * ia)
+        t0, t1 = tm - h, tm + h
+        uncut = f(1) if t0 > near else f(0)
+        t0 = max(t0, near)
+        mid, half = 0.5 * (t0 + t1), max(0.5 * (t1 - t0), 0.0)
+        shift = mid - tm
+        cut += f(1) - uncut if D > 0.0 else f(0)
+        qx, qy, qz = px + shift * ex, py + shift * ey, pz + shift * ez
+        X[_Q0 + k], X[_Q1 + k], X[_Q2 + k] = qx, qy, qz
+        X[_V0 + k], X[_V1 + k], X[_V2 + k] = ex * half, ey * half, ez * half
+        X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k] = D, shift, 1.0 / ia, half
+        S[L.QX + k], S[L.QY + k], S[L.QZ + k] = f(qx), f(qy), f(qz)
+        S[L.EXL + k], S[L.EYL + k], S[L.EZL + k] = f(ex), f(ey), f(ez)
+        S[L.HALF + k], S[L.FIELD + k] = f(half), offset
+        if len(edge) > 0:
+            fade, by_d = chord_edge_fade(f(D), edge)
+            S[L.FADE + k] = fade
             if backward:
-                S[L.DU + at], S[L.DV + at] = f(du), f(dv)
-                S[L.MID + at], S[L.TM + at], S[L.IA + at], S[L.UNCUT + at] = f(mid), f(tm), f(ia), uncut
-                S[L.HEIGHT + at], S[L.SLIDE + at] = f(h), f(0)
-                S[L.DH + at] = f(0.5 * ia / np.sqrt(max(D, np.float64(depth_floor)) * ia))
-            at += 1
-    for k in range(at, n):  # padding: a chord of length zero, finite everywhere
-        for a in (L.QX, L.QY, L.QZ, L.EXL, L.EYL, L.EZL, L.HALF, L.FIELD):
-            S[a + k] = f(0)
-        for a in _Q + _V:
-            X[a + k] = 0.0
-        X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k] = 0.0, 0.0, 0.0, 0.0
-        if with_mid or backward:
-            S[L.MID + k] = f(0)
+                S[L.BY_D + k] = by_d
+        if with_mid:
+            S[L.MID + k] = f(mid)
         if backward:
-            for a in (L.DU, L.DV, L.TM, L.IA, L.UNCUT, L.HEIGHT, L.SLIDE, L.DH):
-                S[a + k] = f(0)
+            S[L.DU + k], S[L.DV + k] = f(du), f(dv)
+            S[L.MID + k], S[L.TM + k], S[L.IA + k], S[L.UNCUT + k] = f(mid), f(tm), f(ia), uncut
+            S[L.HEIGHT + k], S[L.SLIDE + k] = f(h), f(0)
+            S[L.DH + k] = f(0.5 * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else 1e-12) * ia))
+    return cut > f(0)
 
 
 @inline
@@ -93,31 +88,30 @@ def chord_phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Phase at the chord's middle and half its change, in turns: both reduced to half a turn, and the second whole."""
+    """Phase at the chord's middle, reduced to half a turn, and half its change, in turns."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
     v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
-    return f(u - np.rint(u)), f(v - np.rint(v)), v
+    return f(u - np.rint(u)), v
 
 
 @inline
-def _hard_neurons(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) sinc(half its change) of every neuron; in ``V`` the gradients' products."""
+def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyped-def]
+    """FIELD += w2 cos(phase at the middle) B_p(half its change) of every neuron; in ``V`` the gradients' products."""
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
+        wx, wy, wz, phase, amplitude = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], f(p[o + P.AMPLITUDE])
         for k in range(n):
-            r, s, v = _reduced_chord_phases(X, k, p, o)
-            sinc, c = sinc_turns(s * s), cos_turns(r * r)
+            u = X[_Q0 + k] * wx + X[_Q1 + k] * wy + X[_Q2 + k] * wz + phase
+            v = X[_V0 + k] * wx + X[_V1 + k] * wy + X[_V2 + k] * wz
+            whole = np.rint(v)
+            near, r = whole == 0.0, f(u - np.rint(u))
+            b, slope = reduced_profile(edge, f(v), near, f(v - whole), f(1) / (f(1) if near else f(v)))
+            c = cos_turns(r * r)
+            S[L.FIELD + k] += amplitude * c * b
             if V is not None:
-                slope = dsinc_turns(s * s) * f(2) * s
-            if abs(v) > 0.5:
-                sinc *= f(s / v)
-                if V is not None:
-                    slope = (cos_turns(s * s) - sinc) * f(1.0 / v)
-            if V is not None:
-                V[m, L.N_COS + k], V[m, L.N_DSINC + k] = c * sinc, c * slope
-                V[m, L.N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * sinc
-            S[L.FIELD + k] += f(p[o + P.AMPLITUDE]) * c * sinc
+                V[m, L.N_COS + k], V[m, L.N_DSINC + k] = c * b, c * slope
+                V[m, L.N_SIN + k] = -TAU * TAU * r * sinc_turns(r * r) * b
 
 
 @inline
@@ -160,8 +154,9 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 
 
 @inline
-def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
-    """The same of a soft edge, and FADE; with ``V`` also what gradients need of p q^(p - 1) and its moments."""
+def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
+    """The same of a soft edge where the near plane cuts, and FADE; with ``V`` also what gradients need of p q^(p - 1) and
+    its moments."""
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
         D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]
@@ -182,7 +177,7 @@ def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
             continue
         for m in range(neurons):
             o = P.NEURONS + P.PER_NEURON * m
-            r, _, v = _reduced_chord_phases(X, k, p, o)
+            r, v = _reduced_chord_phases(X, k, p, o)
             _chord_moments(_PI2 * v, j, M)
             c, s, a = np.float64(cos_turns(r * r)), np.float64(TAU * r * sinc_turns(r * r)), p[o + P.AMPLITUDE]
             even, odd = q[0] * M[0] + q[2] * M[2] + q[4] * M[4], q[1] * M[1] + q[3] * M[3]
@@ -203,14 +198,9 @@ def _soft_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
 
 
 @inline
-def _soft_neurons_1(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
-    _soft_neurons(S, X, V, n, p, neurons, 1)
-
-
-@inline
-def _soft_neurons_2(S, X, V, n, p, neurons):  # type: ignore[no-untyped-def]
-    _soft_neurons(S, X, V, n, p, neurons, 2)
-
-
-# (edge, S, X, V, n, p, neurons): FADE, FIELD += the weighted mean of every neuron, and in V (None: not) for gradients
-neurons_float64 = compile_dispatch_by_length(_hard_neurons, _soft_neurons_1, _soft_neurons_2)
+def neurons_float64(S, X, V, n, p, neurons, cut, edge):  # type: ignore[no-untyped-def]
+    """FIELD += the weighted mean of every neuron, and FADE of ``cut`` chords; in ``V`` (None: not) for gradients."""
+    if len(edge) > 0 and cut:
+        _cut_chord_neurons(S, X, V, n, p, neurons, len(edge))
+    else:
+        _whole_chord_neurons(S, X, V, n, p, neurons, edge)

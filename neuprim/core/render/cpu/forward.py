@@ -252,7 +252,7 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
                 live[q], first_lane[q] = _live_tile_row_bits(rows_live), evaluated
             if n > 0:
                 n16 = ((n + 15) // 16) * 16
-                chord_field_values(S, D, n16, bounds, frame, pair, with_depth, False, edge)
+                chord_field_values(S, D, n16, frame, pair, with_depth, False, edge)
                 _store_opacities(S, n16, frame, edge, keep, depths, evaluated)
                 evaluated += n16
                 if net is not None:

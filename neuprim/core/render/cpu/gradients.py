@@ -171,14 +171,16 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
 
 
 @inline
-def lanes_with_slopes(S, D, V, n, bounds, frame, pair, edge):  # type: ignore[no-untyped-def]
-    """Chords of ``n`` lanes of a pair; in float64 also the three products per neuron, in ``V``."""
+def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped-def]
+    """Chords of ``n`` lanes of a pair; in float64 also the three products per neuron, in ``V``. Returns whether it is
+    in float64 and a chord is cut."""
     slot = frame.slots[pair.i]
     if slot >= 0:
-        chords_float64(S, D, n, bounds, frame, pair, False, True)
-        neurons_float64(edge, S, D, V, n, frame.wide[slot], frame.neurons)
-    else:
-        lane_chords(S, n, frame, pair, False, True, edge)
+        cut = chords_float64(S, D, n, frame, pair, False, True, edge)
+        neurons_float64(S, D, V, n, frame.wide[slot], frame.neurons, cut, edge)
+        return cut
+    lane_chords(S, n, frame, pair, False, True, edge)
+    return False
 
 
 @inline
@@ -241,7 +243,7 @@ _two_float64 = _two_neuron_lane_gradients(None)
 
 
 @inline
-def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, out):  # type: ignore[no-untyped-def]
+def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  # type: ignore[no-untyped-def]
     """Gradients of b2, log m and every neuron of a pair, and dL/dQ and dL/d(half e) of its lanes."""
     _chord_field_gradient(S, n, out, edge, in_float64)
     for m in range(0, neurons, 2):
@@ -254,19 +256,19 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, out):  # type
             _two_slow(S, V[m], V[m + 1], n, p, m, edge, out)
         else:
             _two_fast(S, V[m], V[m + 1], n, p, m, edge, out)
-    if len(edge) > 0 and in_float64:  # before colours add to dL/dQ: see chord_gradient
+    if len(edge) > 0 and cut:  # before colours add to dL/dQ: see chord_gradient
         for k in range(n):
             S[L.INSIDE + k] = S[L.GQX + k] * S[L.EXL + k] + S[L.GQY + k] * S[L.EYL + k] + S[L.GQZ + k] * S[L.EZL + k]
 
 
 @inline
-def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-def]
+def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
     """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA).
 
     A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, but its weight depends on D = 1 -
-    |p|^2, and on a = e.e and the closest approach where the near plane may cut the chord. In float32 no chord is cut:
-    BY_D is d FADE/dD, and the ends' share through HALF is kept. In float64 the ends are left out, and BY_D, BY_A and
-    BY_TM are derivatives of the whole mean FADE FIELD.
+    |p|^2, and on a = e.e and the closest approach where the near plane cuts the chord. Where it cuts none of the pair's,
+    BY_D is d FADE/dD, and the ends' share through HALF is kept. Otherwise (float64) the ends are left out, and BY_D,
+    BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()
@@ -282,7 +284,7 @@ def chord_gradient(S, n, p, out, edge, in_float64):  # type: ignore[no-untyped-d
         g_mid = gqx * ex + gqy * ey + gqz * ez + S[L.GMID + k]
         g_tm, gD, gA = f(0), f(0), f(0)
         if soft > 0:
-            if in_float64:
+            if cut:
                 g_half, g_mid = f(0), g_mid - S[L.INSIDE + k]
                 g_tm, gD, gA = g * half * S[L.BY_TM + k], g * half * S[L.BY_D + k], g * half * S[L.BY_A + k]
             else:

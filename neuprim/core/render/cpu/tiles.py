@@ -269,7 +269,7 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
     """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Returns the lane count.
 
-    Every row copies a whole vector without a branch; the next row, or the padding, overwrites what stands over.
+    Padding is the first lane's pixel with a norm of 0. Every row copies a whole vector without a branch; the next row, or the padding, overwrites what stands over.
     """
     n = 0
     for y in range(y0, y1):
@@ -279,8 +279,9 @@ def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-
         copy16(S, L.PIXEL + n, _NUMBERS, j)
         copy16(S, L.NORM_L + n, state, L.NORM + j)
         n += bounds[y + P.TILE] - a
+    first = S[L.PIXEL] if n > 0 else f(0)
     for k in range(P.TILE):
-        S[index(L.PIXEL + n + k)] = f(y0 * P.TILE)
+        S[index(L.PIXEL + n + k)] = first
         S[index(L.NORM_L + n + k)] = f(0)
     return n
 
@@ -347,12 +348,12 @@ _values_fast = _neuron_values(profiles_fast)
 
 
 @inline
-def chord_field_values(S, D, n, bounds, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
+def chord_field_values(S, D, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
     """Chords and FIELD of ``n`` lanes of a pair, in float64 where float32 is too coarse; see :func:`lane_chords`."""
     i = pair.i
     if frame.slots[i] >= 0:
-        chords_float64(S, D, n, bounds, frame, pair, with_mid, backward)
-        neurons_float64(edge, S, D, None, n, frame.wide[frame.slots[i]], frame.neurons)
+        cut = chords_float64(S, D, n, frame, pair, with_mid, backward, edge)
+        neurons_float64(S, D, None, n, frame.wide[frame.slots[i]], frame.neurons, cut, edge)
     else:
         p = frame.rows[i]
         lane_chords(S, n, frame, pair, with_mid, backward, edge)

@@ -146,7 +146,7 @@ def test_a_person_looks_at_a_training(tmp_path: Path, monkeypatch: pytest.Monkey
         tries = itertools.count()
 
         def described() -> bool:  # the page listens to clicks a moment after the box was ticked
-            picture = tab.picture()  # the background is white: click on the darkest pixels of what is shown now, in turn
+            picture = tab.picture()  # the background is white: click on the darkest pixels shown now, in turn
             pixel = np.argsort(picture.min(-1), axis=None, kind="stable")[100 * next(tries)]
             y, x = np.unravel_index(int(pixel), picture.shape[:2])
             page.mouse.click(int(x) + 20, int(y) + 200)

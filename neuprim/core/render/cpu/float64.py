@@ -1,8 +1,9 @@
 """The float64 pixel stage, for the few primitives that float32 cannot follow; results are rounded to float32 lanes.
 
-The chords of most are whole, and then the functions of the float32 stage follow from phases that are reduced in
-float64. Where the near plane cuts a chord with a soft edge they do not: along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the closest approach, a = e.e and shift from
-there to the middle. Its p-th power is a polynomial q; the mean of q cos(phase + z u) follows from the moments
+Whole chords take the functions of the float32 stage, with phases reduced in float64. Where the near plane cuts a chord
+with a soft edge these do not apply. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the
+closest approach, a = e.e and shift from there to the middle. Its p-th power is a polynomial q; the mean of
+q cos(phase + z u) follows from the moments
 
     C_n = 1/2 integral of u^n cos(z u) du (n even),   S_n = 1/2 integral of u^n sin(z u) du (n odd),
     dC_n/dz = -S_(n+1), dS_n/dz = C_(n+1)
@@ -155,8 +156,8 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 
 @inline
 def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
-    """The same of a soft edge where the near plane cuts, and FADE; with ``V`` also what gradients need of p q^(p - 1) and
-    its moments."""
+    """The same of a soft edge where the near plane cuts, and FADE; with ``V`` also what gradients need of p q^(p - 1)
+    and its moments."""
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
         D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]

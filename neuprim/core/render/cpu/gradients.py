@@ -266,9 +266,9 @@ def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
     """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA).
 
     A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, but its weight depends on D = 1 -
-    |p|^2, and on a = e.e and the closest approach where the near plane cuts the chord. Where it cuts none of the pair's,
-    BY_D is d FADE/dD, and the ends' share through HALF is kept. Otherwise (float64) the ends are left out, and BY_D,
-    BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
+    |p|^2, and on a = e.e and the closest approach where the near plane cuts the chord. Where it cuts no chord of the
+    pair, BY_D is d FADE/dD, and the ends' share through HALF is kept. Otherwise (float64) the ends are left out, and
+    BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()

@@ -269,7 +269,8 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
     """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Returns the lane count.
 
-    Padding is the first lane's pixel with a norm of 0. Every row copies a whole vector without a branch; the next row, or the padding, overwrites what stands over.
+    Padding is the first lane's pixel with a norm of 0. Every row copies a whole vector without a branch; the next row,
+    or the padding, overwrites what stands over.
     """
     n = 0
     for y in range(y0, y1):

@@ -9,6 +9,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, final
 
+import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
@@ -16,6 +17,7 @@ from torch import Tensor
 from neuprim.core.cameras import Camera, look_at, orbit
 from neuprim.core.cameras.world import World
 from neuprim.core.compute import device as hardware
+from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.errors import ConfigError, warn_once
 from neuprim.core.model.fields import Conditions
 
@@ -25,6 +27,14 @@ if TYPE_CHECKING:
 DataSource = Literal["real", "generated", "simulated"]
 """Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given
 ("simulated")."""
+
+
+@exact_kernel
+def _composite_pixels(rgb, alpha, out, background):  # type: ignore[no-untyped-def]
+    for i in range(rgb.shape[0]):
+        uncovered = np.float32(1) - alpha[i, 0]
+        for c in range(rgb.shape[1]):
+            out[i, c] = rgb[i, c] + uncovered * background[c]
 
 
 @dataclass(frozen=True)
@@ -60,8 +70,12 @@ class Pixels:
         rgb, alpha = self.rgb, self.alpha  # in this order: stored images convert both at once
         if alpha is None:
             return rgb
-        uncovered, channels = (1.0 - alpha).reshape(-1), rgb.shape[-1]
-        return torch.addr(rgb.reshape(-1, channels), uncovered, background.to(rgb)).reshape(rgb.shape)
+        if not hardware.on_numba(rgb, alpha):
+            return torch.addcmul(rgb, (1.0 - alpha)[..., None], background.to(rgb))
+        out = torch.empty(rgb.shape)
+        flat = [x.contiguous().reshape(alpha.numel(), -1).numpy() for x in (rgb, alpha, out)]
+        _composite_pixels(*flat, background.to(rgb).numpy())
+        return out
 
 
 class ViewSet(ABC):

@@ -200,8 +200,9 @@ class _StoredImage:
     scale: float = 1.0  # factor of colours after that
 
     def strided(self, step: int, column: int, row: int) -> _StoredImage:
-        few = Pixels(self.data, None, self.mask).strided(step, column, row)
-        return replace(self, data=few.rgb, mask=few.mask)
+        data, words = self.data, self.data.dtype == torch.uint8 and self.data.shape[-1] == 4
+        few = Pixels(data.view(torch.int32) if words else data, None, self.mask).strided(step, column, row)
+        return replace(self, data=few.rgb.view(data.dtype), mask=few.mask)  # pixels of four bytes move as one number
 
     @property
     def alpha(self) -> Tensor | None:

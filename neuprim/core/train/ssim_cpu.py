@@ -2,7 +2,8 @@
 
 SSIM over an 11-tap Gaussian window (sigma 1.5), valid windows only. With window means a = E[x], b = E[y],
 A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1, D = E[xx] - a^2 + E[yy] - b^2 + c2: SSIM = AB/(CD). Its
-derivatives with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur.
+derivatives with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur. Where the images
+are equal, as in front of an empty background, SSIM is 1 and their gradient 0: those columns are left out.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.kernels import inline, kernel
+from neuprim.core.compute.kernels import exact_kernel, inline, kernel
 from neuprim.core.compute.threads import parallel_for
 
 SSIM_TAPS = 11
@@ -88,8 +89,30 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
     return total
 
 
+@exact_kernel
+def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
+    """unequal[i] = [first, end) of the numbers of image rows start:stop that differ, or [n, 0)."""
+    n = x.shape[0] // height
+    for i in range(start, stop):
+        first, end = 0, n
+        while first < n and x[i * n + first] == y[i * n + first]:
+            first += 1
+        while end > first and x[i * n + end - 1] == y[i * n + end - 1]:
+            end -= 1
+        unequal[i, 0], unequal[i, 1] = (first, end) if end > first else (n, 0)
+
+
+@inline
+def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
+    """[first, end) of the unequal numbers of image rows start:stop, so many before and after, within [0, most)."""
+    first, end = most, np.int64(0)
+    for i in range(start, stop):
+        first, end = min(first, unequal[i, 0] - before), max(end, unequal[i, 1] + after)
+    return max(first, 0), min(end, most)
+
+
 @kernel
-def _ssim_loss_maps(start, stop, x, y, height, channels, maps):  # type: ignore[no-untyped-def]
+def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type: ignore[no-untyped-def]
     """Window rows start:stop: derivative maps of the mean SSIM; returns the sum of SSIM over them.
 
     x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
@@ -102,8 +125,12 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, maps):  # type: ignore[
     s = np.zeros(5 * _BLOCK, np.float32)
     total = 0.0
     for r in range(start, stop):
-        for j0 in range(0, m, _BLOCK):
-            size = min(_BLOCK, m - j0)
+        first, end = _widest_columns(unequal, r, r + SSIM_TAPS, reach, 0, m)
+        total += m - max(end - first, 0)
+        for q in range(3):
+            maps[q, r + SSIM_TAPS - 1, :] = f(0)
+        for j0 in range(first, end, _BLOCK):
+            size = min(_BLOCK, end - j0)
             _vertical_loss_moments(V, x, y, r * n + j0, n, size + reach)
             for q in range(5):
                 _blur_loss_rows(s[q * _BLOCK :], V[q * _WIDE :], channels, size)
@@ -128,7 +155,7 @@ def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped
 
 
 @kernel
-def _spread_loss_gradient(start, stop, x, y, height, channels, maps, weight, grad):  # type: ignore[no-untyped-def]
+def _spread_loss_gradient(start, stop, x, y, height, channels, unequal, maps, weight, grad):  # type: ignore[no-untyped-def]
     """Image rows start:stop of d loss / d x, the adjoint of the blur; returns the sum of |x - y|."""
     n = x.shape[0] // height
     pitch = maps.shape[2]
@@ -138,8 +165,11 @@ def _spread_loss_gradient(start, stop, x, y, height, channels, maps, weight, gra
     l1_share = (f(1) - weight) / f(x.shape[0])
     total = 0.0
     for i in range(start, stop):
-        for j0 in range(0, n, _BLOCK):
-            size = min(_BLOCK, n - j0)
+        low, high = max(i - SSIM_TAPS + 1, 0), min(i + SSIM_TAPS, height)
+        first, end = _widest_columns(unequal, low, high, reach, reach, n)
+        grad[i * n : (i + 1) * n] = f(0)
+        for j0 in range(first, end, _BLOCK):
+            size = min(_BLOCK, end - j0)
             for q in range(3):
                 _blur_loss_columns(
                     V, maps[q].reshape(-1), i * pitch + j0, pitch, size + reach
@@ -171,8 +201,9 @@ def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> t
     H, W, C = rendered.shape
     x, y = (np.ascontiguousarray(image.numpy()).reshape(-1) for image in (rendered, truth))
     windows, m = H - SSIM_TAPS + 1, (W - SSIM_TAPS + 1) * C
-    maps = _bordered_loss_maps(windows + 20, m + 20 * C)
-    ssim = sum(parallel_for(_ssim_loss_maps, windows, _ROWS, 0, x, y, H, C, maps)) / (windows * m)
-    grad = np.empty(x.size, np.float32)
-    l1 = sum(parallel_for(_spread_loss_gradient, H, _ROWS, 0, x, y, H, C, maps, np.float32(weight), grad)) / x.size
+    maps, unequal = _bordered_loss_maps(windows + 20, m + 20 * C), np.empty((H, 2), np.int64)
+    parallel_for(_find_unequal_columns, H, _ROWS, 0, x, y, H, unequal)
+    ssim = sum(parallel_for(_ssim_loss_maps, windows, _ROWS, 0, x, y, H, C, unequal, maps)) / (windows * m)
+    work, grad = (H, _ROWS, 0, x, y, H, C, unequal, maps, np.float32(weight)), np.empty(x.size, np.float32)
+    l1 = sum(parallel_for(_spread_loss_gradient, *work, grad)) / x.size
     return torch.tensor([l1, ssim], dtype=torch.float64), torch.from_numpy(grad).reshape(H, W, C)

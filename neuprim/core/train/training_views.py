@@ -48,11 +48,11 @@ class PixelLoader:
         pixels = self._dataset.train.pixels(index)
         if not isinstance(pixels, StoredPixels):  # they have the size of their view, and no floats yet
             check_pixels("train", self._dataset.train.view(index), pixels, self._dataset.channels)
-        return pixels if self._device.type == device.HOST else pixels.to(self._device)
+        return pixels if self._device.type == device.CPU else pixels.to(self._device)
 
     def take(self, index: int, upcoming: int | None) -> Pixels:
         """Return a view's pixels, and start loading those of ``upcoming``, if it is known. Raises what loading did."""
-        if self._device.type == device.HOST:
+        if self._device.type == device.CPU:
             return self._load(index)
         pending, self._pending = self._pending, None
         if index in self._cache:

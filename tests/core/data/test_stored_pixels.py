@@ -19,6 +19,8 @@ from neuprim.core.data.image_views import ImageFrame, ImageViews, Mask, RadialDi
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import image_info, srgb_to_linear
+from neuprim.core.train.training_views import PixelLoader
+from tests.core import tiny
 
 W, H = 47, 38
 LENS = RadialDistortion(k1=-0.1)
@@ -99,6 +101,13 @@ def test_only_what_is_used_is_converted(tmp_path: Path, monkeypatch: pytest.Monk
     few = pixels.strided(5, 0, 0)
     assert few.alpha is not None and pixels.alpha is not None and not sizes, "silhouettes need no colours"
     assert few.rgb is few.rgb and sizes == [10 * 8]
+
+
+def test_a_training_on_the_cpu_gets_whole_views_unconverted(tmp_path: Path) -> None:
+    views = image_views(tmp_path, "rgba")
+    loader = PixelLoader(tiny.two_primitives(train=views), torch.device("cpu"))
+    taken = loader.take(0, 0)
+    assert isinstance(taken, StoredPixels) and not {"rgb", "alpha"} & set(vars(taken))
 
 
 def test_fields_can_be_replaced(tmp_path: Path) -> None:

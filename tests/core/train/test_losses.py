@@ -50,6 +50,25 @@ def test_fused_equals_kornia(size: tuple[int, int], channels: int, weight: float
     assert exact[0] > 0.05
 
 
+@pytest.mark.parametrize("box", [(0, 0, 0, 0), (0, 1, 0, 1), (30, 31, 0, 40), (10, 34, 17, 39), (39, 40, 49, 50)])
+def test_equal_parts_of_images_count_as_equal(box: tuple[int, int, int, int]) -> None:
+    """Columns left out because both images show the same there: outside of a box, or everywhere."""
+    other, truth = pair(40, 50, 3)
+    top, bottom, left, right = box
+    rendered = truth.clone()
+    rendered[top:bottom, left:right] = other[top:bottom, left:right]
+    fused = value_and_grad(photometric({"ssim_weight": 0.4}), rendered, truth)
+    exact = value_and_grad(lambda a, b, frame: photometric_reference(a, b, 0.4), rendered.double(), truth.double())
+    assert fused[0] == pytest.approx(exact[0], abs=1e-6) and fused[2] == pytest.approx(exact[2], abs=1e-6)
+    assert (fused[1].double() - exact[1]).abs().max() <= max(1e-5 * float(exact[1].abs().max()), 1e-8)
+
+
+def test_not_a_number_is_not_equal() -> None:
+    truth = pair(24, 20, 3)[1]
+    truth[5, 6, 1] = math.nan
+    assert math.isnan(photometric({"ssim_weight": 0.4})(truth, truth.clone(), FRAME)[0].item())
+
+
 def test_flat_images_stay_finite() -> None:
     value, grad, _ = value_and_grad(photometric({"ssim_weight": 0.2}), torch.zeros(16, 16, 3), torch.ones(16, 16, 3))
     assert math.isfinite(value) and bool(torch.isfinite(grad).all())

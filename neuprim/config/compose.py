@@ -147,7 +147,10 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
             refuse_missing_config_plugins(begun)  # naming the package says more
         raise
     if begun is not None:
+        if config.model.primitives == "auto":  # typed again: the run stored the number
+            config.model = dataclasses.replace(config.model, primitives=begun.model.primitives)
         refuse_contradictions(begun, config, paths)
+    config.model = config.model.with_count_for(config.train)
     config.overrides = _merge_overrides(earlier[0], overrides) if earlier else list(overrides)
     return config
 

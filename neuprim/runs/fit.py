@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import torch
@@ -39,6 +40,9 @@ _CURVE_VIEWS = 5
 
 _CURVE_PSNR_MAX = 200.0
 """dB; equal images have an infinite PSNR, which a line of JSON cannot hold."""
+
+_TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS = 5000, 20, 2.0
+"""The training that measures the pace, with as many primitives in the end, and at most so many steps and seconds."""
 
 
 # ---------------------------------------------------------------- events
@@ -194,8 +198,13 @@ def prepare_training(
         trainer = make(job, dataset, loss)
     else:
         events(Preparing("starting points"))
+        if config.model.primitives == "auto":
+            count = partial(_choose_run_size, job, dataset, loss, events)
+            chosen = count() if group is None else group.share_number("primitives", count)
+            config = replace(config, model=replace(config.model, primitives=chosen))
+            job = Job(config, task)
         trainer = make_run_trainer(job, dataset, loss, group)
-        wanted, found = config.model.primitives, trainer.model.count
+        wanted, found = config.model.count, trainer.model.count
         if found < wanted and config.train.population.strategy != "relocate":
             events(Note(f"{dataset.name} offers {found:,} starting points for model.primitives={wanted:,}"))
     # every later command uses the near plane that the trainer chose
@@ -286,7 +295,7 @@ def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup
     model = initial_model_to_train(density, colour, dataset, settings, config.seed)
     population = config.train.population
     if population.grow_to is None:
-        population = replace(population, grow_to=config.model.primitives)
+        population = replace(population, grow_to=config.model.count)
     train = drop_unused_run_rates(replace(config.train, population=population), task, model)
     if group is None:
         return Trainer(model, dataset, loss, train, config.renderer, config.seed)
@@ -304,7 +313,23 @@ def drop_unused_run_rates(train: TrainSettings, task: TaskSpec, model: Primitive
 
 def _starting_count_of_run(config: RunConfig) -> int:
     """Primitives at the start of a training."""
-    return max(round(config.train.population.grow_from * config.model.primitives), 1)
+    return max(round(config.train.population.grow_from * config.model.count), 1)
+
+
+def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> int:
+    """The number of ``model.primitives=auto`` for ``train.max_seconds``, from the pace of a trial training."""
+    config = job.config
+    trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES))
+    trainer = make_run_trainer(Job(trial, job.task), dataset, loss)
+    compile_run_kernels(trainer, events)
+    events(Preparing("a test of the pace, for model.primitives=auto"))
+    with use_one_torch_thread_for_run():
+        while trainer.step < _TRIAL_STEPS and trainer.elapsed < _TRIAL_SECONDS:
+            trainer.train_step()
+    pace = trainer.elapsed / (trainer.step * trainer.model.count)
+    model, seconds = config.model.with_count_for(config.train, pace), config.train.max_seconds
+    events(Note(f"model.primitives=auto: {model.count:,} for {seconds:g} s, as one takes {1e6 * pace:.2g} µs a step"))
+    return model.count
 
 
 def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> None:

@@ -127,13 +127,11 @@ def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
         ConfigError: fewer primitives than the chunks need.
     """
     least, train = _MIN_PRIMITIVES * len(chunks.parts), config.train
-    if config.model.primitives < least:
+    if config.model.count < least:
         raise ConfigError(
-            f"model.primitives={config.model.primitives}: expected at least {least} for {len(chunks.parts)} chunks"
+            f"model.primitives={config.model.count}: expected at least {least} for {len(chunks.parts)} chunks"
         )
-    counts = _divide_primitives_among_chunks(
-        config.model.primitives - least, [part.primitives for part in chunks.parts]
-    )
+    counts = _divide_primitives_among_chunks(config.model.count - least, [part.primitives for part in chunks.parts])
     configs, runs = [], []
     for part, count in zip(chunks.parts, counts, strict=True):
         share = (1 - JOINT_SHARE) * part.steps

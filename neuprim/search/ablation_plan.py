@@ -58,9 +58,9 @@ class Variant:
 
 def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
     """Return knob -> its variants, those next to the centre's value first."""
-    counts = dict.fromkeys(max(1, round(part * centre.model.primitives)) for part in _COUNTS)
+    counts = dict.fromkeys(max(1, round(part * centre.model.count)) for part in _COUNTS)
     knob = "model.primitives"
-    variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.primitives]}
+    variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.count]}
     for knob, values in call_task_tunable_settings(task, build_settings(task, centre.model, centre.options)).items():
         now = get_trial_setting(centre, knob)
         others = [value for value in values if value != now]

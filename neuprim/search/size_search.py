@@ -160,9 +160,7 @@ class SizeSearch:
         """Choose the length of trials from a few steps."""
         if self.record.length:
             return
-        (first,) = self.runner.run(
-            Attempt("pace", {}, self.config.model.primitives, int(min(_PACE_STEPS, self.max_steps)))
-        )
+        (first,) = self.runner.run(Attempt("pace", {}, self.config.model.count, int(min(_PACE_STEPS, self.max_steps))))
         possible, pace = self.full_steps(first.count), self.runner.pace(first.count)
         needed = 2 * _MIN_STEPS * _SHORTER
         if possible < needed:
@@ -180,7 +178,7 @@ class SizeSearch:
 
     def _highest(self) -> int:
         """Return the primitives whose full run has twice the steps of a trial, and that limits allow."""
-        low = high = self.config.model.primitives
+        low = high = self.config.model.count
         while self.full_steps(high) > 2 * self.record.length and high < 2**24:
             low, high = high, 2 * high
         while high - low > max(low // 50, 1):
@@ -202,7 +200,7 @@ class SizeSearch:
 
     def _try_sizes(self) -> None:
         """Try sizes until the one for the target is known, the share of the budget is used, or nothing helps."""
-        first = min(self.config.model.primitives, self._highest())
+        first = min(self.config.model.count, self._highest())
         self._try_size(first)
         lengthened = False
         while not self.record.turns and self.full_steps(first) >= 1.9 * _SHORTER * self.record.length:

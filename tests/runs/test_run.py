@@ -26,6 +26,7 @@ from neuprim.core import checkpoint, errors
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.errors import CheckpointError, ConfigError, DataError, NeuprimWarning
 from neuprim.core.io.files import write_text
+from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs import training
 from neuprim.runs.fit import Event, Note, compile_run_kernels, measure_run_curve_point, prepare_training, train_to_end
@@ -443,6 +444,36 @@ def test_a_count_that_is_not_reached_is_said(
     train_to_end(fitted, events.append)
     notes = [event.text for event in events if isinstance(event, Note)]
     assert len(notes) == 1 and said in notes[0]
+
+
+def test_the_number_of_primitives_follows_the_budget() -> None:
+    auto, steps = ModelSettings(primitives="auto", auto_primitives=10.0), TrainSettings(iterations=400)
+    seconds, both = replace(steps, iterations=None, max_seconds=8.0), replace(steps, max_seconds=8.0)
+    assert auto.with_count_for(steps).count == 200, "10 sqrt(400)"
+    # 8 seconds at 1e-4 a step and primitive: 400 steps of 200 primitives
+    assert auto.with_count_for(seconds, 1e-4).count == auto.with_count_for(both, 1e-4).count == 200
+    assert auto.with_count_for(both, 1e-5).count == 200 and auto.with_count_for(both, 8e-4).count == 100
+    assert auto.with_count_for(seconds, 1e-30).count > 1e6 and auto.with_count_for(seconds, 1e9).count == 1
+    assert ModelSettings(primitives=7).with_count_for(steps).count == 7
+    with pytest.raises(ConfigError, match="primitives=auto: only a training chooses it"):
+        _ = auto.with_count_for(seconds).count
+
+
+def test_a_run_chooses_its_number_of_primitives_once(scene: Path, tmp_path: Path) -> None:
+    """By steps when it is composed, by seconds from its pace; it stores the number, and keeps it when it goes on."""
+    out, events = tmp_path / "out", list[Event]()
+    own = [word for word in words(scene, out, 400) if "primitives" not in word and "max_seconds" not in word]
+    auto = [*own, "model.primitives=auto", "model.auto_primitives=2"]
+    assert compose(auto).model.primitives == 40
+    in_seconds = [*(word for word in auto if "iterations" not in word), "train.max_seconds=0.3"]
+    run(compose(in_seconds), events.append)
+    found = RunConfig.from_yaml(out).model.count
+    said = [event.text for event in events if isinstance(event, Note) and "model.primitives=auto" in event.text]
+    assert len(said) == 1 and f"auto: {found:,} for 0.3 s" in said[0] and read_metrics(out)["primitives"] == found
+    again = compose([*in_seconds, "resume=true"])
+    assert again.model.primitives == found and compose([f"output_dir={out}", "resume=true"]).model.primitives == found
+    with pytest.raises(ConfigError, match=f"model.primitives={found + 1}: the run to resume was begun with"):
+        compose([f"output_dir={out}", "resume=true", f"model.primitives={found + 1}"])
 
 
 def test_kernels_of_points_are_compiled_before_the_first_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

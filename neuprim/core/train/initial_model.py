@@ -46,13 +46,13 @@ def initial_model_to_train(
     where = settings.init.get("points", "matter")
     if isinstance(where, str) and where.lower().endswith((".ply", *COMPRESSED)):
         points = read_points(Path(where).expanduser(), dataset.channels, dataset.color_space).within(dataset.world)
-        cloud = draw_points(points, settings.primitives, generator)
+        cloud = draw_points(points, settings.count, generator)
     elif where in ("matter", "box"):
-        cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.primitives, generator)
+        cloud = (dataset.uniform_points if where == "box" else dataset.initial_points)(settings.count, generator)
         cloud = _add_initial_surroundings(cloud, dataset, settings, generator)
     else:
         raise ConfigError(f"model.init.points={where!r}: expected matter, box or a .ply file")
-    check_points(cloud, settings.primitives, dataset)
+    check_points(cloud, settings.count, dataset)
     if len(cloud.means) == 0:
         raise DataError(f"{dataset.name}: no starting points found; expected points or images with visible content")
     if not bool((count_seeing_views(dataset.train, cloud.means) > 0).any()):
@@ -100,6 +100,6 @@ def _add_initial_surroundings(
         raise ConfigError(
             f"model.init.surroundings={share!r}: matter of {dataset.name} depends on {named}; expected a scene at rest"
         )
-    own = draw_points(cloud, min(len(cloud.means), round((1.0 - share) * settings.primitives)), generator)
-    more = surrounding_points(dataset.train, own, settings.primitives - len(own.means), generator)
+    own = draw_points(cloud, min(len(cloud.means), round((1.0 - share) * settings.count)), generator)
+    more = surrounding_points(dataset.train, own, settings.count - len(own.means), generator)
     return PointCloud(torch.cat([own.means, more.means]), torch.cat([own.colors, more.colors]))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import timedelta
@@ -127,6 +127,14 @@ class ProcessGroup:
         with self._errors():
             dist.all_gather_object(values, value)
         return values
+
+    def share_number(self, name: str, make: Callable[[], int]) -> int:
+        """Return what ``make`` gives on rank 0, which is the only one to call it, as ``name``. Raises RankError."""
+        number = make() if self.is_first else None
+        with self._errors():
+            if number is not None:
+                self.store.set(name, str(number))
+            return int(self.store.get(name))
 
     def exchange(self, sent: Tensor, received: Tensor) -> None:
         """Send row r of (R, n) ``sent`` to rank r; row r of ``received`` comes from rank r. Raises RankError."""

@@ -6,9 +6,10 @@ The settings in :data:`OPTIONAL` are read by a task's ``build`` or by a loss, if
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from neuprim.core.errors import ConfigError
@@ -28,7 +29,10 @@ class ModelSettings:
     """What is fitted.
 
     Attributes:
-        primitives: primitives at the start (and throughout, unless population control grows them).
+        primitives: how many there are to be. "auto" follows the budget: ``auto_primitives`` times the square root of
+            the steps, or of as many as a short test of the pace expects in ``train.max_seconds``; a run stores the
+            number.
+        auto_primitives: see ``primitives``.
         density, colour: which density and colour the task builds; the task says what there is to choose, see its
             presets.
         neurons: hidden width K of the cosine density, 0..16; 0 is a constant density. A Gaussian has none.
@@ -39,7 +43,8 @@ class ModelSettings:
             ``colour.degree=1``; what ``neuprim prune`` found that a scene does not require.
     """
 
-    primitives: Annotated[int, Range(at_least=1)] = 2000
+    primitives: Annotated[int, Range(at_least=1)] | Literal["auto"] = 2000
+    auto_primitives: Annotated[float, Range(above=0)] = 250.0
     density: dict[str, Any] = field(default_factory=dict)
     colour: dict[str, Any] = field(default_factory=dict)
     neurons: Annotated[int, Range(0, 16)] = 8
@@ -52,6 +57,33 @@ class ModelSettings:
 
     def __post_init__(self) -> None:
         validate_fields(self, "model")
+
+    @property
+    def count(self) -> int:
+        """``primitives`` as a number.
+
+        Raises:
+            ConfigError: it is "auto", and only the start of a training measures the pace that it depends on.
+        """
+        if self.primitives == "auto":
+            raise ConfigError(
+                "model.primitives=auto: only a training chooses it for train.max_seconds; expected a number"
+            )
+        return self.primitives
+
+    def with_count_for(self, train: TrainSettings, pace: float | None = None) -> ModelSettings:
+        """Replace "auto" by the number for a budget: that of steps, or of seconds where ``pace`` is known, the smaller
+        where there are both.
+
+        Args:
+            pace: seconds of a step per primitive; None leaves "auto" to budgets of seconds.
+        """
+        if self.primitives != "auto" or (pace is None and train.max_seconds is not None):
+            return self
+        found = [] if train.iterations is None else [self.auto_primitives * math.sqrt(train.iterations)]
+        if train.max_seconds is not None and pace is not None:  # n = a sqrt(steps) and steps = seconds / (pace n)
+            found.append((self.auto_primitives**2 * train.max_seconds / pace) ** (1 / 3))
+        return replace(self, primitives=max(round(min(found)), 1))
 
 
 @dataclass

@@ -145,6 +145,16 @@ def test_a_budget_of_seconds_follows_the_first_rank(scene: Dataset) -> None:
     assert first == second and len(first) > 3 and first[-1] >= 0.3 and first == sorted(first)
 
 
+def test_ranks_share_a_number_that_the_first_one_finds() -> None:
+    asked: list[int] = []
+
+    def work(group: ProcessGroup) -> int:
+        with group.in_turn():
+            return group.share_number("primitives", lambda: asked.append(group.rank) or 10**9)  # type: ignore[func-returns-value]
+
+    assert results(run_ranks(3, work)) == [10**9] * 3 and asked == [0]
+
+
 def test_all_ranks_stop_after_the_same_step(scene: Dataset) -> None:
     def work(group: ProcessGroup) -> int:
         trainer = tiny.trainer(scene, 1000, group=group)

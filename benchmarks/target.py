@@ -71,8 +71,8 @@ _CHAIR = ("task=static", "scene=blender", "train.iterations=2500")
 _FIRE = ("task=dynamic", "scene=vdb", "scene.size=64", "train.iterations=4000")
 _LIT = ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=3000")
 SCENES = {
-    "solids": Scene(_SOLIDS, (40, 80, 160, 320), ("", "model.sh_degree=1"), (26.0, 28.0), 90.0, 400),
-    "chair": Scene(_CHAIR, (200, 400, 800, 1600), ("", "model.sh_degree=1"), (33.0,), 240.0, 2800),
+    "solids": Scene(_SOLIDS, (40, 80, 160, 320), ("", "model.colour.lobes=1"), (26.0, 28.0), 90.0, 400),
+    "chair": Scene(_CHAIR, (200, 400, 800, 1600), ("", "model.colour.lobes=1"), (33.0,), 240.0, 2800),
     "fire": Scene(_FIRE, (850, 1700, 3400, 6800), ("", "model.density.time=window"), (43.0,), 240.0, 13500),
     "lit_solids": Scene(_LIT, (330, 660, 1330, 2655), ("", "model.colour.hidden=4"), (28.0,), 450.0, 2655),
 }

@@ -14,7 +14,8 @@ def words(scene: Path, out: Path, iterations: int = STEPS, *more: str) -> list[s
     """Overrides of a run that is over in a second or two and reproducible to the bit."""
     return [
         "task=static", "scene=blender", f"scene.path={scene}", "scene.background=random", f"output_dir={out}",
-        "model.primitives=40", "model.neurons=4", "model.sh_degree=3", "model.sh_every=0.5", "seed=3",
+        "model.primitives=40", "model.neurons=4", "model.colour.form=sh", "model.sh_degree=3", "model.sh_every=0.5",
+        "seed=3",
         f"train.iterations={iterations}",
         "train.max_seconds=null", "train.log_every=10", "train.eval_every=0.25", "train.population.every=20",
         "train.population.start=0.05",

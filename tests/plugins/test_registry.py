@@ -208,7 +208,7 @@ def test_a_scene_with_the_name_of_a_tasks_own(site: Path) -> None:
     assert "fake_extra" not in sys.modules
     assert find_registered_scene(task, "neuprim:solids").config_package == "neuprim.tasks.static.conf"
     config = compose(["task=static", "scene=fake-extra:solids"], False)
-    assert (config.scene_name, config.scene, config.model.primitives) == ("solids", {"wobble": 3.0}, 2800)
+    assert (config.scene_name, config.scene, config.model.auto_primitives) == ("solids", {"wobble": 3.0}, 250)
     for word in ("fake-extra:solid", "nobody:solids"):
         with pytest.raises(ConfigError, match=f"scene={word}: task 'static' has no such scene of"):
             find_registered_scene(task, word)

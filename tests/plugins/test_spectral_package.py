@@ -60,7 +60,7 @@ def short(out: Path, *words: str) -> list[str]:
 def test_its_loss_serves_any_task(package: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     words = ("train.loss=spectral-angle", "task.options.angle_weight=0.5")
     assert call(*short(tmp_path / "own", *words)) == 0
-    static = ["task=static", "train.max_seconds=null", "model.neurons=1", "model.sh_degree=0"]
+    static = ["task=static", "train.max_seconds=null", "model.neurons=1", "model.colour.lobes=0"]
     assert call(*short(tmp_path / "static", *words), *static) == 0
     assert (tmp_path / "static" / "config.yaml").read_text().count("neuprim-spectral") == 1, "of the loss alone"
     assert "task.options.angel: task 'spectral' has no such option; did you mean 'angle'?" in refusal(

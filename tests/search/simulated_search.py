@@ -11,6 +11,7 @@ from typing import Any
 import pytest
 
 from neuprim.config.command_settings import SearchTarget
+from neuprim.core.train.settings import ModelSettings
 from neuprim.search import size_search
 from neuprim.search.size_forecast import SizePredictor
 from neuprim.search.size_search import SizeSearch
@@ -112,7 +113,7 @@ def simulate_search(
 ) -> tuple[Attempt, SimulatedRunner]:
     """Search with simulated trainings; returns the chosen full run."""
     train = SimpleNamespace(iterations=3000)
-    config: Any = SimpleNamespace(model=SimpleNamespace(primitives=start), train=train, task="static")
+    config: Any = SimpleNamespace(model=ModelSettings(primitives=start), train=train, task="static")
     dataset: Any = SimpleNamespace(train=range(64), test=range(16))
     record = TargetRecord({**target.given_settings(), "budget": 60.0}, {}, hold_out=8)
     runner = SimulatedRunner(config, dataset, record, lambda event: None, curves=curves, seed=seed)

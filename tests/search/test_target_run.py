@@ -217,7 +217,7 @@ def test_what_cannot_be_searched_is_refused(met: Met, tmp_path: Path) -> None:
     with pytest.raises(DataError, match="3 training views; a target needs 4 or more"):
         search(tmp_path / "few", 20.0, "scene.train_views=3")
     with pytest.raises(ConfigError, match=r"target.json: begun with another model"):
-        search(met[0], 20.0, "resume=true", "model.sh_degree=1")
+        search(met[0], 20.0, "resume=true", "model.colour.lobes=1")
     (tmp_path / "config.yaml").write_text("task: {}\n")
     with pytest.raises(ConfigError, match="holds a run without a target"):
         search(tmp_path, 20.0, "resume=true")

@@ -166,6 +166,8 @@ class TrainSettings:
             images.
         loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
+        size_weight: weight of the mean semi-axis over the scene's extent. Smaller primitives overlap less: steps are
+            faster, and what a view does not ask for goes away (3DGS-MCMC, Kheradmand et al. 2024).
         anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
         background: "white", "black", "random" or "auto" (the data set's own choice).
         checkpoint_every_seconds: a checkpoint is written at the first step after this many seconds, and at the end.
@@ -192,6 +194,7 @@ class TrainSettings:
     voxel_colour: NotNegative = 0.1
     loss: Annotated[str, nonempty_text("the name of a loss")] | None = None
     ssim_weight: Annotated[float, Range(0, 1)] = 0.2
+    size_weight: NotNegative = 0.0
     anisotropy_weight: NotNegative = 0.0
     anisotropy_from: Annotated[int, Range(at_least=0)] = 100
     background: Literal["auto", "white", "black", "random"] = "auto"

@@ -356,6 +356,8 @@ class Trainer:
         if points is not None:
             loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
         assert loss is not None
+        if self.settings.size_weight > 0:
+            loss = loss + self.settings.size_weight * self.model.params["log_scales"].exp().mean() / self.extent
         if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
         return loss

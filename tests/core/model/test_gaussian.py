@@ -176,7 +176,7 @@ def test_a_short_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, preset: st
     scene, out = tiny.write_blender(tmp_path / "two"), tmp_path / "run"
     words = [
         "task=static", "scene=blender", f"scene.path={scene}", f"preset={preset}", "model.density.form=gaussian",
-        "model.primitives=30",
+        "model.primitives=30", "model.colour.form=sh",
         "model.sh_degree=1", "train.iterations=120", "train.max_seconds=null", "train.log_every=5",
         "train.population.every=20",
         f"train.population.strategy={strategy}", "train.population.start=0", f"output_dir={out}",

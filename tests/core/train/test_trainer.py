@@ -170,6 +170,16 @@ def test_units_of_rates(plain: Dataset) -> None:
         tiny.trainer(plain, 100, rate_units={"mean": "absolute"})
 
 
+def test_a_size_weight_costs_the_mean_semi_axis_over_the_extent(plain: Dataset) -> None:
+    without, small = tiny.trainer(plain), tiny.trainer(plain, size_weight=0.5)
+    expected = 0.5 * float(small.model.params["log_scales"].exp().mean()) / small.extent
+    assert small.train_step().loss - without.train_step().loss == pytest.approx(expected, rel=1e-4)
+    for trainer in (without, small):
+        list(trainer.run())
+    after = [float(trainer.model.params["log_scales"].exp().mean()) for trainer in (without, small)]
+    assert after[1] < 0.9 * after[0]
+
+
 def test_budget_of_seconds(plain: Dataset) -> None:
     trainer = tiny.trainer(plain, 10**9, max_seconds=0.05)
     reports = list(trainer.run())

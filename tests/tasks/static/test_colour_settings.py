@@ -17,20 +17,17 @@ def colour(*words: str) -> object:
 
 
 def test_forms() -> None:
-    default, two, three = (
-        colour(),
-        colour("model.colour.form=lobes"),
-        colour("model.colour.form=lobes", "model.colour.lobes=3"),
-    )
-    assert isinstance(default, SphericalHarmonics) and default.degree == 3
-    assert isinstance(two, SphericalLobes) and two.settings() == {"lobes": 2, "channels": 3}
+    default, three, harmonics = colour(), colour("model.colour.lobes=3"), colour("model.colour.form=sh")
+    assert isinstance(default, SphericalLobes) and default.settings() == {"lobes": 2, "channels": 3}
     assert isinstance(three, SphericalLobes) and three.lobes == 3
+    assert isinstance(harmonics, SphericalHarmonics) and harmonics.degree == 3
+    assert isinstance(colour("preset=paper"), SphericalHarmonics)
 
 
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["model.colour.lobes=2"], "model.colour.lobes=2: expected none without model.colour.form=lobes"),
+        (["preset=paper", "model.colour.lobes=2"], "model.colour.lobes=2: expected none without model.colour.form="),
         (["model.colour.form=lobes", "model.sh_degree=1"], "model.sh_degree=1: lobes have no harmonics; expected"),
         (["model.colour.form=lobes", "model.colour.lobes=9"], "model.colour.lobes=9: 9 lobes; expected 0..8"),
         (["model.colour.form=lobes", "model.colour.lobes=1.5"], "model.colour.lobes=1.5: expected a whole number"),
@@ -51,6 +48,6 @@ def test_another_form_takes_none_of_an_earlier_runs_lobes() -> None:
 
 
 def test_what_a_search_may_change() -> None:
-    for words, key in (([], "model.sh_degree"), (["model.colour.form=lobes"], "model.colour.lobes")):
+    for words, key in ((["model.colour.form=sh"], "model.sh_degree"), ([], "model.colour.lobes")):
         config = compose(["task=static", "scene=solids", *words], False)
         assert key in TASK.tunable_settings(build_settings(TASK, config.model, config.options))

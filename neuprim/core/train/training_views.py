@@ -21,7 +21,7 @@ from neuprim.core.data.image_views import StoredPixels
 _MIN_SIDE = 11
 """Pixels along a side that no stride goes below: the window of SSIM."""
 
-_PIXELS_PER_PRIMITIVE = 2.5
+_PIXELS_PER_PRIMITIVE = 1.5
 """Covered pixels of a view that take as long in a step on the CPU as one primitive does."""
 
 _COUNTED_VIEWS = 16

@@ -2,8 +2,8 @@
 
     python benchmarks/readme.py
 
-Each row compares the default preset with the paper's form at equal bytes. The records are made by static.py,
-dynamic_quality.py, relight_quality.py and expressivity.py.
+Each row compares the default density with the paper's form at equal bytes. The records are made by dynamic_quality.py,
+relight_quality.py and expressivity.py.
 """
 
 from __future__ import annotations
@@ -23,11 +23,6 @@ def psnr_cell(runs: Sequence[Run], key: str, **facts: Any) -> str:
 def results_table() -> str:
     """The table in Markdown."""
     table = Table("scene", "model", "training", "default", "the paper's form")
-    runs = read_trials(RESULTS / "static.json")
-    for size, steps, default, paper in (("0.8 MB", "2,500 steps", 2800, 2000), ("2.0 MB", "4,000 steps", 7000, 5000)):
-        facts = {"scene": "chair_200", "budget": steps}
-        cells = [psnr_cell(runs, "psnr", primitives=count, **facts) for count in (default, paper)]
-        table.row("NeRF-synthetic chair, 200×200", size, steps, *cells)
     runs = read_trials(RESULTS / "expressivity.json")
     cells = [psnr_cell(runs, "psnr", part="forms", scene="solids", size=2000, form=form) for form in ("2:2", "8:0")]
     table.row("`solids` (generated), 200×200", "0.8 MB", "equal time", *cells)

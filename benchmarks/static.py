@@ -12,7 +12,7 @@ Rows go to benchmarks/results/static.json one by one, and the table to static.md
 a row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of docs/static.md,
 --readme the rows of README_SECONDS into the README. Without SCENE nothing is run. The README's picture:
 
-    python docs/make_pictures.py outputs/static_benchmark/mic_800-240s-0 docs/pictures/static.png 2 400
+    python docs/make_pictures.py outputs/static_benchmark/mic_800-240s-0 docs/pictures/static.png 3 400
 
 Published figures are those of neuprim/runs/paper_tables.yaml and benchmarks/results/published.json, which name their
 sources. Values are means over seeds +- half the spread, of the last checkpoint. SSIM and LPIPS are counted as the tools

@@ -1,7 +1,7 @@
 """Pictures of README and site from finished runs: held-out views, truth above, render below.
 
-    neuprim run task=static scene=solids scene.size=256 train.iterations=3500 output_dir=RUN_DIR
-    python docs/make_pictures.py RUN_DIR docs/pictures/solids.png
+    neuprim run task=static scene=solids output_dir=RUN_DIR
+    python docs/make_pictures.py RUN_DIR docs/pictures/solids.png 4 256
     python docs/make_pictures.py RUN_DIR docs/pictures/smoke_fire.png 6 192
 
     neuprim run task=relight scene=lit_solids train.iterations=4000 output_dir=RUN_DIR

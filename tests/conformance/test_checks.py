@@ -21,9 +21,9 @@ Check = Callable[[], None]
 
 VARIANTS: dict[str, tuple[TaskSpec, str | None, dict[str, Any]]] = {
     "static": (STATIC, None, {}),
-    "static-gaussian": (STATIC, None, {"density": {"form": "gaussian"}, "sh_degree": 0}),
-    "static-lobes": (STATIC, None, {"colour": {"form": "lobes", "lobes": 2}}),
-    "static-edge": (STATIC, None, {"density": {"edge": 1, "gain": True}, "sh_degree": 0}),
+    "static-gaussian": (STATIC, None, {"density": {"form": "gaussian"}, "colour": {"form": "lobes", "lobes": 1}}),
+    "static-harmonics": (STATIC, None, {"colour": {"form": "sh"}}),
+    "static-edge": (STATIC, None, {"density": {"edge": 1, "gain": True}, "colour": {"form": "sh"}, "sh_degree": 0}),
     "dynamic": (DYNAMIC, None, {}),
     "dynamic-edge": (
         DYNAMIC,
@@ -66,7 +66,7 @@ def test_relighting_takes_rgb_only(channels: int) -> None:
 def test_check_task_lists_every_failure() -> None:
     broken = replace(STATIC, check=lambda model: None, fields={})
     with pytest.raises(ConformanceError) as caught:
-        check_task(broken, model={"neurons": 2, "sh_degree": 0})
+        check_task(broken, model={"neurons": 2, "colour": {"form": "sh"}, "sh_degree": 0})
     lines = str(caught.value).splitlines()
     assert all(line.startswith("task 'static': ") for line in lines)
     failed = {line.split(": ")[1] for line in lines}

@@ -25,7 +25,7 @@ from neuprim.core.task import SceneSpec, Supervision, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.tasks.static import TASK, SphericalHarmonics
 
-MODEL = {"neurons": 2, "sh_degree": 0, "init": {}}
+MODEL = {"neurons": 2, "colour": {"form": "sh"}, "sh_degree": 0, "init": {}}
 
 
 def using(

@@ -47,6 +47,7 @@ RECORD = RESULTS / "static.json"
 PUBLISHED = RESULTS / "published.json"
 PAPER_SIZE = "800×800"
 README_SECONDS = (240, 1200)
+README_CELLS = (0, 1, 2, 3, 4, 7, 9)  # of row_cells
 HOLD_OUT = 8
 COMPRESS_SECONDS = 30.0  # as `neuprim compress` fine-tunes unless told otherwise
 KEYS = ("psnr", "psnr_worst", "ssim", "ssim_3dgs", "lpips_3dgs", "primitives", "model_bytes", "psnr_gain")
@@ -177,17 +178,20 @@ def table(record: Record) -> str:
 
 
 def readme_table(record: Record) -> str:
-    """The rows with README_SECONDS and no settings of their own; empty without any."""
+    """Own rows with README_SECONDS and no settings, and below them the PSNR of published ones; empty without any."""
     budgets = [f"{seconds} s" for seconds in README_SECONDS]
     runs = [run for run in record["trials"] if run["budget"] in budgets and not run["settings"]]
     if not runs:
         return ""
-    made = Table("scene", *COLUMNS[2:], "published PSNR")
+    made, published = Table("scene", *(COLUMNS[2 + number] for number in README_CELLS)), []
     for scene, size, rows in group_rows(runs):
-        others = "; ".join(f"{row['method']} {row['psnr']:.2f}" for row in published_rows(scene, size))
         for own in rows:
-            made.row(f"{scene}, {size}", *row_cells(own), others or "–")
-    return str(made)
+            cells = row_cells(own)
+            made.row(f"{scene}, {size}", *(cells[number] for number in README_CELLS))
+        others = "; ".join(f"{row['method']}: {row['psnr']:.2f}" for row in published_rows(scene, size))
+        if others:
+            published.append(f"Published for {scene}, {size}, dB: {others}.")
+    return "\n\n".join([str(made), *published])
 
 
 def main() -> None:

@@ -54,8 +54,9 @@ class Tab:
     def until(self, condition: Callable[[], bool], what: str) -> None:
         end = time.monotonic() + PATIENCE
         while not condition():
-            text = self.page.evaluate("document.body.innerText")
-            assert time.monotonic() < end, f"{what}: not within {PATIENCE:.0f} s; {self.faults}; {text}"
+            if time.monotonic() >= end:
+                shown = self.page.evaluate("document.body.innerText")
+                raise AssertionError(f"{what}: not within {PATIENCE:.0f} s; {self.faults}; {shown}")
             self.page.wait_for_timeout(100)
 
     def moved(self, before: np.ndarray, share: float = 0.02) -> np.ndarray:

@@ -72,7 +72,7 @@ class Pixels:
             return rgb
         if not hardware.on_numba(rgb, alpha):
             return torch.addcmul(rgb, (1.0 - alpha)[..., None], background.to(rgb))
-        out = torch.empty(rgb.shape)
+        out = torch.empty(rgb.shape, dtype=rgb.dtype)
         flat = [x.contiguous().reshape(alpha.numel(), -1).numpy() for x in (rgb, alpha, out)]
         _composite_pixels(*flat, background.to(rgb).numpy())
         return out

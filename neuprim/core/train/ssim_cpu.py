@@ -104,11 +104,13 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 
 @inline
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
-    """[first, end) of the unequal numbers of image rows start:stop, so many before and after, within [0, most)."""
+    """[first, end) of the unequal numbers of image rows start:stop, so many before and after, within [0, most); end is
+    first without any."""
     first, end = most, np.int64(0)
     for i in range(start, stop):
         first, end = min(first, unequal[i, 0] - before), max(end, unequal[i, 1] + after)
-    return max(first, 0), min(end, most)
+    first = max(first, 0)
+    return first, max(min(end, most), first)
 
 
 @kernel
@@ -126,9 +128,11 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
     total = 0.0
     for r in range(start, stop):
         first, end = _widest_columns(unequal, r, r + SSIM_TAPS, reach, 0, m)
-        total += m - max(end - first, 0)
+        total += m - (end - first)
         for q in range(3):
-            maps[q, r + SSIM_TAPS - 1, :] = f(0)
+            row = maps[q, r + SSIM_TAPS - 1]
+            row[: reach + first] = f(0)
+            row[reach + end :] = f(0)
         for j0 in range(first, end, _BLOCK):
             size = min(_BLOCK, end - j0)
             _vertical_loss_moments(V, x, y, r * n + j0, n, size + reach)
@@ -167,7 +171,8 @@ def _spread_loss_gradient(start, stop, x, y, height, channels, unequal, maps, we
     for i in range(start, stop):
         low, high = max(i - SSIM_TAPS + 1, 0), min(i + SSIM_TAPS, height)
         first, end = _widest_columns(unequal, low, high, reach, reach, n)
-        grad[i * n : (i + 1) * n] = f(0)
+        grad[i * n : i * n + first] = f(0)
+        grad[i * n + end : (i + 1) * n] = f(0)
         for j0 in range(first, end, _BLOCK):
             size = min(_BLOCK, end - j0)
             for q in range(3):

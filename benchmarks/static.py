@@ -85,7 +85,7 @@ def plan(args: argparse.Namespace) -> list[Trial]:
 
 
 def measure_row(data: tuple[Trial, Path], attempt: int, events: Events) -> Record:
-    """Train, evaluate and compress; the function of a job."""
+    """Train, evaluate and, unless held-out views judge, compress; the function of a job."""
     trial, out = data[0], data[1] / data[0].name
     torch.set_num_threads(1)
     own = [f"seed={trial.seed}", "renderer.threads=1", f"output_dir='{out}'", "resume=true"]
@@ -97,16 +97,13 @@ def measure_row(data: tuple[Trial, Path], attempt: int, events: Events) -> Recor
         start = time.process_time()
         metrics = evaluate_fitted(fitted, out)
         evaluated = time.process_time() - start
-        compressed = compress_run(CompressRequest(out, overwrite=True, seconds=COMPRESS_SECONDS))
+        compress = CompressRequest(out, overwrite=True, seconds=COMPRESS_SECONDS)
+        compressed = None if trial.hold_out else compress_run(compress)
     row = {"trial": trial.name, "seed": trial.seed, "iterations": fitted.trainer.step, **dict(trial.facts)}
     row |= {"cpu_seconds": fitted.trainer.elapsed, "evaluation_cpu_seconds": evaluated}
-    row |= {
-        "size": "×".join(map(str, metrics["image_size"])),
-        "compressed_bytes": compressed.after,
-        "frame_ms": time_frames(fitted),
-    }
-    if not trial.hold_out:
-        row["psnr_compressed"] = compressed.measured["psnr"][1]
+    row |= {"size": "×".join(map(str, metrics["image_size"])), "frame_ms": time_frames(fitted)}
+    if compressed is not None:
+        row |= {"compressed_bytes": compressed.after, "psnr_compressed": compressed.measured["psnr"][1]}
     return row | {key: metrics[key] for key in KEYS if metrics.get(key) is not None}
 
 

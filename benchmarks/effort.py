@@ -1,27 +1,30 @@
 """What is the best use of so much time? The levels `effort=1` to `9` of every task: how many primitives, and how many
 views.
 
-    python benchmarks/effort.py [--scenes chair smoke_fire lit_solids] [--chair DIR] [--write] [--docs] [--print]
+    python benchmarks/effort.py [--scenes smoke_fire lit_solids] [--write] [--docs] [--print]
 
-A level is a share of the time that the preset `quick` takes, from a sixteenth of it to four times as much, on any
-machine. Level by level the number of primitives that was best so far is tried, and at most levels twice as many, while
-that is better: they share the time at paces measured side by side. Each is trained once, one thread, all else as the
-preset has it, and judged by views held out of the training ones (volumes: by the two test cameras of a rig of 38, as
-those of the usual 40 must not decide). The level is the smallest model within TIE dB of the best of so much time or
-less. Results go to benchmarks/results/effort/SCENE.json after every run, and only what is missing is run. --write
-freezes the levels in the tasks' `effort/NAME.yaml`, --docs puts the tables between the markers of docs/tradeoffs.md and
-draws docs/pictures/effort.png; --print runs nothing.
+Static scenes have levels of views alone, as their number of primitives follows the views. --docs makes their table of
+what `python benchmarks/static.py SCENE ... --tune --steps 320 500 ...` recorded. Of the other tasks a level is a share
+of the time that the preset `quick` takes, from a sixteenth of it to four times as much, on any machine. Level by level
+the number of primitives that was best so far is tried, and at most levels twice as many, while that is better: they
+share the time at paces measured side by side. Each is trained once, one thread, all else as the preset has it, and
+judged by views held out of the training ones (volumes: by the two test cameras of a rig of 38, as those of the usual 40
+must not decide). The level is the smallest model within TIE dB of the best of so much time or less. Results go to
+benchmarks/results/effort/SCENE.json after every run, and only what is missing is run. --write freezes the levels in the
+tasks' `effort/NAME.yaml`, --docs puts the tables between the markers of docs/tradeoffs.md and draws
+docs/pictures/effort.png; --print runs nothing.
 """
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
 
-from shared.arguments import make_parser, require_folders
+import yaml
+from shared.arguments import make_parser
 from shared.forms import SCENES
-from shared.tables import DOCS, RESULTS, ROOT, Run, Table, between_markers, make_table, read_trials
+from shared.tables import DOCS, RESULTS, ROOT, Run, Table, between_markers, group_runs, make_table, read_trials
 from shared.trials import Trial, measure_paces, run_all
 
 from neuprim.config import compose
@@ -30,12 +33,11 @@ from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
 
 PICTURE = DOCS / "pictures" / "effort.png"
 TITLES = {
-    "chair": "static: NeRF-synthetic chair, 200×200",
     "smoke_fire": "dynamic: `smoke_fire` (simulated), 64×64",
     "lit_solids": "relight: `lit_solids` (generated), 128×128",
 }
-"""One scene of each task."""
-JUDGED = {"chair": "all pixels", "smoke_fire": "inside the mask", "lit_solids": "clamped"}
+"""One scene of each task but the static one."""
+JUDGED = {"smoke_fire": "inside the mask", "lit_solids": "clamped"}
 TIMES = dict(zip(LEVELS, (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 1.5, 2, 3, 4), strict=True))  # of the preset's own time
 FIRST = 0.5
 """Of the preset's own number of primitives, where the first level begins, and half of which it tries as well."""
@@ -46,19 +48,58 @@ TIE = 0.05
 PACED = 320  # steps of the short runs that tell the paces; a whole one each, as primitives are born on the way
 HOLD_OUT = 8
 KEYS = ("psnr", "psnr_mask", "psnr_linear_clamped", "ssim", "primitives", "model_bytes")
+STATIC_RECORD = RESULTS / "static_tune.json"
 
 
 def record_of(scene: str) -> Path:
     return RESULTS / "effort" / f"{scene}.json"
 
 
+def levels_path(task: str) -> Path:
+    return ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml"
+
+
+def static_levels() -> dict[int, list[Run]]:
+    """A run per scene of every level of the static task."""
+    levels = yaml.safe_load(levels_path("static").read_text(encoding="utf-8"))["levels"]
+    runs = [run for run in read_trials(STATIC_RECORD) if not run["settings"]]
+    views = {f"{settings['train.iterations']:,} steps": level for level, settings in levels.items()}
+    by_budget = group_runs((run for run in runs if run["budget"] in views), "budget")
+    found = {views[budget]: sorted(own, key=lambda run: run["scene"]) for (budget,), own in by_budget.items()}
+    return dict(sorted(found.items()))
+
+
+def static_table(levels: Mapping[int, Sequence[Run]]) -> Table:
+    """A row per level: what it costs, and dB, SSIM and seconds of a core of every scene."""
+    preset = {run["scene"]: run["cpu_seconds"] for run in levels[5]}
+
+    def time_of(level: int) -> float:
+        return statistics.mean(run["cpu_seconds"] / preset[run["scene"]] for run in levels[level])
+
+    columns = {
+        "`effort=`": lambda level: level,
+        "time": lambda level: f"{time_of(level):.2g}",
+        "views": lambda level: f"{levels[level][0]['iterations']:,}",
+        "primitives": lambda level: f"{levels[level][0]['primitives']:,}",
+        "bytes": lambda level: f"{levels[level][0]['model_bytes']:,}",
+    }
+    for number, run in enumerate(levels[5]):
+
+        def result(level: int, number: int = number) -> str:
+            own = levels[level][number]
+            return f"{own['psnr']:.2f}, {own['ssim']:.4f} ({own['cpu_seconds']:.0f} s)"
+
+        columns[f"{run['scene']}, {run['size']}"] = result
+    return make_table(columns, levels)
+
+
 class Climb:
     """Goes up the levels of a scene; what is recorded is not run again."""
 
-    def __init__(self, scene: str, folders: Mapping[str, Any]) -> None:
+    def __init__(self, scene: str) -> None:
         self.scene, self.record = scene, record_of(scene)
         self.is_volume = SCENES[scene].task == "dynamic"
-        self.words = (*SCENES[scene].all_words(folders, scene), *(("scene.cameras=38",) if self.is_volume else ()))
+        self.words = (*SCENES[scene].all_words({}, scene), *(("scene.cameras=38",) if self.is_volume else ()))
         own = compose(self.words, check_output=False)
         assert own.train.iterations is not None, "presets are stated in views"
         self.steps, self.primitives = own.train.iterations, own.model.primitives
@@ -86,7 +127,7 @@ class Climb:
         trials = read_trials(self.record)
         return float(next(run[SCENES[self.scene].judged] for run in trials if run["trial"] == name))
 
-    def _trial(self, name: str, steps: int, share: float, facts: tuple[tuple[str, Any], ...] = ()) -> Trial:
+    def _trial(self, name: str, steps: int, share: float, facts: tuple[tuple[str, object], ...] = ()) -> Trial:
         words = (*self.words, f"model.primitives={round(share * self.primitives)}")
         hold_out = 0 if self.is_volume or not name else HOLD_OUT
         return Trial(name, words, steps, 0, hold_out, facts, interventions=None)
@@ -161,23 +202,20 @@ def make_chart(runs: Sequence[Run], scene: str) -> Chart:
 
 
 def main() -> None:
-    parser = make_parser(__doc__, "--chair", "--docs", "--print", scenes=TITLES)
+    parser = make_parser(__doc__, "--docs", "--print", scenes=TITLES)
     parser.add_argument("--write", action="store_true", help="freeze the levels in the tasks' files")
     args = parser.parse_args()
     if not args.only_print:
-        require_folders(parser, args, args.scenes)
         for scene in args.scenes:
-            Climb(scene, vars(args)).run()
+            Climb(scene).run()
     found = {scene: read_trials(record_of(scene)) for scene in TITLES}
     found = {scene: runs for scene, runs in found.items() if {run["level"] for run in runs} == set(LEVELS)}
     text = "\n\n".join(f"**{TITLES[scene]}**\n\n{table(runs, scene)}" for scene, runs in found.items())
     if args.write:
         for scene, runs in found.items():
-            task = SCENES[scene].task
-            target = ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml"
-            target.parent.mkdir(exist_ok=True)
-            target.write_text(levels_file(runs, scene))
+            levels_path(SCENES[scene].task).write_text(levels_file(runs, scene))
     if args.docs:
+        between_markers(DOCS / "tradeoffs.md", "effort-static", str(static_table(static_levels())))
         between_markers(DOCS / "tradeoffs.md", "effort", text)
         write_png_charts(PICTURE, [make_chart(runs, scene) for scene, runs in found.items()])
 

@@ -71,6 +71,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "fronts": ("docs/tradeoffs.md", "fronts", reports),
     "target": ("docs/tradeoffs.md", "target", reports),
     "effort": ("docs/tradeoffs.md", "effort", effort),
+    "effort-static": ("docs/tradeoffs.md", "effort", lambda s: s.static_table(s.static_levels())),
     "expressivity": ("docs/expressivity.md", "expressivity", lambda s: s.forms_table(record_of(s))),
     "expressivity-gaussian": (
         "docs/expressivity.md",
@@ -119,6 +120,5 @@ def test_recorded_numbers_keep_their_promises(load: Load) -> None:
 def test_levels_of_effort_are_those_that_were_measured(load: Load) -> None:
     script = load("effort")
     for scene in script.TITLES:
-        task = script.SCENES[scene].task
-        file = ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml"
+        file = script.levels_path(script.SCENES[scene].task)
         assert file.read_text("utf-8") == script.levels_file(script.read_trials(script.record_of(scene)), scene)

@@ -29,7 +29,7 @@ from shared.trials import Trial, measure_paces, run_all
 
 from neuprim.config import compose
 from neuprim.config.task_files import LEVELS
-from neuprim.report.charts import Chart, Dot, front_chart, write_png_charts
+from neuprim.report.charts import Chart, ChartPoints, Dot, front_chart, write_png_charts
 
 PICTURE = DOCS / "pictures" / "effort.png"
 TITLES = {
@@ -91,6 +91,16 @@ def static_table(levels: Mapping[int, Sequence[Run]]) -> Table:
 
         columns[f"{run['scene']}, {run['size']}"] = result
     return make_table(columns, levels)
+
+
+def static_chart(levels: Mapping[int, Sequence[Run]]) -> Chart:
+    """PSNR of every scene against the training time of its levels."""
+    lines = []
+    for number, run in enumerate(levels[5]):
+        own = [levels[level][number] for level in levels]
+        seconds, scores = [run["cpu_seconds"] for run in own], [run["psnr"] for run in own]
+        lines.append(ChartPoints(seconds, scores, f"C{number}", name=f"{run['scene']}, {run['size']}"))
+    return Chart("static", lines, "training, seconds of a core", "dB, held-out views", log_x=True)
 
 
 class Climb:
@@ -215,9 +225,11 @@ def main() -> None:
         for scene, runs in found.items():
             levels_path(SCENES[scene].task).write_text(levels_file(runs, scene))
     if args.docs:
-        between_markers(DOCS / "tradeoffs.md", "effort-static", str(static_table(static_levels())))
+        levels = static_levels()
+        between_markers(DOCS / "tradeoffs.md", "effort-static", str(static_table(levels)))
         between_markers(DOCS / "tradeoffs.md", "effort", text)
-        write_png_charts(PICTURE, [make_chart(runs, scene) for scene, runs in found.items()])
+        charts = [make_chart(runs, scene) for scene, runs in found.items()]
+        write_png_charts(PICTURE, [static_chart(levels), *charts])
 
 
 if __name__ == "__main__":

@@ -67,6 +67,7 @@ FIELDS: dict[str, tuple[str, Callable[[], tuple[DensityField, ColourField]]]] = 
         "relight",
         lambda: (CosineDensity(2), field("relight", "LightNetwork", hidden=3, form="multiplicative")),
     ),
+    "surface": ("relight", lambda: (CosineDensity(0), field("relight", "SurfaceColour", lobes=2))),
     "harmonics": ("relight", lambda: (CosineDensity(2), field("relight", "LightHarmonics", degree=4))),
 }  # type: ignore[dict-item]
 """Name -> task, and a density and a colour."""

@@ -31,6 +31,7 @@ VARIANTS: dict[str, tuple[TaskSpec, str | None, dict[str, Any]]] = {
         {"density": {"time": "phase+offset+window+motion", "edge": 2, "gain": True}},
     ),
     "relight": (RELIGHT, None, {"colour": {"form": "multiplicative", "hidden": 4, "visibility": "none"}}),
+    "relight-surface": (RELIGHT, None, {"colour": {"form": "surface", "lobes": 1, "visibility": "none"}}),
 }
 
 

@@ -21,6 +21,7 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
+from neuprim.tasks.relight.surface import SurfaceColour
 from neuprim.tasks.static import SphericalHarmonics, SphericalLobes
 from neuprim.webpage import PageView
 from tests.browsers import Tab, open_tab
@@ -156,6 +157,20 @@ def test_relit_models(hidden: int, visibility: str, falloff: bool, chromium: Any
     form = "multiplicative" if falloff else "additive"
     colour = LightNetwork(hidden, form=form, visibility=visibility, falloff=falloff)
     model, bound = random_model(CosineDensity(2, edge=2), colour, seed=3), ERROR if visibility == "none" else 5 * ERROR
+    page_of(model, tmp_path / "p.html", LIGHT)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
+            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < bound
+        assert tab.faults == []
+
+
+@pytest.mark.parametrize(
+    ("lobes", "indirect", "visibility", "falloff"),
+    [(0, 0, "none", True), (8, 4, "none", False), (2, 4, "primitive", True), (1, 1, "primitive", False)],
+)
+def test_lit_surfaces(lobes: int, indirect: int, visibility: str, falloff: bool, chromium: Any, tmp_path: Path) -> None:
+    colour = SurfaceColour(lobes, indirect, visibility=visibility, falloff=falloff)
+    model, bound = random_model(CosineDensity(2, edge=2), colour, seed=7), ERROR if visibility == "none" else 5 * ERROR
     page_of(model, tmp_path / "p.html", LIGHT)
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):

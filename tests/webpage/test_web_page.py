@@ -16,6 +16,7 @@ from neuprim.core.model.edge import edge_profile
 from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.tasks.relight import colour as light_colour
 from neuprim.tasks.relight.colour import LightNetwork
+from neuprim.tasks.relight.surface import GATE, SHORTEST, WRAP, SurfaceColour
 from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
 from neuprim.webpage.model_page import pack_webpage_model, shader_constants, stored_up_axis
@@ -109,7 +110,9 @@ def test_the_controls_of_conditions(tmp_path: Path) -> None:
 
 def test_the_script_s_shadows_are_those_of_the_model() -> None:
     """Constants that stand in both languages."""
-    text = LightNetwork(2).script()
-    for name, value in (("size", light_colour.SIZE), ("layers", light_colour.LAYERS)):
-        assert f"{name}: {value}" in text
-    assert light_colour.BIAS == light_colour.SOFTNESS == 1 / 20 and "bias: 1 / 20, softness: 1 / 20" in text
+    assert light_colour.BIAS == light_colour.SOFTNESS == 1 / 20
+    for text in (LightNetwork(2).script(), SurfaceColour().script()):
+        for name, value in (("size", light_colour.SIZE), ("layers", light_colour.LAYERS)):
+            assert f"{name}: {value}" in text
+        assert "bias: 1 / 20, softness: 1 / 20" in text
+    assert f"wrap = {WRAP}, gate = {GATE:g}, shortest = 1e-6" in text and SHORTEST == 1e-6

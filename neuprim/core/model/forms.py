@@ -154,12 +154,16 @@ LoweredDensity = Cosine | CustomDensity
 
 @dataclass(frozen=True)
 class Constant(PrimitiveTensors):
-    """One colour per primitive and view: rgb (N, C), any channel count."""
+    """One colour per primitive and view: rgb (N, C), any channel count.
+
+    ``unshaded`` (N, C), if given, is added once :class:`Shading` has multiplied ``rgb``.
+    """
 
     per_primitive: ClassVar[bool] = True
     shapes: ClassVar[Shapes] = {"rgb": (("N", "C"),)}
 
     rgb: Tensor
+    unshaded: Tensor | None = None
 
     @property
     def channels(self) -> int:
@@ -168,9 +172,10 @@ class Constant(PrimitiveTensors):
     def tensors(self) -> dict[str, Tensor]:
         return {"colors": self.rgb}  # as users know it
 
-    def scaled(self, factors: Tensor) -> Constant:
-        """The same times (N,) factors, at least 0."""
-        return Constant(self.rgb * factors.to(self.rgb)[:, None])
+    def shaded(self, factors: Tensor | None) -> Constant:
+        """``rgb`` times (N,) factors, at least 0, and ``unshaded``; None: 1."""
+        rgb = self.rgb if factors is None else self.rgb * factors.to(self.rgb)[:, None]
+        return Constant(rgb if self.unshaded is None else rgb + self.unshaded)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
         """(M, C) float64 colours that are seen along chords."""
@@ -204,8 +209,10 @@ class CustomColour(PrimitiveTensors):
         sizes["C"] = (self.channels, "channels")
         return labelled_fault("radiance", function_fault(self.radiance))
 
-    def scaled(self, factors: Tensor) -> CustomColour:
-        """The same times (N,) factors, at least 0."""
+    def shaded(self, factors: Tensor | None) -> CustomColour:
+        """The same times (N,) factors, at least 0; None: 1."""
+        if factors is None:
+            return self
 
         def radiance(prim: Tensor, x: Tensor, d: Tensor) -> Tensor:
             found = self.radiance(prim, x, d)
@@ -261,8 +268,10 @@ class RayNet(PrimitiveTensors):
     def hidden(self) -> int:
         return int(self.Wx.shape[1])
 
-    def scaled(self, factors: Tensor) -> RayNet:
-        """The same times (N,) factors, at least 0, which max(0, .) lets through."""
+    def shaded(self, factors: Tensor | None) -> RayNet:
+        """The same times (N,) factors, at least 0, which max(0, .) lets through; None: 1."""
+        if factors is None:
+            return self
         factors = factors.to(self.base)
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 

@@ -250,8 +250,7 @@ class Primitives:
         check_lowered_channels(sizes["C"][0], self.colour)
         found = self.colour.shade(geometry, density, conditions, settings or RenderSettings()) if shaded else None
         shading = check_primitive_shading(found, geometry.count, model_method_label(self.colour, "shade"))
-        if shading.primitives is not None:
-            colour = colour.scaled(shading.primitives)
+        colour = colour.shaded(shading.primitives)
         return LoweredPrimitives(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:

@@ -39,10 +39,13 @@ from neuprim.tasks.relight.lighting import (
     summarize_lights,
     typical_light,
 )
+from neuprim.tasks.relight.surface import INDIRECT, SurfaceColour
 
 _SETTINGS: dict[str, tuple[Any, ...] | type] = {
-    "form": (*FORMS, "harmonics"),
+    "form": (*FORMS, "surface", "harmonics"),
     "hidden": int,
+    "lobes": int,
+    "indirect": int,
     "visibility": VISIBILITY,
     "boost": float,
     "degree": int,
@@ -50,10 +53,14 @@ _SETTINGS: dict[str, tuple[Any, ...] | type] = {
 
 
 def _light_colour_field(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
-    chosen = {"form": "additive", "degree": 5, **model["colour"]}
+    chosen = {"form": "additive", "degree": 5, "lobes": 2, "indirect": 4, **model["colour"]}
+    surface = {name: chosen.pop(name) for name in ("lobes", "indirect")}
     degree = chosen.pop("degree")
     if chosen["form"] == "harmonics":
         return LightHarmonics(degree, falloff=falloff, typical=typical)
+    if chosen["form"] == "surface":
+        visibility = chosen.get("visibility", "primitive")
+        return SurfaceColour(**surface, visibility=visibility, falloff=falloff, typical=typical)
     return LightNetwork(falloff=falloff, typical=typical, **chosen)
 
 
@@ -69,6 +76,8 @@ def _check_relight_model(model: Mapping[str, Any]) -> None:
 def _tunable_relight_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
     if model["colour"].get("form") == "harmonics":
         return {**DENSITY_TRADE, "model.colour.degree": (1, 2, 3, 5)}
+    if model["colour"].get("form") == "surface":
+        return {**DENSITY_TRADE, "model.colour.lobes": (0, 1, 2, 3), "model.colour.indirect": INDIRECT}
     return {**DENSITY_TRADE, "model.colour.hidden": (0, 4, 8, 12), "model.colour.visibility": VISIBILITY}
 
 
@@ -272,7 +281,12 @@ TASK = TaskSpec(
         ),
         ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_light_intensities),
     ),
-    fields={"CosineDensity": CosineDensity, "LightNetwork": LightNetwork, "LightHarmonics": LightHarmonics},
+    fields={
+        "CosineDensity": CosineDensity,
+        "LightNetwork": LightNetwork,
+        "LightHarmonics": LightHarmonics,
+        "SurfaceColour": SurfaceColour,
+    },
     environment=lights_from_environment,
     uses=("model.neurons",),
     mask=relight_matter_mask,

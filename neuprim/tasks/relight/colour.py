@@ -51,16 +51,16 @@ FORMS = ("additive", "multiplicative")
 VISIBILITY = ("none", "primitive", "pixel")
 """Where the light's depth images are read: nowhere, at centres of primitives, or at the point that a pixel shows."""
 
-_DARKEST = 1e-3  # smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black
+DARKEST = 1e-3  # smallest initial colour: at zero and below, max(0, .) passes no gradient and black stays black
 
 
-def _check_network_count(value: object, low: int, high: float, name: str) -> None:
-    if not isinstance(value, int) or not low <= value <= high:
+def check_count(value: object, low: int, high: float, name: str) -> None:
+    if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         expected = f"at least {low}" if high == math.inf else f"{low}..{high}"
         raise ValueError(f"{name} {value!r}; expected {expected}")
 
 
-def _validate_typical_light(typical: float) -> None:
+def check_typical_light(typical: float) -> None:
     if not 0 < typical < math.inf:
         raise ValueError(f"typical light {typical!r}; expected a number above 0")
 
@@ -89,9 +89,9 @@ class LightNetwork(ColourField):
         falloff: bool = False,
         typical: float = 1.0,
     ) -> None:
-        _check_network_count(hidden, 0, 16, "hidden units")
-        _check_network_count(channels, 1, math.inf, "colour channels")
-        _validate_typical_light(typical)
+        check_count(hidden, 0, 16, "hidden units")
+        check_count(channels, 1, math.inf, "colour channels")
+        check_typical_light(typical)
         if form not in FORMS:
             raise ValueError(f"form {form!r}; expected {' or '.join(FORMS)}")
         if visibility not in VISIBILITY:
@@ -110,7 +110,7 @@ class LightNetwork(ColourField):
         H, C = self.hidden, self.channels
         outputs = (C, H) if self.form == "additive" else (1, H)
         return [
-            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(_DARKEST).float()),
+            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(DARKEST).float()),
             ParameterSpec("net_x", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 9)),
             ParameterSpec("net_view", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3)),
             ParameterSpec("net_light", (H, 3), 1e-2, lambda c: c.uniform(H, 3, bound=1 / 3)),
@@ -131,10 +131,7 @@ class LightNetwork(ColourField):
         size = geometry.length_scale.detach()[:, None]
         view = normalize_direction(means - device.to_device_like(camera.position, means), size)
         to_light = device.to_device_like(conditions["light"], means) - means
-        strength = device.to_device_like(conditions["light_intensity"], means).expand(self.channels) / self.typical
-        factor = strength.expand(means.shape[0], -1)
-        if self.falloff:
-            factor = factor / to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_light_distance(geometry))
+        factor = light_factor(geometry, conditions, self.typical, self.falloff)
         phase = (
             (params["net_view"] * view[:, None]).sum(-1)
             + (params["net_light"] * normalize_direction(to_light, size)[:, None]).sum(-1)
@@ -233,8 +230,8 @@ class LightHarmonics(ColourField):
     """c = E max(0, SH(direction mu -> light)): a baseline without view dependence and shadows."""
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
-        _check_network_count(degree, 0, 8, "spherical-harmonics degree")
-        _validate_typical_light(typical)
+        check_count(degree, 0, 8, "spherical-harmonics degree")
+        check_typical_light(typical)
         self.degree, self.channels, self.falloff, self.typical = degree, channels, bool(falloff), float(typical)
 
     def settings(self) -> dict[str, Any]:
@@ -242,7 +239,7 @@ class LightHarmonics(ColourField):
 
     def parameters(self) -> list[ParameterSpec]:
         C, rest = self.channels, (self.degree + 1) ** 2 - 1
-        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(_DARKEST).float())]
+        specs = [ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(DARKEST).float())]
         if rest:
             specs.append(ParameterSpec("light_sh", (rest, C), 1e-2, lambda c: torch.zeros(c.count, rest, C)))
         return specs
@@ -263,15 +260,12 @@ class LightHarmonics(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         color = params["c_dc"]
-        to_light = device.to_device_like(conditions["light"], color) - geometry.means
-        squared = to_light.square().sum(-1, keepdim=True).clamp_min(min_squared_light_distance(geometry))
         if self.degree:
+            to_light = device.to_device_like(conditions["light"], color) - geometry.means
             size = geometry.length_scale.detach()[:, None]
             bands = real_light_harmonics(normalize_direction(to_light, size), self.degree)
             color = color + (bands[:, 1:, None] * params["light_sh"]).sum(1)
-        strength = device.to_device_like(conditions["light_intensity"], color) / self.typical
-        strength = strength / (squared if self.falloff else 1.0)
-        return Constant(color.clamp_min(0.0) * strength)
+        return Constant(color.clamp_min(0.0) * light_factor(geometry, conditions, self.typical, self.falloff))
 
 
 def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
@@ -315,9 +309,15 @@ def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
 
-def min_squared_light_distance(geometry: Geometry) -> Tensor:
-    """(N, 1) smallest squared distance to a light for falloff."""
-    return (_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square()
+def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
+    """(N, C) intensity of the light over ``typical``, with ``falloff`` divided by the squared distance to the
+    centres."""
+    means = geometry.means
+    strength = device.to_device_like(conditions["light_intensity"], means) / typical
+    if not falloff:
+        return strength.reshape(1, -1).expand(len(means), -1)
+    squared = (device.to_device_like(conditions["light"], means) - means).square().sum(-1, keepdim=True)
+    return strength / squared.clamp_min((_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square())
 
 
 # ---------------------------------------------------------------- visibility

@@ -27,6 +27,7 @@ from neuprim.plugins.registry import load_task
 from neuprim.tasks.dynamic import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
+from neuprim.tasks.relight.surface import SurfaceColour
 from neuprim.tasks.static import SphericalHarmonics, SphericalLobes
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 
@@ -35,6 +36,7 @@ PAIRS = [
     (TimeDensity(2, "phase+offset+window+motion"), TimeHarmonics(2)),
     (CosineDensity(1), SphericalLobes(3)),
     (CosineDensity(1), LightHarmonics(4)),
+    (CosineDensity(1), SurfaceColour(3)),
     (CosineDensity(0), LightNetwork(4, visibility="none")),
     (CosineDensity(0), LightNetwork(3, form="multiplicative", visibility="none")),
 ]

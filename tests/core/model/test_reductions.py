@@ -18,6 +18,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.tasks.dynamic import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
+from neuprim.tasks.relight.surface import SurfaceColour
 from neuprim.tasks.static import SphericalHarmonics, SphericalLobes
 from tests.core.model.shaken import CONDITIONS, COUNT, camera, made
 
@@ -25,6 +26,7 @@ PAIRS = [
     (CosineDensity(8, edge=2, gain=True), SphericalHarmonics(3)),
     (TimeDensity(6, "phase+offset+window+motion"), TimeHarmonics(2)),
     (CosineDensity(5), LightHarmonics(4)),
+    (CosineDensity(1), SurfaceColour(3)),
     (CosineDensity(1), SphericalLobes(3)),
     (GaussianDensity(), LightNetwork(4, visibility="none")),
     (CosineDensity(0), LightNetwork(6, form="multiplicative", visibility="none")),

@@ -1,0 +1,228 @@
+"""Colour of a surface under a point light: a normal, an albedo, highlights, and light that arrives indirectly.
+
+    c = E [ V (max(0, a) s(n . l) + gate(n . l) sum_j max(0, k_j) exp(g_j (n . h - 1))) + max(0, b_0 + B l) ]
+
+n, l and v are unit vectors: the normal, and from the centre to the light and to the camera; h = unit(l + v) is between
+them. s(x) = (x + sqrt(x^2 + 0.01))/2 is a smooth max(0, x), gate(x) = 1/(1 + exp(-20 x)). The lobes are spherical
+Gaussians in the half vector (Wang et al. 2009, All-frequency rendering of dynamic, spatially-varying reflectance). V is
+the visibility of the light, which indirect light does without; E is the light's strength, as for
+:class:`~neuprim.tasks.relight.colour.LightNetwork`. All is constant over a primitive.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from scipy.spatial import cKDTree
+from torch import Tensor
+
+from neuprim.core.cameras.pinhole import AnyCamera
+from neuprim.core.compute import device
+from neuprim.core.errors import FormError
+from neuprim.core.model.colour_constants import LOG_LIMIT, MOST_LOBES
+from neuprim.core.model.fields import ColourField, Conditions, Constant, LoweredDensity, Shading, read_script
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.prunable import PrunableUnit
+from neuprim.core.model.schema import InitContext, ParameterSpec, Params
+from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
+from neuprim.core.settings import RenderSettings
+from neuprim.tasks.relight.colour import DARKEST, check_count, check_typical_light, light_factor, light_visibility
+
+WRAP = 0.01
+GATE = 20.0
+SHORTEST = 1e-6
+"""Of the equation: under the root of s, slope of the gate. Vectors shorter than ``SHORTEST`` (to light and camera: of
+the primitive's size) are divided by it instead of by their length, so that gradients of directions stay finite."""
+
+INDIRECT = (0, 1, 4)
+"""Numbers per channel of the indirect light: none, b_0, or b_0 and B."""
+
+_GLOSS = 20.0  # sharpness of the first highlight at the start; each further one is six times as sharp
+_HIGHLIGHT, _INDIRECT = 0.1, 0.02
+_NEIGHBOURS = 12
+
+
+def surface_colors(
+    means: Tensor,
+    sizes: Tensor,
+    normal: Tensor,
+    albedo: Tensor,
+    highlight: Tensor,
+    log_gloss: Tensor,
+    indirect: Tensor,
+    light: Tensor,
+    eye: Tensor,
+) -> Tensor:
+    """(N, 2, C) colours of the module's equation for E = 1 and V = 1, linear light: what comes from the light directly,
+    and the indirect part. Fused on float32 tensors; differentiable in all but ``sizes``.
+
+    Args:
+        means: (N, 3) scene units. sizes: (N,) of the primitives, scene units.
+        normal: (N, 3), of any length. albedo: (N, C).
+        highlight: (N, L, C), L from 0 to 8. log_gloss: (N, L) natural logarithms of g.
+        indirect: (N, B, C), B one of :data:`INDIRECT`; b_0, then B's columns for x, y and z.
+        light, eye: (3,) positions.
+
+    Raises:
+        FormError: a tensor does not fit.
+    """
+    sizes_by_name: Sizes = {}
+    fault = primitive_tensors_fault(
+        [
+            ("means", means, (("N", 3),)),
+            ("sizes", sizes, (("N",),)),
+            ("normal", normal, (("N", 3),)),
+            ("albedo", albedo, (("N", "C"),)),
+            ("highlight", highlight, (("N", "L", "C"),)),
+            ("log_gloss", log_gloss, (("N", "L"),)),
+            ("indirect", indirect, (("N", "B", "C"),)),
+            ("light", light, ((3,),)),
+            ("eye", eye, ((3,),)),
+        ],
+        sizes_by_name,
+    )
+    if fault is None and highlight.shape[1] > MOST_LOBES:
+        fault = f"highlight has {highlight.shape[1]} lobes; expected at most {MOST_LOBES}"
+    if fault is None and indirect.shape[1] not in INDIRECT:
+        fault = f"indirect has {indirect.shape[1]} numbers a channel; expected 0, 1 or 4"
+    if fault is not None:
+        raise FormError(f"surface_colors: {fault}")
+    tensors = (means, sizes, normal, albedo, highlight, log_gloss, indirect)
+    if all(tensor.dtype == torch.float32 for tensor in tensors) and device.on_numba(*tensors):
+        from neuprim.tasks.relight import surface_cpu  # numba, loaded when first needed
+
+        return surface_cpu.fused_surface_colors(*tensors, light, eye)
+    centers, shortest = means.double(), SHORTEST * sizes.double()[:, None]
+    n = _unit(normal.double(), SHORTEST)
+    l, v = (_unit(device.to_device_like(place, centers) - centers, shortest) for place in (light, eye))
+    cosine = (n * l).sum(-1, keepdim=True)
+    near = ((n * _unit(l + v, SHORTEST)).sum(-1, keepdim=True) - 1).clamp_max(0)
+    diffuse = 0.5 * (cosine + (cosine.square() + WRAP).sqrt())
+    gloss = log_gloss.double().clamp(-LOG_LIMIT, LOG_LIMIT).exp()
+    weight = torch.sigmoid(GATE * cosine) * (gloss * near).exp()
+    direct = albedo.double().clamp_min(0) * diffuse + (weight[..., None] * highlight.double().clamp_min(0)).sum(1)
+    b = indirect.double()
+    around = b[:, :1].sum(1) + (l[:, : b[:, 1:].shape[1], None] * b[:, 1:]).sum(1)
+    return torch.stack([direct, around.clamp_min(0)], 1).to(albedo.dtype)
+
+
+def _unit(vector: Tensor, shortest: Tensor | float) -> Tensor:
+    return vector / vector.norm(dim=-1, keepdim=True).clamp_min(shortest)
+
+
+def initial_normals(context: InitContext) -> Tensor:
+    """(N, 3) float32 unit normals: the direction in which the neighbours of a starting point vary least, away from the
+    middle of all points."""
+    points = context.means.double()
+    away = points - points.mean(0)
+    count = min(_NEIGHBOURS, len(points))
+    near = torch.from_numpy(cKDTree(points.numpy()).query(points.numpy(), k=count)[1]).reshape(-1, count)
+    offsets = points[near] - points[near].mean(1, keepdim=True)
+    normals = torch.linalg.eigh(offsets.transpose(1, 2) @ offsets).eigenvectors[:, :, 0]
+    inward = (normals * away).sum(-1, keepdim=True) < 0
+    return torch.where(inward, -normals, normals).float()
+
+
+class SurfaceColour(ColourField):
+    """Colour of a surface under a point light (see the module): 6 + 4 L + 3 B numbers of three channels.
+
+    Args:
+        lobes: L, 0..8.
+        indirect: B, one of :data:`INDIRECT`.
+        visibility: "none" or "primitive": where the light's depth images are read.
+        falloff, typical: as of :class:`~neuprim.tasks.relight.colour.LightNetwork`.
+    """
+
+    def __init__(
+        self,
+        lobes: int = 2,
+        indirect: int = 4,
+        channels: int = 3,
+        visibility: str = "primitive",
+        falloff: bool = False,
+        typical: float = 1.0,
+    ) -> None:
+        check_count(lobes, 0, MOST_LOBES, "lobes")
+        check_count(channels, 1, math.inf, "colour channels")
+        check_typical_light(typical)
+        if isinstance(indirect, bool) or indirect not in INDIRECT:
+            raise ValueError(f"indirect {indirect!r}; expected 0, 1 or 4")
+        if visibility not in ("none", "primitive"):
+            raise ValueError(f"visibility {visibility!r}; expected none or primitive, as form=surface")
+        self.lobes, self.indirect, self.channels = lobes, indirect, channels
+        self.visibility, self.falloff, self.typical = visibility, bool(falloff), float(typical)
+
+    def settings(self) -> dict[str, Any]:
+        names = ("lobes", "indirect", "channels", "visibility", "falloff", "typical")
+        return {name: getattr(self, name) for name in names}
+
+    def parameters(self) -> list[ParameterSpec]:
+        L, B, C = self.lobes, self.indirect, self.channels
+        specs = [
+            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(DARKEST).float()),
+            ParameterSpec("normal", (3,), 1e-2, initial_normals),
+        ]
+        if L:
+            sharpness = torch.tensor([math.log(_GLOSS) + j * math.log(6.0) for j in range(L)])
+            specs += [
+                ParameterSpec("highlight", (L, C), 1e-2, lambda c: torch.full((c.count, L, C), _HIGHLIGHT)),
+                ParameterSpec("log_gloss", (L,), 3e-2, lambda c: sharpness.expand(c.count, L).clone()),
+            ]
+        if B:
+            start = torch.zeros(B, C)
+            start[0] = _INDIRECT
+            specs.append(ParameterSpec("indirect", (B, C), 3e-3, lambda c: start.expand(c.count, B, C).clone()))
+        return specs
+
+    def shade(
+        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+    ) -> Shading | None:
+        if self.visibility == "none":
+            return None
+        visible = light_visibility(geometry, density, conditions["light"], settings)
+        return Shading(primitives=visible(geometry.means))
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        means, albedo = geometry.means, params["c_dc"]
+        none = albedo.new_zeros(len(albedo), 0, self.channels)
+        parts = surface_colors(
+            means, geometry.length_scale.detach(), params["normal"], albedo,
+            params.get("highlight", none), params.get("log_gloss", none[..., 0]), params.get("indirect", none),
+            conditions["light"], camera.position,
+        )  # fmt: skip
+        direct, indirect = (parts * light_factor(geometry, conditions, self.typical, self.falloff)[:, None]).unbind(1)
+        return Constant(direct, indirect if self.indirect else None)
+
+    def reductions(self) -> dict[str, tuple[int, ...]]:
+        found = {"lobes": tuple(range(self.lobes - 1, -1, -1))} if self.lobes else {}
+        return found | ({"indirect": tuple(b for b in INDIRECT[::-1] if b < self.indirect)} if self.indirect else {})
+
+    def reduce(
+        self, params: Params, geometry: Geometry, name: str, value: int
+    ) -> tuple[SurfaceColour, dict[str, Tensor]]:
+        """Fewer lobes: those whose integral over the sphere times their colour is largest stay."""
+        field, found = SurfaceColour(**{**self.settings(), name: value}), dict(params)
+        if name == "indirect":
+            kept = found.pop("indirect")[:, :value].contiguous()
+            return field, found | ({"indirect": kept} if value else {})
+        highlight, log_gloss = found.pop("highlight"), found.pop("log_gloss")
+        if value:
+            g = log_gloss.double().clamp(-LOG_LIMIT, LOG_LIMIT).exp()
+            size = highlight.double().clamp_min(0).sum(-1) * -torch.expm1(-2 * g) / g
+            kept = size.argsort(dim=1, descending=True, stable=True)[:, :value].sort(dim=1).values
+            rows = kept[..., None].expand(-1, -1, self.channels)
+            found["highlight"] = highlight.gather(1, rows).contiguous()
+            found["log_gloss"] = log_gloss.gather(1, kept).contiguous()
+        return field, found
+
+    def prunable_units(self) -> tuple[PrunableUnit, ...]:
+        """Lobes, and indirect light."""
+        found = [PrunableUnit(f"lobe {j}", {"highlight": (j,), "log_gloss": (j,)}) for j in range(self.lobes)]
+        if self.indirect > 1:
+            found.append(PrunableUnit("direction of indirect light", {"indirect": (slice(1, None),)}))
+        return tuple(found)
+
+    def script(self) -> str:
+        return read_script(__package__, "surface.js")

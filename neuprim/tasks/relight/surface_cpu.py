@@ -126,7 +126,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
                 value = np.float64(indirect[i, 0, c])
                 for b in range(1, numbers):
                     value += l[b - 1] * indirect[i, b, c]
-                g = np.float64(grad[i, 1, c]) if value >= 0.0 else 0.0
+                g = np.float64(grad[i, 1, c] if value >= 0.0 else 0.0)
                 g_indirect[i, 0, c] = g
                 for b in range(1, numbers):
                     g_indirect[i, b, c] = l[b - 1] * g

@@ -90,10 +90,15 @@ def surface_colors(
     if fault is not None:
         raise FormError(f"surface_colors: {fault}")
     tensors = (means, sizes, normal, albedo, highlight, log_gloss, indirect)
-    if all(tensor.dtype == torch.float32 for tensor in tensors) and device.on_numba(*tensors):
-        from neuprim.tasks.relight import surface_cpu  # numba, loaded when first needed
+    if all(tensor.dtype == torch.float32 for tensor in tensors):
+        if device.on_numba(*tensors):
+            from neuprim.tasks.relight import surface_cpu  # numba, loaded when first needed
 
-        return surface_cpu.fused_surface_colors(*tensors, light, eye)
+            return surface_cpu.fused_surface_colors(*tensors, light, eye)
+        if highlight.shape[1] and indirect.shape[1] and device.on_warp(*tensors):
+            from neuprim.tasks.relight import surface_warp
+
+            return surface_warp.fused_surface_colors(*tensors, light, eye)
     centers, shortest = means.double(), SHORTEST * sizes.double()[:, None]
     n = _unit(normal.double(), SHORTEST)
     l, v = (_unit(device.to_device_like(place, centers) - centers, shortest) for place in (light, eye))

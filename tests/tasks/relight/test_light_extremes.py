@@ -20,6 +20,7 @@ from neuprim.core.train.losses import compressed_loss, l1, relative_loss
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork, normalize_direction
+from neuprim.tasks.relight.surface import SurfaceColour
 from tests import scenes
 from tests.core import tiny
 from tests.numerics.equivalence import row_errors, undecided, weights
@@ -27,9 +28,10 @@ from tests.numerics.equivalence import row_errors, undecided, weights
 LOSSES = {"l1": l1, "compressed": compressed_loss, "relative": relative_loss}
 COUNT = 20
 UNSHADOWED, SHADOWED = "none", "pixel"  # LightNetwork's ``visibility``
+Field = LightNetwork | LightHarmonics | SurfaceColour
 
 
-def model(field: LightNetwork | LightHarmonics, dtype: torch.dtype = torch.float32) -> Primitives:
+def model(field: Field, dtype: torch.dtype = torch.float32) -> Primitives:
     g = torch.Generator().manual_seed(5)
     t = {k: v for k, v in scenes.tensors(COUNT, 3, seed=3).items() if k != "colors"}
     t |= {s.name: 0.5 * torch.randn((COUNT, *s.shape), generator=g) for s in field.parameters()}
@@ -65,13 +67,16 @@ def picture(
 
 @pytest.mark.parametrize("name", LIGHTS)
 @pytest.mark.parametrize(
-    ("form", "falloff"), [("additive", True), ("multiplicative", False), ("H=0", True), ("harmonics", False)]
+    ("form", "falloff"),
+    [("additive", True), ("multiplicative", False), ("H=0", True), ("harmonics", False), ("surface", True)],
 )
 def test_kernels_equal_float64_under_any_light(form: str, falloff: bool, name: str) -> None:
     """Image within 1e-5 of the colours' size, every parameter's gradient within 1e-3 of its row, as in the tests of
     RayNet alone."""
     if form == "harmonics":
-        field: LightNetwork | LightHarmonics = LightHarmonics(3, 3, falloff)
+        field: Field = LightHarmonics(3, 3, falloff)
+    elif form == "surface":
+        field = SurfaceColour(visibility=UNSHADOWED, falloff=falloff)
     else:
         hidden, kind = (0, "additive") if form == "H=0" else (5, form)
         field = LightNetwork(hidden, form=kind, visibility=UNSHADOWED, falloff=falloff)
@@ -114,8 +119,10 @@ def test_lights_at_infinity_have_finite_gradients(distance: float, falloff: bool
     assert all(bool(torch.isfinite(v.grad).all()) for v in m.params.values() if v.grad is not None)
 
 
-@pytest.mark.parametrize("field", [LightNetwork(4, visibility=UNSHADOWED), LightHarmonics(3, 3)])
-def test_a_distant_light_is_a_direction(field: LightNetwork | LightHarmonics) -> None:
+@pytest.mark.parametrize(
+    "field", [LightNetwork(4, visibility=UNSHADOWED), LightHarmonics(3, 3), SurfaceColour(visibility=UNSHADOWED)]
+)
+def test_a_distant_light_is_a_direction(field: Field) -> None:
     m = model(field)
     images = []
     for distance in (1e6, 1e9, 1e18):

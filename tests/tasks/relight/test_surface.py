@@ -26,6 +26,17 @@ Inputs = dict[str, Tensor]
 NAMES = ("means", "sizes", "normal", "albedo", "highlight", "log_gloss", "indirect", "light", "eye")
 
 
+def on_blocks(**tensors: Tensor) -> Tensor:
+    """The GPU's kernels, on Warp's CPU blocks."""
+    pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
+    from neuprim.tasks.relight.surface_warp import fused_surface_colors
+
+    return fused_surface_colors(*(tensors[name] for name in NAMES))
+
+
+EVERY = pytest.mark.parametrize("kernels", [surface_colors, on_blocks])
+
+
 def equation(x: Inputs) -> Tensor:
     """As written: float64, without any of the module's functions."""
     n = x["normal"] / x["normal"].norm(dim=-1, keepdim=True)
@@ -59,13 +70,18 @@ def gradients(colours: Callable[..., Tensor], x: Inputs, pull: Tensor) -> tuple[
     return found.detach(), {name: value.grad for name, value in leaves.items() if value.grad is not None}
 
 
+@EVERY
 @pytest.mark.parametrize(("lobes", "numbers", "channels"), [(0, 0, 3), (1, 1, 1), (2, 4, 3), (8, 4, 5)])
-def test_values_and_gradients_are_those_of_the_equation(lobes: int, numbers: int, channels: int) -> None:
+def test_values_and_gradients_are_those_of_the_equation(
+    kernels: Callable[..., Tensor], lobes: int, numbers: int, channels: int
+) -> None:
     """Also of the light's and the camera's position, and for colours that are cut off at zero."""
+    if kernels is on_blocks and not lobes:
+        pytest.skip("left to torch code")
     x = drawn(60, lobes, numbers, channels, lobes)
     pull = torch.randn(60, 2, channels, generator=torch.Generator().manual_seed(9)).double()
     wanted, exact = gradients(lambda **y: equation(y), x, pull)
-    found, made = gradients(surface_colors, single(x), pull)
+    found, made = gradients(kernels, single(x), pull)
     assert torch.allclose(found.double(), wanted, rtol=1e-6, atol=1e-6)
     assert bool((found[:, 1] == 0).any()) == (numbers != 4 or bool((wanted[:, 1] == 0).any()))
     for name, value in exact.items():
@@ -110,13 +126,14 @@ def extremes(light: tuple[float, float, float], distance: float) -> Inputs:
     return {name: value.float().double() for name, value in x.items()}
 
 
+@EVERY
 @pytest.mark.parametrize("distance", DISTANCES)
 @pytest.mark.parametrize("light", LIGHTS)
-def test_extremes(light: str, distance: float) -> None:
+def test_extremes(kernels: Callable[..., Tensor], light: str, distance: float) -> None:
     """Values within 2e-6 of the largest term, gradients finite and within 1e-5 of float64's, which no limit rounds."""
     x = extremes(LIGHTS[light], distance)
     pull = torch.ones(len(x["sizes"]), 2, 3).double()
-    found, made = gradients(surface_colors, single(x), pull)
+    found, made = gradients(kernels, single(x), pull)
     twin, exact = gradients(surface_colors, x, pull)
     scale = 1 + x["albedo"].abs().amax(1)
     assert float(((found.double() - twin).abs().amax((1, 2)) / scale).max()) < 2e-6
@@ -133,14 +150,15 @@ def test_extremes(light: str, distance: float) -> None:
         assert float(((rows - other).abs().amax(1) / size).max()) < 1e-5, name
 
 
+@EVERY
 @pytest.mark.parametrize("name", NAMES)
-def test_numbers_that_are_not_finite_are_not_hidden(name: str) -> None:
+def test_numbers_that_are_not_finite_are_not_hidden(kernels: Callable[..., Tensor], name: str) -> None:
     x = single(drawn(3, 2, 4, 3, 0))
     x["albedo"] += 10
     x["highlight"] += 10
     x["indirect"][:, 0] += 100
     x[name].reshape(-1)[0] = math.nan
-    assert not bool(torch.isfinite(surface_colors(**x)[0]).all())
+    assert not bool(torch.isfinite(kernels(**x)[0]).all())
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -16,7 +16,8 @@ from neuprim.core.model.edge import edge_profile
 from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.tasks.relight import colour as light_colour
 from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.surface import GATE, SHORTEST, WRAP, SurfaceColour
+from neuprim.tasks.relight.surface import SurfaceColour
+from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 from neuprim.tasks.static import SphericalHarmonics
 from neuprim.webpage import PageView
 from neuprim.webpage.model_page import pack_webpage_model, shader_constants, stored_up_axis

@@ -29,12 +29,7 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.relight.colour import DARKEST, check_count, check_typical_light, light_factor, light_visibility
-
-WRAP = 0.01
-GATE = 20.0
-SHORTEST = 1e-6
-"""Of the equation: under the root of s, slope of the gate. Vectors shorter than ``SHORTEST`` (to light and camera: of
-the primitive's size) are divided by it instead of by their length, so that gradients of directions stay finite."""
+from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 INDIRECT = (0, 1, 4)
 """Numbers per channel of the indirect light: none, b_0, or b_0 and B."""

@@ -11,7 +11,7 @@ from torch import Tensor
 from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.compute.threads import apply_kernel_operation, parallel_for
 from neuprim.core.model.colour_constants import LOG_LIMIT
-from neuprim.tasks.relight.surface import GATE, SHORTEST, WRAP
+from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 _CHUNK = 2048  # primitives per unit of work
 

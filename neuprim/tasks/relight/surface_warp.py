@@ -9,7 +9,7 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
 from neuprim.core.model.colour_constants import LOG_LIMIT
-from neuprim.tasks.relight.surface import GATE, SHORTEST, WRAP
+from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 d, f = wp.float64, wp.float32
 _WRAP, _GATE, _SHORTEST, _LIMIT = (wp.constant(d(x)) for x in (WRAP, GATE, SHORTEST, LOG_LIMIT))

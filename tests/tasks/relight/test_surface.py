@@ -17,7 +17,8 @@ from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
-from neuprim.tasks.relight.surface import SHORTEST, SurfaceColour, surface_colors
+from neuprim.tasks.relight.surface import SurfaceColour, surface_colors
+from neuprim.tasks.relight.surface_constants import SHORTEST
 from tests import scenes
 
 pytestmark = pytest.mark.usefixtures("either_way")

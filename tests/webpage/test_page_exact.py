@@ -147,6 +147,14 @@ def test_models_joined_from_chunks(time: str, chromium: Any, tmp_path: Path) -> 
         assert tab.faults == []
 
 
+def assert_equal_under_lights(model: Primitives, bound: float, chromium: Any, tmp_path: Path) -> None:
+    page_of(model, tmp_path / "p.html", LIGHT)
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
+            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < bound
+        assert tab.faults == []
+
+
 @pytest.mark.parametrize(
     ("hidden", "visibility", "falloff"),
     [(0, "none", True), (16, "none", True), (3, "primitive", False), (5, "pixel", True)],
@@ -157,11 +165,7 @@ def test_relit_models(hidden: int, visibility: str, falloff: bool, chromium: Any
     form = "multiplicative" if falloff else "additive"
     colour = LightNetwork(hidden, form=form, visibility=visibility, falloff=falloff)
     model, bound = random_model(CosineDensity(2, edge=2), colour, seed=3), ERROR if visibility == "none" else 5 * ERROR
-    page_of(model, tmp_path / "p.html", LIGHT)
-    with open_tab(chromium, tmp_path / "p.html") as tab:
-        for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
-            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < bound
-        assert tab.faults == []
+    assert_equal_under_lights(model, bound, chromium, tmp_path)
 
 
 @pytest.mark.parametrize(
@@ -171,11 +175,7 @@ def test_relit_models(hidden: int, visibility: str, falloff: bool, chromium: Any
 def test_lit_surfaces(lobes: int, indirect: int, visibility: str, falloff: bool, chromium: Any, tmp_path: Path) -> None:
     colour = SurfaceColour(lobes, indirect, visibility=visibility, falloff=falloff)
     model, bound = random_model(CosineDensity(2, edge=2), colour, seed=7), ERROR if visibility == "none" else 5 * ERROR
-    page_of(model, tmp_path / "p.html", LIGHT)
-    with open_tab(chromium, tmp_path / "p.html") as tab:
-        for light in (LIGHT["light"], torch.tensor([-1.0, 0.5, 3.0]), torch.tensor([0.0, 0.0, -0.3])):
-            assert error(tab, model, camera_at(EYES[0]), {**LIGHT, "light": light.double()}) < bound
-        assert tab.faults == []
+    assert_equal_under_lights(model, bound, chromium, tmp_path)
 
 
 @pytest.mark.parametrize("degree", [0, 5, 8])

@@ -166,7 +166,7 @@ def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
 
 
 @strict
-def _lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
+def lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
     """Weight, nearness as clamped at 0, and sharpness. Comparisons are such that NaN stays NaN."""
     if log_sharpness > LOG_LIMIT:
         log_sharpness = LOG_LIMIT
@@ -186,7 +186,7 @@ def _lobe_colors(start, stop, means, dc, amplitude, axis, log_sharpness, origin,
         dx, dy, dz, _ = _unit_or_zero(means[i, 0] - origin[0], means[i, 1] - origin[1], means[i, 2] - origin[2])
         for j in range(lobes):
             x, y, z, _ = _unit_or_zero(np.float64(axis[i, j, 0]), np.float64(axis[i, j, 1]), np.float64(axis[i, j, 2]))
-            weights[j] = _lobe_weight(x * dx + y * dy + z * dz - 1.0, np.float64(log_sharpness[i, j]))[0]
+            weights[j] = lobe_weight(x * dx + y * dy + z * dz - 1.0, np.float64(log_sharpness[i, j]))[0]
         for c in range(channels):
             value = C0 * dc[i, c] + 0.5
             for j in range(lobes):
@@ -212,7 +212,7 @@ def _lobe_colors_backward(  # type: ignore[no-untyped-def]
                 np.float64(axis[i, j, 0]), np.float64(axis[i, j, 1]), np.float64(axis[i, j, 2])
             )
             cosine, log = x * dx + y * dy + z * dz, np.float64(log_sharpness[i, j])
-            weight, nearness, sharpness = _lobe_weight(cosine - 1.0, log)
+            weight, nearness, sharpness = lobe_weight(cosine - 1.0, log)
             pull = 0.0
             for c in range(channels):
                 g_amplitude[i, j, c] = weight * g_color[c]

@@ -183,7 +183,7 @@ def _one_over(v: wp.vec3d):
 
 
 @wp.func
-def _sharpness(log_sharpness: float):
+def lobe_sharpness(log_sharpness: float):
     value = d(log_sharpness)
     if value > _LIMIT:
         value = _LIMIT
@@ -193,7 +193,7 @@ def _sharpness(log_sharpness: float):
 
 
 @wp.func
-def _nearness(cosine: wp.float64):
+def lobe_nearness(cosine: wp.float64):
     if cosine > d(1.0):
         return d(0.0)
     return cosine - d(1.0)
@@ -212,7 +212,7 @@ def _lobe_forward(
     for j in range(axis.shape[1]):
         m = wp.vec3d(axis[i, j])
         cosine = _one_over(m) * wp.dot(m, direction)
-        weights[j] = wp.exp(_sharpness(log_sharpness[i, j]) * _nearness(cosine))
+        weights[j] = wp.exp(lobe_sharpness(log_sharpness[i, j]) * lobe_nearness(cosine))
     for c in range(color.shape[1]):
         value = _C0 * d(dc[i, c]) + d(0.5)
         for j in range(axis.shape[1]):
@@ -243,7 +243,7 @@ def _lobe_backward(
         over = _one_over(m)
         m = over * m
         cosine = wp.dot(m, direction)
-        sharpness, nearness = _sharpness(log_sharpness[i, j]), _nearness(cosine)
+        sharpness, nearness = lobe_sharpness(log_sharpness[i, j]), lobe_nearness(cosine)
         weight = wp.exp(sharpness * nearness)
         pull = d(0.0)
         for c in range(color.shape[1]):

@@ -156,14 +156,14 @@ LoweredDensity = Cosine | CustomDensity
 class Constant(PrimitiveTensors):
     """One colour per primitive and view: rgb (N, C), any channel count.
 
-    ``unshaded`` (N, C), if given, is added once :class:`Shading` has multiplied ``rgb``.
+    ``ambient`` (N, C), if given, is added once the factors per primitive of :class:`Shading` have multiplied ``rgb``.
     """
 
     per_primitive: ClassVar[bool] = True
     shapes: ClassVar[Shapes] = {"rgb": (("N", "C"),)}
 
     rgb: Tensor
-    unshaded: Tensor | None = None
+    ambient: Tensor | None = None
 
     @property
     def channels(self) -> int:
@@ -173,9 +173,9 @@ class Constant(PrimitiveTensors):
         return {"colors": self.rgb}  # as users know it
 
     def shaded(self, factors: Tensor | None) -> Constant:
-        """``rgb`` times (N,) factors, at least 0, and ``unshaded``; None: 1."""
+        """``rgb`` times (N,) factors, at least 0, and ``ambient``; None: 1."""
         rgb = self.rgb if factors is None else self.rgb * factors.to(self.rgb)[:, None]
-        return Constant(rgb if self.unshaded is None else rgb + self.unshaded)
+        return Constant(rgb if self.ambient is None else rgb + self.ambient)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
         """(M, C) float64 colours that are seen along chords."""

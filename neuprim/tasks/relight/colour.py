@@ -121,10 +121,7 @@ class LightNetwork(ColourField):
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading | None:
-        if self.visibility == "none":
-            return None
-        visible = light_visibility(geometry, density, conditions["light"], settings)
-        return Shading(pixels=visible) if self.visibility == "pixel" else Shading(primitives=visible(geometry.means))
+        return shade_by_light(self.visibility, geometry, density, conditions, settings)
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
@@ -333,6 +330,16 @@ keeps all of its light."""
 
 _FAR = 1e3  # scene radii; from there all rays are parallel, and a float32 depth image keeps no digits
 _CHUNK = 1024  # points per unit of work
+
+
+def shade_by_light(
+    where: str, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+) -> Shading | None:
+    """The visibility of the frame's light ``where`` it is asked for, one of :data:`VISIBILITY`."""
+    if where == "none":
+        return None
+    visible = light_visibility(geometry, density, conditions["light"], settings)
+    return Shading(pixels=visible) if where == "pixel" else Shading(primitives=visible(geometry.means))
 
 
 def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor, settings: RenderSettings) -> Shade:

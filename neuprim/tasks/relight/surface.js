@@ -30,7 +30,7 @@
         out.base[c] = value;
         value = indirect ? around[indirect * i * channels + c] : 0;
         for (let b = 1; b < indirect; b++) value += towards[b - 1] * around[(indirect * i + b) * channels + c];
-        out.unshaded[c] = Math.max(value, 0);
+        out.ambient[c] = Math.max(value, 0);
         out.factor[c] = light_intensity[c] * share;
       }
     }

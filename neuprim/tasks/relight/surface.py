@@ -28,7 +28,7 @@ from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
 from neuprim.core.settings import RenderSettings
-from neuprim.tasks.relight.colour import DARKEST, check_count, check_typical_light, light_factor, light_visibility
+from neuprim.tasks.relight.colour import DARKEST, check_count, check_typical_light, light_factor, shade_by_light
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 INDIRECT = (0, 1, 4)
@@ -179,10 +179,7 @@ class SurfaceColour(ColourField):
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading | None:
-        if self.visibility == "none":
-            return None
-        visible = light_visibility(geometry, density, conditions["light"], settings)
-        return Shading(primitives=visible(geometry.means))
+        return shade_by_light(self.visibility, geometry, density, conditions, settings)
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         means, albedo = geometry.means, params["c_dc"]

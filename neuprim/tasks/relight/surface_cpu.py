@@ -11,6 +11,7 @@ from torch import Tensor
 from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.compute.threads import apply_kernel_operation, parallel_for
 from neuprim.core.model.colour_constants import LOG_LIMIT
+from neuprim.core.model.colours_cpu import lobe_weight
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 _CHUNK = 2048  # primitives per unit of work
@@ -46,15 +47,6 @@ def _directions(i, means, sizes, normal, light, eye):  # type: ignore[no-untyped
 
 
 @strict
-def _sharpness(log_gloss):  # type: ignore[no-untyped-def]
-    if log_gloss > LOG_LIMIT:
-        log_gloss = LOG_LIMIT
-    if log_gloss < -LOG_LIMIT:
-        log_gloss = -LOG_LIMIT
-    return np.exp(log_gloss)
-
-
-@strict
 def _positive(value):  # type: ignore[no-untyped-def]
     """max(0, value), where NaN stays NaN."""
     return 0.0 if value < 0.0 else np.float64(value)
@@ -70,12 +62,10 @@ def _surface_colors(  # type: ignore[no-untyped-def]
         n, l, _, h = _directions(i, means, sizes, normal, light, eye)
         cosine = n[0] * l[0] + n[1] * l[1] + n[2] * l[2]
         near = n[0] * h[0] + n[1] * h[1] + n[2] * h[2] - 1.0
-        if near > 0.0:
-            near = 0.0
         diffuse = 0.5 * (cosine + np.sqrt(cosine * cosine + WRAP))
         gate = 1.0 / (1.0 + np.exp(-GATE * cosine))
         for j in range(lobes):
-            weights[j] = gate * np.exp(_sharpness(np.float64(log_gloss[i, j])) * near)
+            weights[j] = gate * lobe_weight(near, np.float64(log_gloss[i, j]))[0]
         for c in range(albedo.shape[1]):
             value = _positive(albedo[i, c]) * diffuse
             for j in range(lobes):
@@ -99,7 +89,6 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
         n, l, v, h = _directions(i, means, sizes, normal, light, eye)
         cosine = n[0] * l[0] + n[1] * l[1] + n[2] * l[2]
         between = n[0] * h[0] + n[1] * h[1] + n[2] * h[2]
-        near = min(between - 1.0, 0.0)
         root, gate = np.sqrt(cosine * cosine + WRAP), 1.0 / (1.0 + np.exp(-GATE * cosine))
         pull = 0.0
         for c in range(channels):
@@ -109,8 +98,8 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
         g_cosine, g_between = 0.5 * (1.0 + cosine / root) * pull, 0.0
         for j in range(lobes):
             log = np.float64(log_gloss[i, j])
-            sharpness = _sharpness(log)
-            weight, pull = np.exp(sharpness * near), 0.0
+            weight, near, sharpness = lobe_weight(between - 1.0, log)
+            pull = 0.0
             for c in range(channels):
                 g = np.float64(grad[i, 0, c])
                 g_highlight[i, j, c] = gate * weight * g if highlight[i, j, c] >= 0.0 else 0.0

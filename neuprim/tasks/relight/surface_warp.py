@@ -9,6 +9,7 @@ from torch import Tensor
 from neuprim.core.compute import device
 from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
 from neuprim.core.model.colour_constants import LOG_LIMIT
+from neuprim.core.model.colours_warp import lobe_nearness, lobe_sharpness
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 d, f = wp.float64, wp.float32
@@ -40,23 +41,6 @@ def _positive(value: float):
     return d(value)
 
 
-@wp.func
-def _sharpness(log_gloss: float):
-    value = d(log_gloss)
-    if value > _LIMIT:
-        value = _LIMIT
-    if value < -_LIMIT:
-        value = -_LIMIT
-    return wp.exp(value)
-
-
-@wp.func
-def _nearness(between: wp.float64):
-    if between > d(1.0):
-        return d(0.0)
-    return between - d(1.0)
-
-
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def _forward(
     means: wp.array(dtype=wp.vec3), sizes: wp.array(dtype=float), normal: wp.array(dtype=wp.vec3),
@@ -69,13 +53,13 @@ def _forward(
     n, l, v = _over(n, _SHORTEST) * n, _over(l, shortest) * l, _over(v, shortest) * v
     h = l + v
     h = _over(h, _SHORTEST) * h
-    cosine, near = wp.dot(n, l), _nearness(wp.dot(n, h))
+    cosine, near = wp.dot(n, l), lobe_nearness(wp.dot(n, h))
     diffuse = d(0.5) * (cosine + wp.sqrt(cosine * cosine + _WRAP))
     gate = d(1.0) / (d(1.0) + wp.exp(-_GATE * cosine))
     for c in range(albedo.shape[1]):
         value = _positive(albedo[i, c]) * diffuse
         for j in range(log_gloss.shape[1]):
-            value += _positive(highlight[i, j, c]) * gate * wp.exp(_sharpness(log_gloss[i, j]) * near)
+            value += _positive(highlight[i, j, c]) * gate * wp.exp(lobe_sharpness(log_gloss[i, j]) * near)
         color[i, 0, c] = f(value)
         value = d(indirect[i, 0, c])
         for b in range(1, indirect.shape[1]):
@@ -102,7 +86,7 @@ def _backward(
     over_h = _over(middle, _SHORTEST)
     h = over_h * middle
     cosine, between = wp.dot(n, l), wp.dot(n, h)
-    near, root = _nearness(between), wp.sqrt(cosine * cosine + _WRAP)
+    near, root = lobe_nearness(between), wp.sqrt(cosine * cosine + _WRAP)
     gate = d(1.0) / (d(1.0) + wp.exp(-_GATE * cosine))
     pull = d(0.0)
     for c in range(albedo.shape[1]):
@@ -113,7 +97,7 @@ def _backward(
             g_albedo[i, c] = f(d(0.5) * (cosine + root) * g)
     g_cosine, g_between = d(0.5) * (d(1.0) + cosine / root) * pull, d(0.0)
     for j in range(log_gloss.shape[1]):
-        sharpness = _sharpness(log_gloss[i, j])
+        sharpness = lobe_sharpness(log_gloss[i, j])
         weight = wp.exp(sharpness * near)
         pull = d(0.0)
         for c in range(albedo.shape[1]):

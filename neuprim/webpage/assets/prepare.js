@@ -63,7 +63,7 @@ function preparer(page, tensors, density, colour) {
   }
   const centre = new Float64Array(3 * count), depth = new Float64Array(count), seen = new Int32Array(count), sort = sorter(count), rank = new Int32Array(count);
   const place = new Float64Array(3), eye = new Float64Array(3), R = new Float64Array(9), channels = Math.max(...pick) + 1;
-  const look = { base: new Float64Array(channels), unshaded: new Float64Array(channels), factor: new Float64Array(channels), phases: new Float64Array(H) };
+  const look = { base: new Float64Array(channels), ambient: new Float64Array(channels), factor: new Float64Array(channels), phases: new Float64Array(H) };
   const scene = new Float64Array(3 * count); // where the centres are under these conditions
   const A = new Float64Array(9); // of one primitive: camera axes -> whitened axes
   const e0 = new Float64Array(3), ex = new Float64Array(3), ey = new Float64Array(3), xa = new Float64Array(3), span = new Float64Array(5);
@@ -204,7 +204,7 @@ function preparer(page, tensors, density, colour) {
         rows[o + 16 + a] = tc * ex[a] + tu * e0[a];
         rows[o + 20 + a] = tc * ey[a] + tv * e0[a];
         const factor = look.factor[pick[a]], base = look.base[pick[a]];
-        rows[o + 24 + a] = H ? factor * light : factor * (light * Math.max(base, 0) + look.unshaded[pick[a]]); // no shadow reaches these
+        rows[o + 24 + a] = H ? factor * light : factor * (light * Math.max(base, 0) + look.ambient[pick[a]]); // no shadow reaches these
         rows[o + 40 + a] = base;
       }
       rows[o + 3] = ax;

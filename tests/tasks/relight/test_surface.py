@@ -27,15 +27,16 @@ Inputs = dict[str, Tensor]
 NAMES = ("means", "sizes", "normal", "albedo", "highlight", "log_gloss", "indirect", "light", "eye")
 
 
-def on_blocks(**tensors: Tensor) -> Tensor:
-    """The GPU's kernels, on Warp's CPU blocks."""
+def on_warp(**tensors: Tensor) -> Tensor:
+    """The GPU's kernels: on a card where there is one, else on Warp's CPU blocks."""
     pytest.importorskip("warp", reason="the cuda backend's kernels need Warp")
     from neuprim.tasks.relight.surface_warp import fused_surface_colors
 
-    return fused_surface_colors(*(tensors[name] for name in NAMES))
+    place = "cuda" if torch.cuda.is_available() else "cpu"
+    return fused_surface_colors(*(tensors[name].to(place) for name in NAMES)).cpu()
 
 
-EVERY = pytest.mark.parametrize("kernels", [surface_colors, on_blocks])
+EVERY = pytest.mark.parametrize("kernels", [surface_colors, on_warp])
 
 
 def equation(x: Inputs) -> Tensor:
@@ -77,7 +78,7 @@ def test_values_and_gradients_are_those_of_the_equation(
     kernels: Callable[..., Tensor], lobes: int, numbers: int, channels: int
 ) -> None:
     """Also of the light's and the camera's position, and for colours that are cut off at zero."""
-    if kernels is on_blocks and not lobes:
+    if kernels is on_warp and not lobes:
         pytest.skip("left to torch code")
     x = drawn(60, lobes, numbers, channels, lobes)
     pull = torch.randn(60, 2, channels, generator=torch.Generator().manual_seed(9)).double()

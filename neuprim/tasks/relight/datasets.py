@@ -43,7 +43,7 @@ from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
 from neuprim.core.validation import Accepts, Range, validate_settings
 from neuprim.scenes.lit import NEAR_LIGHTS, PARTS, LitSettings, generate_lit_solids
-from neuprim.tasks.relight.lighting import Lighting, olat_percentile_exposure
+from neuprim.tasks.relight.lighting import Lighting, measure_falloff, olat_percentile_exposure
 
 _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
 
@@ -58,8 +58,8 @@ class OlatSettings(FolderSettings):
     test_split: SplitName = "test"
     # n: evaluate on every n-th training view instead of the test split, for tuning; 0 for that split
     hold_out: HoldOut = 0
-    # "inverse_square" where the light weakens with the square of its distance
-    falloff: Literal["none", "inverse_square"] = "none"
+    # "inverse_square" where the light weakens with the square of its distance; "auto": as training images show
+    falloff: Literal["auto", "none", "inverse_square"] = "auto"
     # images are divided by this; "auto": by the 99.5th percentile of the training images
     exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
     ignore_corrections: bool = False  # poses are transform_matrix, even where a frame has the optimised R_opt and T_opt
@@ -82,10 +82,11 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         exposure=(lambda views: olat_percentile_exposure(views, str(folder)))
         if options.exposure == "auto"
         else options.exposure,
-        extra=Lighting(options.falloff),
         positions=("light",),
     )
-    return assemble_dataset(str(folder), folder.resolve().name, train, test, options, context, details)
+    dataset = assemble_dataset(str(folder), folder.resolve().name, train, test, options, context, details)
+    falloff = measure_falloff(dataset) if options.falloff == "auto" else options.falloff
+    return replace(dataset, extra=Lighting(falloff))
 
 
 def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:

@@ -17,8 +17,9 @@ from neuprim.core.cameras.world import World
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.environment import Environment, Illumination
-from neuprim.core.errors import ConfigError, DataError
+from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.json_reader import JsonReader
+from neuprim.tasks.relight.colour import real_light_harmonics
 
 if TYPE_CHECKING:
     from neuprim.core.data.image_views import ImageViews
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 Falloff = Literal["none", "inverse_square"]
 
 EXPOSURE_PERCENTILE = 99.5  # an automatic exposure lets this percentile of the training images' values be 1
+FALLOFF_VIEWS = 200  # training views, evenly spread, whose brightness says how light weakens with distance
+FALLOFF_SPREAD = 0.4  # standard error of the exponent beyond which they do not say it
 MAX_LIGHT_ANGLE = 15.0  # degrees from every training light beyond which a direction counts as unseen
 _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, frames
 _MAX_DIRECTIONS = 256  # of training lights in a model's header
@@ -71,6 +74,43 @@ def olat_percentile_exposure(views: ImageViews, where: str) -> float:
             "expected light, or a number for scene.exposure"
         )
     return value
+
+
+def measure_falloff(dataset: Dataset) -> Falloff:
+    """Whether training images darken with the square of the light's distance, warning where they do not say it.
+
+    The logarithm of a view's mean value over its intensity is fitted by a line in the logarithm of the light's
+    distance, harmonics of degree 2 of the directions to light and camera, and the cosine between the two and its
+    square. A slope below -1 is "inverse_square"; so is an unknown one, as that is how point lights are.
+    """
+    center, views = dataset.center.double(), dataset.train
+    rows, values = [], []
+    for i in sorted({round(x) for x in torch.linspace(0, len(views) - 1, min(len(views), FALLOFF_VIEWS)).tolist()}):
+        view = views.view(i)
+        light, eye = view.conditions["light"].double() - center, view.camera.position.double() - center
+        brightness = views.pixels(i).rgb.double().mean() / view.conditions["light_intensity"].double().mean()
+        if 0 < float(brightness) < math.inf and min(float(light.norm()), float(eye.norm())) > 0:
+            units = torch.stack([light / light.norm(), eye / eye.norm()])
+            phase = units.prod(0).sum()[None]
+            bands = real_light_harmonics(units, 2)[:, 1:].flatten()
+            rows.append(torch.cat([light.norm().log()[None], phase.new_ones(1), phase, phase.square(), bands]))
+            values.append(brightness.log())
+    slope, error = -2.0, math.inf
+    if rows and len(rows) > 2 * len(rows[0]):
+        system, wanted = torch.stack(rows), torch.stack(values)
+        distances = system[:, 0] - system[:, 1:] @ torch.linalg.pinv(system[:, 1:]) @ system[:, 0]
+        spread = float(distances.square().sum())
+        if spread > 1e-6 * len(rows):
+            slope = float(distances @ wanted) / spread
+            left = wanted - system @ torch.linalg.pinv(system) @ wanted
+            error = math.sqrt(float(left.square().sum()) / (len(rows) - len(rows[0])) / spread)
+    if error > FALLOFF_SPREAD:
+        warn_once(
+            f"{dataset.name}: training images do not say whether light weakens with its distance; taken for "
+            "inverse_square, as of point lights; scene.falloff=none where it does not"
+        )
+        return "inverse_square"
+    return "none" if slope > -1 else "inverse_square"
 
 
 def typical_light(dataset: Dataset, falloff: bool) -> float:

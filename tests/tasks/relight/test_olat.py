@@ -5,7 +5,9 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Callable, Mapping
+from contextlib import nullcontext
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from neuprim.core.io.images import srgb_to_linear, write_png
 from neuprim.core.task import SceneContext
 from neuprim.tasks import relight
 from neuprim.tasks.relight.datasets import load_olat as load
-from neuprim.tasks.relight.lighting import dataset_lighting
+from neuprim.tasks.relight.lighting import dataset_lighting, measure_falloff
 
 SIZE = 12
 FX, FY, CX, CY = 20.0, 21.0, 5.0, 6.5
@@ -88,11 +90,8 @@ def each(change: Edit) -> Edit:
 def test_the_plainest_variant(folder: Path, context: SceneContext) -> None:
     dataset = read(folder, context)
     assert (len(dataset.train), len(dataset.test), dataset.color_space, dataset.name) == (3, 2, "linear", "scene")
-    assert (dataset_lighting(dataset).falloff, dataset.exposure, dataset.background.tolist()) == (
-        "none",
-        1.0,
-        [0.0] * 3,
-    )
+    found = (dataset_lighting(dataset).falloff, dataset.exposure, dataset.background.tolist())
+    assert found == ("inverse_square", 1.0, [0.0] * 3)
     view = dataset.train.view(1)
     assert view.name == "r_1" and view.conditions["light"].tolist() == [2.0, 2.0, 4.0]
     assert view.conditions["light_intensity"].tolist() == [1.0, 1.0, 1.0]
@@ -219,6 +218,42 @@ def test_exposure(folder: Path, context: SceneContext) -> None:
     )
     torch.testing.assert_close(dataset.test.pixels(0).rgb * dataset.exposure, plain.test.pixels(0).rgb)
     torch.testing.assert_close(dataset.test.pixels(0).alpha, plain.test.pixels(0).alpha)
+
+
+@pytest.mark.parametrize(
+    ("count", "exponent", "range_of_distances", "falloff", "told"),
+    [
+        (200, -2.0, 0.2, "inverse_square", True),
+        (200, 0.0, 0.2, "none", True),
+        (200, 0.0, 1e-3, "inverse_square", False),
+        (200, 0.0, 0.0, "inverse_square", False),
+        (20, 0.0, 0.2, "inverse_square", False),
+    ],
+)
+def test_images_say_how_light_weakens(
+    count: int, exponent: float, range_of_distances: float, falloff: str, told: bool
+) -> None:
+    """Though they also darken with the angle between light and camera, and with chance; where they do not say it, a
+    line does."""
+    g = torch.Generator().manual_seed(0)
+    lights, eyes = torch.nn.functional.normalize(torch.randn(2, count, 3, generator=g), dim=-1)
+    distances = 4 * (1 + range_of_distances * (torch.rand(count, generator=g) - 0.5))
+    values = (1.5 + (lights * eyes).sum(-1)) * distances**exponent * (0.2 * torch.randn(count, generator=g)).exp()
+
+    class Views:
+        def __len__(self) -> int:
+            return count
+
+        def view(self, i: int) -> Any:
+            conditions = {"light": 1 + lights[i] * distances[i], "light_intensity": torch.full((3,), 2.0)}
+            return SimpleNamespace(conditions=conditions, camera=SimpleNamespace(position=1 + 3 * eyes[i].double()))
+
+        def pixels(self, i: int) -> Any:
+            return SimpleNamespace(rgb=values[i].expand(2, 2, 3))
+
+    dataset: Any = SimpleNamespace(center=torch.ones(3), train=Views(), name=f"{count} {range_of_distances}")
+    with nullcontext() if told else pytest.warns(match="do not say whether light weakens"):
+        assert measure_falloff(dataset) == falloff
 
 
 def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:

@@ -111,9 +111,10 @@ def test_the_controls_of_conditions(tmp_path: Path) -> None:
 
 def test_the_script_s_shadows_are_those_of_the_model() -> None:
     """Constants that stand in both languages."""
-    assert light_colour.BIAS == light_colour.SOFTNESS == 1 / 20
+    assert (light_colour.FADE, light_colour.EXTENTS, light_colour.PIXEL_FADE) == (1 / 50, 1.5, 1 / 10)
     for text in (LightNetwork(2).script(), SurfaceColour().script()):
         for name, value in (("size", light_colour.SIZE), ("layers", light_colour.LAYERS)):
             assert f"{name}: {value}" in text
-        assert "bias: 1 / 20, softness: 1 / 20" in text
+    assert 'fade: visibility === "pixel" ? 1 / 10 : 1 / 50, extents: 1.5 ' in LightNetwork(2).script()
+    assert "fade: 1 / 50, extents: 1.5 " in SurfaceColour().script()
     assert f"wrap = {WRAP}, gate = {GATE:g}, shortest = 1e-6" in text and SHORTEST == 1e-6

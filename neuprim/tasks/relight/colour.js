@@ -7,7 +7,7 @@
     input: (i, h, a) => boost * net_x[(i * hidden + h) * 3 + a],
     output: (i, h, c) => (multiplicative ? base(i, c) * net_out[i * hidden + h] : net_out[(i * channels + c) * hidden + h]),
   };
-  const shadow = visibility === "none" ? null : { where: visibility, light: ({ light }) => light, size: 192, layers: 4, bias: 1 / 20, softness: 1 / 20 };
+  const shadow = visibility === "none" ? null : { where: visibility, light: ({ light }) => light, size: 192, layers: 4, fade: visibility === "pixel" ? 1 / 10 : 1 / 50, extents: 1.5 };
   const view = new Float64Array(3), towards = new Float64Array(3);
   // What the light alone decides, kept while nothing but the camera moves: of each primitive its part of the phases, and what it gets of the light.
   const lit = new Float64Array(count * hidden), share = new Float64Array(count), done = new Int32Array(count);

@@ -15,7 +15,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Any
+from functools import partial
+from typing import Any, Protocol
 
 import numpy as np
 import torch
@@ -35,7 +36,6 @@ from neuprim.core.model.fields import (
     Constant,
     LoweredDensity,
     RayNet,
-    Shade,
     Shading,
     read_script,
 )
@@ -322,11 +322,11 @@ def light_factor(geometry: Geometry, conditions: Conditions, typical: float, fal
 SIZE = 192  # pixels of the depth images, square
 LAYERS = 4  # of equal depth; more of them separate depths better and take longer
 
-BIAS, SOFTNESS = 1 / 20, 1 / 20
-"""In scene diameters, as the light sees the scene: how far behind a depth image light has fallen to a half, and within
-what distance before and after that it fades. Surfaces made of ellipsoids are bumpy: a smaller bias lets the bumps
-shadow each other, a larger one detaches shadows from their casters. With both equal a point on a depth image itself
-keeps all of its light."""
+FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
+"""How far behind a depth image light fades: at a primitive over FADE scene diameters, as the light sees the scene, and
+EXTENTS times its own extent towards the light; at a pixel over PIXEL_FADE diameters. Surfaces made of ellipsoids are bumpy: where light fades faster, the bumps
+shadow each other, and where it fades slower, shadows come off their casters. A point on a depth image itself keeps all
+of its light."""
 
 _FAR = 1e3  # scene radii; from there all rays are parallel, and a float32 depth image keeps no digits
 _CHUNK = 1024  # points per unit of work
@@ -338,17 +338,38 @@ def shade_by_light(
     """The visibility of the frame's light ``where`` it is asked for, one of :data:`VISIBILITY`."""
     if where == "none":
         return None
-    visible = light_visibility(geometry, density, conditions["light"], settings)
-    return Shading(pixels=visible) if where == "pixel" else Shading(primitives=visible(geometry.means))
+    light = conditions["light"]
+    visible = light_visibility(geometry, density, light, settings)
+    if where == "pixel":
+        return Shading(pixels=partial(visible, fade=PIXEL_FADE))
+    return Shading(primitives=visible(geometry.means, FADE, EXTENTS * extents_towards(geometry, light)))
 
 
-def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor, settings: RenderSettings) -> Shade:
-    """The function (M, 3) scene points -> (M,) visibility 0..1, float32, of a point light (3,), by layered shadow maps.
+@torch.no_grad()
+def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
+    """(N,) how long each ellipsoid is in the direction from its centre to ``point`` (3,): between the two planes across
+    it that touch the ellipsoid, in scene units."""
+    towards = device.to_device_like(point, geometry.means) - geometry.means
+    units = normalize_direction(towards, geometry.length_scale[:, None])
+    return 2 * ((geometry.rotations * units[:, :, None]).sum(1) * geometry.scales).norm(dim=-1)
+
+
+class Visibility(Protocol):
+    """Scene points (M, 3) -> (M,) float32 visibility 0..1. Light fades over ``fade`` scene diameters and (M,) ``more``
+    scene units behind a depth image."""
+
+    def __call__(self, points: Tensor, fade: float, more: Tensor | None = None) -> Tensor: ...
+
+
+def light_visibility(
+    geometry: Geometry, density: LoweredDensity, light: Tensor, settings: RenderSettings
+) -> Visibility:
+    """The visibility of a point light (3,), by layered shadow maps.
 
     The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity
     A_k and mean depth d_k. The light's transmittance at a point x of depth z is
 
-        V(x) = prod_k (1 - A_k s((z - d_k - bias)/softness)),      s a smooth step from 0 at -1 to 1 at 1,
+        V(x) = prod_k (1 - A_k s((z - d_k)/fade)),      s a smooth step from 0 at 0 to 1 at 1,
 
     exactly 1 where nothing lies in front, and 1 - A behind something of opacity A. One slab, a common shadow map, would
     know one mean depth per pixel: half way between a translucent thing and the floor below it. Depths are read as
@@ -369,7 +390,7 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
         radius = far_away + size
         distance = float((light - center).norm())
         if distance < 1e-9 * max(radius, 1e-30):
-            return lambda points: torch.ones(len(points), device=points.device)
+            return lambda points, fade, more=None: torch.ones(len(points), device=points.device)
         if distance > _FAR * radius:
             light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
         focal = 0.5 * SIZE / math.tan(math.asin(min(radius / distance, 0.94)))
@@ -383,31 +404,27 @@ def light_visibility(geometry: Geometry, density: LoweredDensity, light: Tensor,
         slabs = torch.bucketize(depths, device.to_device_like(edges[1:-1], means))
         own = replace(settings, depth=True, near=near, samples=1)
         opacities, distances = render_slabs(geometry, density, slabs, LAYERS, camera, own)
-    view, limits = camera.viewmat[:3].contiguous(), (BIAS * 2.0 * radius, SOFTNESS * 2.0 * radius)
+    view = camera.viewmat[:3].contiguous()
 
-    def visibility(points: Tensor) -> Tensor:
+    def visibility(points: Tensor, fade: float, more: Tensor | None = None) -> Tensor:
         points = points.detach().double().contiguous()
+        fades = torch.full_like(points[:, 0], fade * 2.0 * radius)
+        if more is not None:
+            fades += more
         if not device.on_numba(points, opacities):
-            return sample_visibility(
-                points, device.to_device_like(view, points), near, focal, opacities, distances, *limits
-            )
+            place = device.to_device_like(view, points)
+            return sample_visibility(points, place, near, focal, opacities, distances, fades)
         found = np.empty(len(points), np.float32)
         places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy())
-        parallel_for(_visibility_kernel, len(found), _CHUNK, settings.threads, *places, *images, *limits, found)
+        kernel = _visibility_kernel
+        parallel_for(kernel, len(found), _CHUNK, settings.threads, *places, *images, fades.numpy(), found)
         return torch.from_numpy(found)
 
     return visibility
 
 
 def sample_visibility(
-    points: Tensor,
-    view: Tensor,
-    near: float,
-    focal: float,
-    alphas: Tensor,
-    depths: Tensor,
-    bias: float,
-    softness: float,
+    points: Tensor, view: Tensor, near: float, focal: float, alphas: Tensor, depths: Tensor, fades: Tensor
 ) -> Tensor:
     """(M,) float32 visibility of ``points`` (M, 3) float64 in torch code, for a GPU: the twin of the kernel below."""
     nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
@@ -420,12 +437,12 @@ def sample_visibility(
     read = F.grid_sample(images.flatten(0, 1)[None], where[None, None], align_corners=False)[0, :, 0]
     alpha, inverse_depth = read.unflatten(0, (-1, 2)).unbind(1)
     behind = z - alpha / inverse_depth.clamp_min(1e-30)
-    s = (0.5 + 0.5 * (behind - bias) / softness).clamp(0.0, 1.0)
+    s = (behind / fades).clamp(0.0, 1.0)
     return torch.where(ahead, (1.0 - alpha * s * s * (3.0 - 2.0 * s)).prod(0), 1.0).float()
 
 
 @exact_kernel
-def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, bias, softness, found):  # type: ignore[no-untyped-def]
+def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, fades, found):  # type: ignore[no-untyped-def]
     """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
     size = alphas.shape[1]
     for p in range(start, stop):
@@ -452,6 +469,6 @@ def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, b
                         alpha += weight
                         nearness += weight / max(np.float64(depths[k, i + di, j + dj]), near)
             behind = z - alpha / max(nearness, 1e-30)
-            s = min(max(0.5 + 0.5 * (behind - bias) / softness, 0.0), 1.0)
+            s = min(max(behind / fades[p], 0.0), 1.0)
             arrives *= 1.0 - alpha * s * s * (3.0 - 2.0 * s)
         found[p] = arrives

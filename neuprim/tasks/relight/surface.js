@@ -1,6 +1,6 @@
 // In a browser: SurfaceColour. The page draws the depth images out of the light.
 ({ lobes, indirect, channels, visibility, falloff, typical }, { c_dc, normal, highlight, log_gloss, indirect: around }, count, lib) => {
-  const shadow = visibility === "none" ? null : { where: visibility, light: ({ light }) => light, size: 192, layers: 4, bias: 1 / 20, softness: 1 / 20 };
+  const shadow = visibility === "none" ? null : { where: visibility, light: ({ light }) => light, size: 192, layers: 4, fade: 1 / 50, extents: 1.5 };
   const wrap = 0.01, gate = 20, shortest = 1e-6;
   const towards = new Float64Array(3), view = new Float64Array(3), half = new Float64Array(3), weights = new Float64Array(lobes);
   const normals = Float64Array.from(normal), gloss = Float64Array.from(log_gloss || [], x => Math.exp(Math.min(Math.max(x, -20), 20)));

@@ -182,10 +182,10 @@ function painter(canvas, page, made) {
     if (shaded) {
       const { R, t, fx, fy, cx, cy } = camera, columns = [];
       for (const [a, b, c] of [[1 / fx, 0, 0], [0, 1 / fy, 0], [-cx / fx, -cy / fy, 1]]) columns.push(R[0] * a + R[3] * b + R[6] * c, R[1] * a + R[4] * b + R[7] * c, R[2] * a + R[5] * b + R[8] * c, 0);
-      const eye = [0, 1, 2].map(a => -(R[a] * t[0] + R[3 + a] * t[1] + R[6 + a] * t[2])), L = light.R, s = light.diameter * made.shadow.softness;
+      const eye = [0, 1, 2].map(a => -(R[a] * t[0] + R[3 + a] * t[1] + R[6 + a] * t[2])), L = light.R;
       gl.uniformMatrix4fv(shader.at("toScene"), false, [...columns, ...eye, 1]);
       gl.uniformMatrix4fv(shader.at("toLight"), false, [L[0], L[3], L[6], 0, L[1], L[4], L[7], 0, L[2], L[5], L[8], 0, ...light.t, 1]);
-      gl.uniform4f(shader.at("light"), light.fx, light.near, light.diameter * made.shadow.bias, s);
+      gl.uniform3f(shader.at("light"), light.fx, light.near, light.diameter * made.shadow.fade);
     }
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }

@@ -121,6 +121,13 @@ function preparer(page, tensors, density, colour) {
   }
   const wholeInFront = (i, reach) => centre[3 * i + 2] - reach > 1e-3 * reach;
 
+  // How long primitive i is in the direction to a point, in scene units.
+  function extentTowards(i, point) {
+    for (let a = 0; a < 3; a++) place[a] = point[a] - scene[3 * i + a];
+    lib.unit(place);
+    return 2 * unit[i] * Math.hypot(...[0, 1, 2].map(a => whitened(i, a, ...place)));
+  }
+
   // Which primitives live under these conditions, ascending, and in `scene` where they are.
   function settle(conditions) {
     const folded = density.at(conditions), living = new Int32Array(count);
@@ -242,5 +249,5 @@ function preparer(page, tensors, density, colour) {
     return ends;
   }
 
-  return { settle, frame, within, neurons, units, moving, turns: !!density.turns, K, H, edge: density.edge, phaseTexels, scene, scales: unit };
+  return { settle, frame, within, extentTowards, neurons, units, moving, turns: !!density.turns, K, H, edge: density.edge, phaseTexels, scene, scales: unit };
 }

@@ -9,7 +9,7 @@ uniform float top;
 uniform bool shaded;
 uniform mat4 toScene; // (pixel x z, pixel y z, z, 1) -> scene
 uniform mat4 toLight; // scene -> the light's camera
-uniform vec4 light; // focal, near, bias, softness
+uniform vec3 light; // focal, near, and how far behind a depth image light fades
 out vec4 result;
 
 vec3 ramp(float t) { // dark blue, green, yellow
@@ -43,7 +43,7 @@ float arriving(vec3 point) { // as arrivingAt of shadow.js
       alpha += share.x * share.y * opacity;
       nearness += share.x * share.y * opacity / max(seen.r / opacity, light.y);
     }
-    float behind = x.z - alpha / max(nearness, 1e-12), s = clamp(0.5 + 0.5 * (behind - light.z) / light.w, 0.0, 1.0);
+    float behind = x.z - alpha / max(nearness, 1e-12), s = clamp(behind / light.z, 0.0, 1.0);
     found *= 1.0 - alpha * s * s * (3.0 - 2.0 * s);
   }
   return found;

@@ -39,9 +39,9 @@ function lightCamera(scene, scales, living, light, { size, layers }) {
   return { R, t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, diameter: 2 * radius };
 }
 
-// Visibility of the point (x, y, z); maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
-function arrivingAt(px, py, pz, camera, maps, bias, softness) {
-  const { R, t, fx, width: size, near, diameter } = camera;
+// Visibility of the point (x, y, z), behind which light fades over `fade` scene units; maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
+function arrivingAt(px, py, pz, camera, maps, fade) {
+  const { R, t, fx, width: size, near } = camera;
   const x = R[0] * px + R[1] * py + R[2] * pz + t[0], y = R[3] * px + R[4] * py + R[5] * pz + t[1], z = R[6] * px + R[7] * py + R[8] * pz + t[2];
   if (!(z > near)) return 1;
   const u = (fx * x) / z + 0.5 * size - 0.5, v = (fx * y) / z + 0.5 * size - 0.5; // in pixels, 0 the middle of the first
@@ -60,7 +60,7 @@ function arrivingAt(px, py, pz, camera, maps, bias, softness) {
       nearness += weight / Math.max(map[o] / opacity, near);
     }
     const behind = z - alpha / Math.max(nearness, 1e-30);
-    const s = Math.min(Math.max(0.5 + (0.5 * (behind - bias * diameter)) / (softness * diameter), 0), 1);
+    const s = Math.min(Math.max(behind / fade, 0), 1);
     found *= 1 - alpha * s * s * (3 - 2 * s);
   }
   return found;

@@ -8,8 +8,8 @@ function preparing(post) {
     colour = fieldScripts.colour(page.fields.colour, tensors, page.count, lib);
     engine = preparer(page, tensors, density, colour);
     const { neurons, units, moving, turns, K, H, edge, phaseTexels } = engine;
-    const { where, bias, softness } = colour.shadow || {}; // functions do not travel
-    post({ kind: "ready", neurons, units, moving, turns, K, H, edge, phaseTexels, shadow: { where, bias, softness } });
+    const { where, fade } = colour.shadow || {}; // functions do not travel
+    post({ kind: "ready", neurons, units, moving, turns, K, H, edge, phaseTexels, shadow: { where, fade } });
   }
 
   function frame(request) {
@@ -30,10 +30,11 @@ function preparing(post) {
       }
     }
     if (camera && maps && shadow.where === "primitive" && !visible) {
+      const source = shadow.light(conditions), fade = i => shadow.fade * camera.diameter + shadow.extents * engine.extentTowards(i, source);
       visible = new Float64Array(engine.scales.length);
       for (const i of settled.living) {
         const [x, y, z] = engine.scene.subarray(3 * i, 3 * i + 3);
-        visible[i] = Math.fround(arrivingAt(x, y, z, camera, maps, shadow.bias, shadow.softness));
+        visible[i] = Math.fround(arrivingAt(x, y, z, camera, maps, fade(i)));
       }
     }
     const count = engine.frame(request.camera, conditions, settled, visible, rows, phases);

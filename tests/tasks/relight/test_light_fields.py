@@ -17,15 +17,16 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.train.population import split_population
-from neuprim.tasks.relight import colour
 from neuprim.tasks.relight.colour import (
-    BIAS,
+    FADE,
     FORMS,
-    SOFTNESS,
+    PIXEL_FADE,
     LightHarmonics,
     LightNetwork,
+    extents_towards,
     light_visibility,
     real_light_harmonics,
+    shade_by_light,
 )
 from neuprim.tasks.relight.lighting import parse_light_intensities, parse_light_positions
 from tests import scenes
@@ -117,42 +118,61 @@ def slabs() -> tuple[Geometry, Cosine]:
     )
 
 
-def test_what_lies_behind_something_is_in_its_shadow(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(colour, "BIAS", 0.0875)
+def visibility(geometry: Geometry, density: Cosine, light: tuple[float, float, float]) -> Tensor:
+    """Of the primitives."""
+    shading = shade_by_light("primitive", geometry, density, {"light": torch.tensor(light)}, SETTINGS)
+    assert shading is not None and shading.primitives is not None
+    return shading.primitives
+
+
+def test_what_lies_behind_something_is_in_its_shadow() -> None:
     geometry, density = slabs()
-    straight = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 5.0]), SETTINGS)(geometry.means)
+    straight = visibility(geometry, density, (0.0, 0.0, 5.0))
     assert float(straight[3]) < 0.05 and bool((straight[[0, 1, 2, 4, 5]] > 0.8).all())
-    aside = torch.tensor([4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)])
-    slanted = light_visibility(geometry, density, aside, SETTINGS)(geometry.means)
+    slanted = visibility(geometry, density, (4.0, 0.0, 1.0 + 4.0 * (1.0 / 0.75)))
     assert float(slanted[2]) < 0.3 and float(slanted[3]) > 0.8
 
 
 @pytest.mark.parametrize("size", [1.0, 50.0])
 def test_light_fades_over_parts_of_the_scene_s_diameter(size: float) -> None:
-    """Behind a disc of the greatest opacity, 0.99, at the depths that BIAS and SOFTNESS name: all, half and none of the
-    rest is kept."""
+    """Behind a disc of the greatest opacity, 0.99: all, half and none of the rest is kept."""
     geometry = Geometry(
         torch.zeros(1, 3), (size * torch.tensor([[1.0, 1.0, 1e-4]])).log(), torch.tensor([[1.0, 0, 0, 0]])
     )
     density = Cosine(torch.zeros(1, 0, 3), torch.zeros(1, 0), torch.zeros(1, 0), torch.full((1, 1), 1e6))
-    behind = torch.tensor([0.0, BIAS, BIAS + SOFTNESS, 3 * BIAS]) * 2 * size
-    points = torch.stack([torch.zeros(4), torch.zeros(4), -behind], -1)
-    found = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 4.0 * size]), SETTINGS)(points)
-    assert torch.allclose(found, torch.tensor([1.0, 0.505, 0.01, 0.01]), atol=0.005)
+    visible = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 4.0 * size]), SETTINGS)
+    for more in (0.0, size):
+        behind = torch.tensor([0.0, 0.5, 1.0, 3.0]) * (FADE * 2 * size + more)
+        points = torch.stack([torch.zeros(4), torch.zeros(4), -behind], -1)
+        found = visible(points, FADE, torch.full((4,), more))
+        assert torch.allclose(found, torch.tensor([1.0, 0.505, 0.01, 0.01]), atol=0.005)
+
+
+def test_extents_are_those_between_planes_that_touch() -> None:
+    """Of random ellipsoids, by points of their surfaces; one whose centre is the point has none."""
+    g = torch.Generator().manual_seed(0)
+    geometry = Geometry(torch.randn(5, 3, generator=g), torch.randn(5, 3, generator=g), torch.randn(5, 4, generator=g))
+    point = torch.tensor([3.0, -2.0, 5.0])
+    sphere = torch.nn.functional.normalize(torch.randn(20000, 3, generator=g), dim=-1)
+    surface = torch.einsum("nij,nj,pj->pni", geometry.rotations, geometry.scales, sphere)
+    towards = torch.nn.functional.normalize(point - geometry.means, dim=-1)
+    wanted = 2 * (surface * towards).sum(-1).amax(0)
+    assert torch.allclose(extents_towards(geometry, point), wanted, rtol=0.02)
+    assert float(extents_towards(geometry, geometry.means[3])[3]) == 0.0
 
 
 def test_shadows_carry_no_gradient_and_are_bounded() -> None:
     geometry, density = slabs()
     wanted = Geometry(geometry.means.requires_grad_(), geometry.log_scales, geometry.quats)
-    found = light_visibility(wanted, density, torch.tensor([0.5, 0.2, 4.0]), SETTINGS)(wanted.means)
+    found = visibility(wanted, density, (0.5, 0.2, 4.0))
     assert not found.requires_grad and bool(((found >= 0) & (found <= 1)).all())
 
 
-def covered_floor(opacity: float) -> tuple[Geometry, Cosine]:
-    """An opaque floor of 441 flat discs, and the last primitive, a disc of this opacity 1.5 above its middle, number
+def covered_floor(opacity: float, height: float = 1.5) -> tuple[Geometry, Cosine]:
+    """An opaque floor of 441 flat discs, and the last primitive, a disc of this opacity above its middle, number
     220."""
     side = torch.linspace(-2, 2, 21)
-    means = torch.cat([torch.cartesian_prod(side, side, torch.zeros(1)), torch.tensor([[0.0, 0.0, 1.5]])])
+    means = torch.cat([torch.cartesian_prod(side, side, torch.zeros(1)), torch.tensor([[0.0, 0.0, height]])])
     axes = torch.cat([torch.tensor([[0.25, 0.25, 0.03]]).expand(441, 3), torch.tensor([[0.6, 0.6, 0.05]])])
     offsets = torch.full((442, 1), 20.0)
     offsets[-1] = -math.log1p(-opacity) / 2 * 0.6 / 0.05  # straight through its middle
@@ -163,15 +183,21 @@ def covered_floor(opacity: float) -> tuple[Geometry, Cosine]:
 @pytest.mark.parametrize("opacity", [0.1, 0.55, 0.9, 0.99])
 def test_behind_something_translucent_the_rest_of_the_light_arrives(opacity: float) -> None:
     geometry, density = covered_floor(opacity)
-    found = light_visibility(geometry, density, torch.tensor([0.0, 0.0, 6.0]), SETTINGS)(geometry.means)
+    found = visibility(geometry, density, (0.0, 0.0, 6.0))
     assert float(found[220]) == pytest.approx(1 - opacity, abs=0.005)
     assert float(found[-1]) == 1.0
+
+
+def test_a_thin_thing_shadows_what_is_close_behind_it() -> None:
+    """At a twentieth of the scene's diameter."""
+    found = visibility(*covered_floor(0.99, 0.3), (0.0, 0.0, 6.0))
+    assert float(found[220]) < 0.05 and float(found[-1]) == 1.0
 
 
 @pytest.mark.parametrize("light", [(0.0, 0.0, 6.0), (4.0, 0.0, 2.5)])
 def test_what_nothing_covers_is_lit_fully(light: tuple[float, float, float]) -> None:
     geometry, density = covered_floor(0.9)
-    found = light_visibility(geometry, density, torch.tensor(light), SETTINGS)(geometry.means)
+    found = visibility(geometry, density, light)
     towards = torch.tensor(light)[:2] / torch.tensor(light).norm()
     clear = (geometry.means[:, :2] @ towards > 0.3) if light[0] else (geometry.means[:, :2].norm(dim=1) > 1)
     assert int(clear.sum()) > 100 and float(found[clear].min()) > 0.999
@@ -180,10 +206,7 @@ def test_what_nothing_covers_is_lit_fully(light: tuple[float, float, float]) -> 
 @pytest.mark.parametrize("distance", [1e3, 1e8, 1e18])
 def test_distant_lights_cast_the_shadows_of_near_ones(distance: float) -> None:
     geometry, density = slabs()
-    direction = torch.tensor([0.2, 0.1, 1.0])
-    near, far = (
-        light_visibility(geometry, density, d * direction, SETTINGS)(geometry.means) for d in (100.0, distance)
-    )
+    near, far = (visibility(geometry, density, (0.2 * d, 0.1 * d, d)) for d in (100.0, distance))
     assert float(near.min()) < 0.1 and float(near.max()) > 0.9 and torch.allclose(near, far, atol=0.05)
 
 
@@ -199,10 +222,11 @@ def test_a_flat_floor_does_not_shadow_itself(polar: float) -> None:
     light = 4.5 * torch.tensor([math.sin(angle), 0.0, math.cos(angle)])
     inner = torch.rand(500, 2, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
     points = torch.cat([inner, torch.zeros(500, 1)], -1).double()
-    assert float(light_visibility(geometry, density, light, SETTINGS)(points).min()) > 0.9
+    visible = light_visibility(geometry, density, light, SETTINGS)
+    assert float(visible(points, PIXEL_FADE).min()) > 0.9
     below = points - torch.tensor([0.0, 0.0, 0.6], dtype=torch.float64)
     under = below[(below[:, 0] + 0.6 * math.tan(angle)).abs() < 0.8]  # whose light would have to cross the floor
-    assert not len(under) or float(light_visibility(geometry, density, light, SETTINGS)(under).max()) < 0.1
+    assert not len(under) or float(visible(under, PIXEL_FADE).max()) < 0.1
 
 
 def test_the_recurrence_agrees_with_the_renderers_harmonics() -> None:

@@ -14,9 +14,13 @@ from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import unproject_rendered_depth
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import (
+    EXTENTS,
+    FADE,
+    PIXEL_FADE,
     LightHarmonics,
     LightNetwork,
     _visibility_kernel,
+    extents_towards,
     light_visibility,
     sample_visibility,
 )
@@ -40,7 +44,9 @@ def test_shadows_of_primitives() -> None:
     one = frame(LightNetwork(3, visibility="primitive"))
     found, drawn = chords(one.lowered, CAMERA), layers(one)
     geometry, density = one.lowered.geometry, one.lowered.density
-    V = light_visibility(geometry, density, one.conditions["light"], EXACT)(geometry.means).double()
+    light = one.conditions["light"]
+    visible = light_visibility(geometry, density, light, EXACT)
+    V = visible(geometry.means, FADE, EXTENTS * extents_towards(geometry, light)).double()
     assert V.min() < 0.7 < V.max()
     alpha = found.weight.sum(0)
     expected = torch.where(alpha > 0, torch.einsum("nhw,n->hw", found.weight, V) / alpha.clamp_min(1e-30), 0.0)
@@ -65,7 +71,8 @@ def test_shadows_of_pixels_multiply() -> None:
     assert visibility[one.drawn.alpha > 0].min() < 0.6
     assert (unshadowed * visibility[..., None] - one.drawn.rgb).abs().max() < 1e-5
     V = light_visibility(one.lowered.geometry, one.lowered.density, one.conditions["light"], EXACT)
-    expected = V(unproject_rendered_depth(one.drawn.depth, CAMERA).reshape(-1, 3)).reshape(visibility.shape)
+    points = unproject_rendered_depth(one.drawn.depth, CAMERA).reshape(-1, 3)
+    expected = V(points, PIXEL_FADE).reshape(visibility.shape)
     assert (visibility - torch.where(one.drawn.alpha > 0, expected, 0.0)).abs().max() < 1e-6
 
 
@@ -95,8 +102,9 @@ def test_both_read_the_same(slabs: int) -> None:
     points = torch.cat([points, (local - view[:, 3]) @ view[:, :3]])
     found = np.full(len(points), -1.0, np.float32)
     images = (alphas.numpy(), depths.numpy())
-    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, 0.2, 0.3, found)
-    wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, 0.2, 0.3)
+    fades = 0.1 + torch.rand(len(points), generator=generator, dtype=torch.float64)
+    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, fades.numpy(), found)
+    wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, fades)
     assert wanted.dtype == torch.float32 and torch.allclose(torch.from_numpy(found), wanted, rtol=0, atol=5e-7)
     assert 0.1 < float((wanted < 0.99).float().mean()) and float(wanted.min()) < 0.3
     assert found[50:54].tolist() == wanted[50:54].tolist() == [1.0] * 4

@@ -73,7 +73,7 @@ _LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shad
 class LitSettings:
     """Settings of ``scene=lit_solids`` that change the images: size in pixels, images a split, rays per pixel side."""
 
-    size: ImageSize = 160
+    size: ImageSize = 256
     train_views: Annotated[int, Range(1, 100000)] = 500
     test_views: Annotated[int, Range(1, 10000)] = 100
     supersampling: Supersampling = 2

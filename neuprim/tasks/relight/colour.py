@@ -324,9 +324,9 @@ LAYERS = 4  # of equal depth; more of them separate depths better and take longe
 
 FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
 """How far behind a depth image light fades: at a primitive over FADE scene diameters, as the light sees the scene, and
-EXTENTS times its own extent towards the light; at a pixel over PIXEL_FADE diameters. Surfaces made of ellipsoids are bumpy: where light fades faster, the bumps
-shadow each other, and where it fades slower, shadows come off their casters. A point on a depth image itself keeps all
-of its light."""
+EXTENTS times its own extent towards the light; at a pixel over PIXEL_FADE diameters. Surfaces made of ellipsoids are
+bumpy: where light fades faster, the bumps shadow each other, and where it fades slower, shadows come off their casters.
+A point on a depth image itself keeps all of its light."""
 
 _FAR = 1e3  # scene radii; from there all rays are parallel, and a float32 depth image keeps no digits
 _CHUNK = 1024  # points per unit of work

@@ -1,18 +1,17 @@
 """What is the best use of so much time? The levels `effort=1` to `9` of every task: how many primitives, and how many
 views.
 
-    python benchmarks/effort.py [--scenes smoke_fire lit_solids] [--write] [--docs] [--print]
+    python benchmarks/effort.py [--scenes smoke_fire] [--write] [--docs] [--print]
 
-Static scenes have levels of views alone, as their number of primitives follows the views. --docs makes their table of
-what `python benchmarks/static.py SCENE ... --tune --steps 320 500 ...` recorded. Of the other tasks a level is a share
-of the time that the preset `quick` takes, from a sixteenth of it to four times as much, on any machine. Level by level
-the number of primitives that was best so far is tried, and at most levels twice as many, while that is better: they
-share the time at paces measured side by side. Each is trained once, one thread, all else as the preset has it, and
-judged by views held out of the training ones (volumes: by the two test cameras of a rig of 38, as those of the usual 40
-must not decide). The level is the smallest model within TIE dB of the best of so much time or less. Results go to
-benchmarks/results/effort/SCENE.json after every run, and only what is missing is run. --write freezes the levels in the
-tasks' `effort/NAME.yaml`, --docs puts the tables between the markers of docs/tradeoffs.md and draws
-docs/pictures/effort.png; --print runs nothing.
+Static scenes and relighting have levels of views alone, as their number of primitives follows the views. --docs makes
+their tables of what `python benchmarks/quality.py SCENE ... --tune --steps 320 500 ...` recorded. Of volumes a level is
+a share of the time that the preset `quick` takes, from a sixteenth of it to four times as much. Level by level the
+number of primitives that was best so far is tried, and at most levels twice as many, while that is better: they share
+the time at paces measured side by side. Each is trained once, one thread, all else as the preset has it, and judged by
+the two test cameras of a rig of 38, as those of the usual 40 must not decide. The level is the smallest model within
+TIE dB of the best of so much time or less. Results go to benchmarks/results/effort/SCENE.json after every run, and only
+what is missing is run. --write freezes the levels in the tasks' `effort/NAME.yaml`, --docs puts the tables between the
+markers of docs/tradeoffs.md and draws docs/pictures/effort.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -34,10 +33,11 @@ from neuprim.report.charts import Chart, ChartPoints, Dot, front_chart, write_pn
 PICTURE = DOCS / "pictures" / "effort.png"
 TITLES = {
     "smoke_fire": "dynamic: `smoke_fire` (simulated), 64×64",
-    "lit_solids": "relight: `lit_solids` (generated), 128×128",
 }
-"""One scene of each task but the static one."""
-JUDGED = {"smoke_fire": "inside the mask", "lit_solids": "clamped"}
+"""Of volumes."""
+JUDGED = {"smoke_fire": "inside the mask"}
+SCORES = {"static": ("psnr", "ssim"), "relight": ("psnr_linear_clamped", "ssim_display")}
+"""Of the tasks whose levels are views alone: dB and SSIM."""
 TIMES = dict(zip(LEVELS, (1 / 16, 1 / 8, 1 / 4, 1 / 2, 1, 1.5, 2, 3, 4), strict=True))  # of the preset's own time
 FIRST = 0.5
 """Of the preset's own number of primitives, where the first level begins, and half of which it tries as well."""
@@ -46,9 +46,7 @@ DOUBLED = {1: 4, 2: 4, 3: 4, 4: 4, 5: 4, 7: 1}
 one before found."""
 TIE = 0.05
 PACED = 320  # steps of the short runs that tell the paces; a whole one each, as primitives are born on the way
-HOLD_OUT = 8
-KEYS = ("psnr", "psnr_mask", "psnr_linear_clamped", "ssim", "primitives", "model_bytes")
-STATIC_RECORD = RESULTS / "static_tune.json"
+KEYS = ("psnr", "psnr_mask", "ssim", "primitives", "model_bytes")
 
 
 def record_of(scene: str) -> Path:
@@ -59,18 +57,19 @@ def levels_path(task: str) -> Path:
     return ROOT / "neuprim" / "tasks" / task / "conf" / "effort" / f"{task}.yaml"
 
 
-def static_levels() -> dict[int, list[Run]]:
-    """A run per scene of every level of the static task."""
-    levels = yaml.safe_load(levels_path("static").read_text(encoding="utf-8"))["levels"]
-    runs = [run for run in read_trials(STATIC_RECORD) if not run["settings"]]
+def levels_of_views(task: str) -> dict[int, list[Run]]:
+    """A run per scene of every level of a task whose levels are views alone."""
+    levels = yaml.safe_load(levels_path(task).read_text(encoding="utf-8"))["levels"]
+    runs = [run for run in read_trials(RESULTS / f"{task}_tune.json") if not run["settings"]]
     views = {f"{settings['train.iterations']:,} steps": level for level, settings in levels.items()}
     by_budget = group_runs((run for run in runs if run["budget"] in views), "budget")
     found = {views[budget]: sorted(own, key=lambda run: run["scene"]) for (budget,), own in by_budget.items()}
     return dict(sorted(found.items()))
 
 
-def static_table(levels: Mapping[int, Sequence[Run]]) -> Table:
+def table_of_views(levels: Mapping[int, Sequence[Run]], task: str) -> Table:
     """A row per level: what it costs, and dB, SSIM and seconds of a core of every scene."""
+    judged, similar = SCORES[task]
     preset = {run["scene"]: run["cpu_seconds"] for run in levels[5]}
 
     def time_of(level: int) -> float:
@@ -87,20 +86,20 @@ def static_table(levels: Mapping[int, Sequence[Run]]) -> Table:
 
         def result(level: int, number: int = number) -> str:
             own = levels[level][number]
-            return f"{own['psnr']:.2f}, {own['ssim']:.4f} ({own['cpu_seconds']:.0f} s)"
+            return f"{own[judged]:.2f}, {own[similar]:.4f} ({own['cpu_seconds']:.0f} s)"
 
         columns[f"{run['scene']}, {run['size']}"] = result
     return make_table(columns, levels)
 
 
-def static_chart(levels: Mapping[int, Sequence[Run]]) -> Chart:
+def chart_of_views(levels: Mapping[int, Sequence[Run]], task: str) -> Chart:
     """PSNR of every scene against the training time of its levels."""
     lines = []
     for number, run in enumerate(levels[5]):
         own = [levels[level][number] for level in levels]
-        seconds, scores = [run["cpu_seconds"] for run in own], [run["psnr"] for run in own]
+        seconds, scores = [run["cpu_seconds"] for run in own], [run[SCORES[task][0]] for run in own]
         lines.append(ChartPoints(seconds, scores, f"C{number}", name=f"{run['scene']}, {run['size']}"))
-    return Chart("static", lines, "training, seconds of a core", "dB, held-out views", log_x=True)
+    return Chart(task, lines, "training, seconds of a core", "dB, held-out views", log_x=True)
 
 
 class Climb:
@@ -108,8 +107,7 @@ class Climb:
 
     def __init__(self, scene: str) -> None:
         self.scene, self.record = scene, record_of(scene)
-        self.is_volume = SCENES[scene].task == "dynamic"
-        self.words = (*SCENES[scene].all_words({}, scene), *(("scene.cameras=38",) if self.is_volume else ()))
+        self.words = (*SCENES[scene].all_words({}, scene), "scene.cameras=38")
         own = compose(self.words, check_output=False)
         assert own.train.iterations is not None, "presets are stated in views"
         self.steps, self.primitives = own.train.iterations, own.model.primitives
@@ -139,8 +137,7 @@ class Climb:
 
     def _trial(self, name: str, steps: int, share: float, facts: tuple[tuple[str, object], ...] = ()) -> Trial:
         words = (*self.words, f"model.primitives={round(share * self.primitives)}")
-        hold_out = 0 if self.is_volume or not name else HOLD_OUT
-        return Trial(name, words, steps, 0, hold_out, facts, interventions=None)
+        return Trial(name, words, steps, 0, 0, facts, interventions=None)
 
 
 def _round(steps: float) -> int:
@@ -225,11 +222,12 @@ def main() -> None:
         for scene, runs in found.items():
             levels_path(SCENES[scene].task).write_text(levels_file(runs, scene))
     if args.docs:
-        levels = static_levels()
-        between_markers(DOCS / "tradeoffs.md", "effort-static", str(static_table(levels)))
+        levels = {task: levels_of_views(task) for task in SCORES}
+        for task, own in levels.items():
+            between_markers(DOCS / "tradeoffs.md", f"effort-{task}", str(table_of_views(own, task)))
         between_markers(DOCS / "tradeoffs.md", "effort", text)
         charts = [make_chart(runs, scene) for scene, runs in found.items()]
-        write_png_charts(PICTURE, [static_chart(levels), *charts])
+        write_png_charts(PICTURE, [*(chart_of_views(own, task) for task, own in levels.items()), *charts])
 
 
 if __name__ == "__main__":

@@ -59,9 +59,9 @@ def reports(script: ModuleType) -> str:
 TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "results": ("README.md", "readme", lambda s: s.results_table()),
     "budgets": ("docs/budgets.md", "budget", budgets),
-    "static": ("docs/static.md", "static", lambda s: s.table(record_of(s))),
-    "full-size": ("README.md", "static", lambda s: s.readme_table(record_of(s))),
-    "relight-quality": ("docs/relighting.md", "relight_quality", lambda s: s.quality_table(record_of(s))),
+    "static": ("docs/static.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "static.json"))),
+    "full-size": ("README.md", "quality", lambda s: s.readme_table(s.read_record(s.RESULTS / "static.json"))),
+    "relight": ("docs/relighting.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "relight.json"))),
     **{
         name: ("docs/dynamic.md", "dynamic_quality", lambda s, name=name: s.make_tables(record_of(s))[name])
         for name in ("dynamic-quality", "dynamic-equations", "dynamic-control")
@@ -71,7 +71,14 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "fronts": ("docs/tradeoffs.md", "fronts", reports),
     "target": ("docs/tradeoffs.md", "target", reports),
     "effort": ("docs/tradeoffs.md", "effort", effort),
-    "effort-static": ("docs/tradeoffs.md", "effort", lambda s: s.static_table(s.static_levels())),
+    **{
+        f"effort-{task}": (
+            "docs/tradeoffs.md",
+            "effort",
+            lambda s, task=task: s.table_of_views(s.levels_of_views(task), task),
+        )
+        for task in ("static", "relight")
+    },
     "expressivity": ("docs/expressivity.md", "expressivity", lambda s: s.forms_table(record_of(s))),
     "expressivity-gaussian": (
         "docs/expressivity.md",

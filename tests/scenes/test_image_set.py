@@ -109,7 +109,7 @@ def test_a_failure_cancels_what_has_not_begun() -> None:
 
 @pytest.mark.parametrize(
     ("settings", "key"),
-    [(SolidsSettings, "326a24e0eb083720"), (LitSettings, "ef4d792bdd2608a3"), (RoomSettings, "efc71f16459cf01b")],
+    [(SolidsSettings, "326a24e0eb083720"), (LitSettings, "53a8804685091653"), (RoomSettings, "efc71f16459cf01b")],
     ids=lambda value: getattr(value, "__name__", ""),
 )
 def test_every_setting_is_in_the_key_and_existing_caches_stay_valid(settings: Any, key: str) -> None:

@@ -21,7 +21,7 @@ import torch
 from PIL import Image
 from torch import Tensor
 
-from neuprim.core.cameras import opengl_to_viewmat
+from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.posed_images import (
@@ -37,7 +37,7 @@ from neuprim.core.data.posed_images import (
     image_frame_in_scene,
 )
 from neuprim.core.data.transforms_json import TransformsLayout, read_image_frames, read_image_splits
-from neuprim.core.errors import DataError
+from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.images import read_image
 from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.task import SceneContext
@@ -60,6 +60,8 @@ class OlatSettings(FolderSettings):
     hold_out: HoldOut = 0
     # "inverse_square" where the light weakens with the square of its distance; "auto": as training images show
     falloff: Literal["auto", "none", "inverse_square"] = "auto"
+    # "camera": positions of lights are on the axes of each frame's camera, as of a flash: x right, y up, z backward
+    light_space: Literal["world", "camera"] = "world"
     # images are divided by this; "auto": by the 99.5th percentile of the training images
     exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
     ignore_corrections: bool = False  # poses are transform_matrix, even where a frame has the optimised R_opt and T_opt
@@ -102,9 +104,22 @@ def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[Ima
     lit = []
     for record, frame in zip(records, frames, strict=True):
         light = record.array("pl_pos", (3,), "the point light's position, 3 numbers")
+        if options.light_space == "camera":
+            light = _light_of_camera(frame.camera, light)
         intensity = _light_intensity(record if record.has("pl_intensity") else document)
         lit.append(replace(frame, conditions={"light": light, "light_intensity": intensity}))
+    if split == options.train_split and len(lit) > 1 and len({tuple(f.conditions["light"].tolist()) for f in lit}) == 1:
+        warn_once(
+            f"{document.where}: pl_pos is the same in all frames, so that nothing shows the scene under another light; "
+            "scene.light_space=camera if it is a place beside the camera"
+        )
     return lit
+
+
+def _light_of_camera(camera: Camera, light: Tensor) -> Tensor:
+    """(3,) in world units of a position on the camera's axes: x right, y up, z backward."""
+    view = camera.viewmat.double()
+    return view[:3, :3].T @ (light.double() * light.new_tensor([1, -1, -1]) - view[:3, 3])
 
 
 def _olat_frame_name(record: JsonReader) -> str:

@@ -208,6 +208,18 @@ def test_intensities(folder: Path, context: SceneContext) -> None:
     assert found == [[1.0, 2.0, 3.0], [25.0] * 3, [1.0, 2.0, 3.0]]
 
 
+def test_lights_beside_the_camera(folder: Path, context: SceneContext) -> None:
+    """A flash two units above and one behind each camera; equal numbers of all frames are pointed out."""
+    both(folder, each(lambda frame: frame.update(pl_pos=[0.0, 2.0, 1.0])))
+    with pytest.warns(match="pl_pos is the same in all frames.*scene.light_space=camera"):
+        read(folder, context)
+    dataset = read(folder, context, light_space="camera")
+    for i in range(3):
+        view = dataset.train.view(i)
+        wanted = view.camera.viewmat.inverse() @ torch.tensor([0.0, -2.0, -1.0, 1.0]).double()
+        assert torch.allclose(view.conditions["light"].double(), wanted[:3], atol=1e-5)
+
+
 def test_exposure(folder: Path, context: SceneContext) -> None:
     plain = read(folder, context)
     values = torch.cat([plain.train.pixels(i).rgb.flatten() for i in range(3)])

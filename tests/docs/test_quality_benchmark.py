@@ -1,4 +1,4 @@
-"""The benchmark of static scenes: rows are measured once, published figures stand beside them."""
+"""The benchmark of static scenes and relighting: rows are measured once, published figures stand beside them."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from tests.docs.pages import ROOT
 
 
 @pytest.fixture
-def static(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+def quality(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
-    return importlib.import_module("static")
+    return importlib.import_module("quality")
 
 
 def make_run(scene: str, size: str, **more: Any) -> dict[str, Any]:
@@ -28,41 +28,41 @@ def make_run(scene: str, size: str, **more: Any) -> dict[str, Any]:
     return row | {"model_bytes": 200_000, "psnr": 30.0, "ssim_3dgs": 0.95, "frame_ms": 12.34} | more
 
 
-def test_published_rows_are_those_of_the_scene_and_its_size(static: ModuleType) -> None:
-    rows = {row["method"]: row["psnr"] for row in static.published_rows("mic_800,scene.hold_out=8", "800×800")}
+def test_published_rows_are_those_of_the_scene_and_its_size(quality: ModuleType) -> None:
+    rows = {row["method"]: row["psnr"] for row in quality.published_rows("mic_800,scene.hold_out=8", "800×800")}
     assert rows["the paper, 5k"] == 34.01 and rows["3DGS nolimit"] == 35.36 and rows["HAC++, small"] == 35.21
-    peer = list(static.published_rows("chair_200", "200×200"))
+    peer = list(quality.published_rows("chair_200", "200×200"))
     assert {row["method"] for row in peer} == {"OpenSplat 1.2"} and len(peer) == 2
-    assert not list(static.published_rows("mic", "400×400")) and not list(static.published_rows("solids", "800×800"))
+    assert not list(quality.published_rows("mic", "400×400")) and not list(quality.published_rows("solids", "800×800"))
 
 
-def test_tables(static: ModuleType) -> None:
+def test_tables(quality: ModuleType) -> None:
     runs = [make_run("mic_800", "800×800", psnr=psnr) for psnr in (30.0, 31.0)]
     runs.append(make_run("mic_800", "800×800", settings="model.primitives=100", cpu_seconds=1.0))
-    lines = static.table({"cpu": "a CPU", "trials": runs}).splitlines()
+    lines = quality.table({"cpu": "a CPU", "trials": runs}).splitlines()
     assert lines[2].startswith(
         "| mic_800, 800×800 | neuprim, `model.primitives=100` | 240 s | 100 | 200,000 | – | 30.00 |"
     )
     assert "| 30.50 ± 0.50 | – | – | 0.9500 ± 0.0000 | – | 12.3 |" in lines[3]
     assert any("the paper, 5k | – | – | – | – | 34.01 |" in line for line in lines)
-    made = static.readme_table({"trials": [*runs, make_run("solids", "512×512", budget="10 s")]})
+    made = quality.readme_table({"trials": [*runs, make_run("solids", "512×512", budget="10 s")]})
     row, _, published = made.splitlines()[2:]
     assert "30.50 ± 0.50" in row and published.startswith("Published for mic") and "HAC++, small: 35.21" in published
-    assert static.readme_table({"trials": []}) == ""
+    assert quality.readme_table({"trials": []}) == ""
 
 
 @pytest.mark.parametrize("tune", [True, False])
 def test_rows_are_measured_once(
-    static: ModuleType, tune: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    quality: ModuleType, tune: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A tiny budget in seconds of the CPU; a second call has nothing left to do."""
     scene = "solids,scene.size=24,scene.train_views=16,scene.test_views=2,scene.supersampling=1"
     args = Namespace(
         scenes=[scene], seconds=[0.2], steps=[], seeds=1, set=["model.primitives=30"], tune=tune, lpips=None
     )
-    (trial,) = static.plan(args)
-    monkeypatch.setattr(static, "COMPRESS_SECONDS", 0.0)
-    row = static.measure_row((trial, tmp_path / "runs"), 0, lambda event: None)
+    (trial,) = quality.plan(args)
+    monkeypatch.setattr(quality, "COMPRESS_SECONDS", 0.0)
+    row = quality.measure_row((trial, tmp_path / "runs"), 0, lambda event: None)
     assert (row["budget"], row["size"], row["settings"]) == ("0.2 s", "24×24", "model.primitives=30")
     assert 0.2 <= row["cpu_seconds"] < 1.0 and row["iterations"] > 1
     assert row["frame_ms"] > 0 and row["psnr"] > 10
@@ -73,8 +73,8 @@ def test_rows_are_measured_once(
     record = tmp_path / "static.json"
     record.write_text(json.dumps({"cpu": "a CPU", "trials": [row]}), encoding="utf-8")
     words = ["--seconds", "0.2", "--seeds", "1", "--set", "model.primitives=30", "--record", str(record)]
-    monkeypatch.setattr(sys, "argv", ["static.py", scene, *words, *(["--tune"] if tune else [])])
-    monkeypatch.setattr(static, "measure_row", None)
-    static.main()
+    monkeypatch.setattr(sys, "argv", ["quality.py", scene, *words, *(["--tune"] if tune else [])])
+    monkeypatch.setattr(quality, "measure_row", None)
+    quality.main()
     assert json.loads(record.read_text(encoding="utf-8"))["trials"] == [row]
     assert record.with_suffix(".md").read_text(encoding="utf-8").count("24×24") == 1

@@ -1,22 +1,25 @@
-"""Static scenes: quality, size and speed by training time, beside published results.
+"""Static scenes and relighting: quality, size and speed by training time, beside published results.
 
-    python benchmarks/static.py SCENE ... [--seconds 240 1200] [--steps 2500] [--seeds 3] [--set KEY=VALUE ...]
+    python benchmarks/quality.py SCENE ... [--seconds 240 1200] [--steps 2500] [--seeds 3] [--set KEY=VALUE ...]
     [--tune] [--lpips FILE] [--jobs 1] [--out DIR] [--record FILE] [--docs] [--readme]
 
-SCENE is the folder of a data set or the name of a built-in scene; `SCENE,KEY=VALUE,...` has settings of its own, as in
-`solids`, `room,scene.size=400` or `DIR/cup,scene.downsample=2`. A row is a run in a directory below --out, one thread,
-all as the preset has it but --set, and then `neuprim compress`. A budget is seconds that this thread computes while the
-model learns, or steps. --tune judges by every eighth training view instead of the test views, in a record of its own.
+SCENE is the folder of a data set or the name of a built-in scene, all of one task; `SCENE,KEY=VALUE,...` has settings
+of its own, as in `solids`, `room,scene.size=400` or `DIR/cup,scene.downsample=2`. A row is a run in a directory below
+--out, one thread, all as the preset has it but --set, and then `neuprim compress`. A budget is seconds that this thread
+computes while the model learns, or steps. --tune judges by training views that are held out instead of the test views,
+in a record of its own.
 
-Rows go to benchmarks/results/static.json one by one, and the table to static.md beside it. Only what is missing is run;
-a row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of docs/static.md,
---readme the rows of README_SECONDS into the README. Without SCENE nothing is run. The README's picture:
+Rows go to benchmarks/results/TASK.json one by one, and the table to TASK.md beside it. Only what is missing is run; a
+row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of docs/static.md or
+docs/relighting.md, --readme the static rows of README_SECONDS into the README. Without SCENE nothing is run, and the
+static table is made, or that of --record. The README's picture:
 
-    python docs/make_pictures.py outputs/static_benchmark/mic_800-240s-0 docs/pictures/static.png 3 400
+    python docs/make_pictures.py outputs/quality/mic_800-240s-0 docs/pictures/static.png 3 400
 
 Published figures are those of neuprim/runs/paper_tables.yaml and benchmarks/results/published.json, which name their
-sources. Values are means over seeds +- half the spread, of the last checkpoint. SSIM and LPIPS are counted as the tools
-of 3D Gaussian splatting do (`ssim_3dgs`, `lpips_3dgs`).
+sources. Values are means over seeds +- half the spread, of the last checkpoint. SSIM and LPIPS of static scenes are
+counted as the tools of 3D Gaussian splatting do (`ssim_3dgs`, `lpips_3dgs`). Scores of relighting are those of linear
+light clamped to 0..1 and of display values, and of pixel classes where the scene knows them.
 """
 
 from __future__ import annotations
@@ -43,29 +46,49 @@ from neuprim.runs.paper import find_paper_figure, load_paper_run_tables
 from neuprim.runs.training import train_in_directory
 from neuprim.search.compress import CompressRequest, compress_run
 
-RECORD = RESULTS / "static.json"
 PUBLISHED = RESULTS / "published.json"
 PAPER_SIZE = "800×800"
 README_SECONDS = (240, 1200)
 README_CELLS = (0, 1, 2, 3, 4, 7, 9)  # of row_cells
 HOLD_OUT = 8
 COMPRESS_SECONDS = 30.0  # as `neuprim compress` fine-tunes unless told otherwise
-KEYS = ("psnr", "psnr_worst", "ssim", "ssim_3dgs", "lpips_3dgs", "primitives", "model_bytes", "psnr_gain")
 COLUMNS = ("scene", "method", "training", "primitives", "bytes", "compressed")
-COLUMNS += ("PSNR", "a gain away", "SSIM", "SSIM (3DGS)", "LPIPS (3DGS)", "ms a frame")
-SCORES = (("psnr", 2), ("psnr_gain", 2), ("ssim", 4), ("ssim_3dgs", 4), ("lpips_3dgs", 4))
+CLASSES = {"lit": "lit", "cast_shadow": "cast shadow", "attached_shadow": "attached shadow", "highlight": "highlight"}
+SCORES: dict[str, dict[str, tuple[str, int]]] = {
+    "static": {
+        "psnr": ("PSNR", 2),
+        "psnr_gain": ("a gain away", 2),
+        "ssim": ("SSIM", 4),
+        "ssim_3dgs": ("SSIM (3DGS)", 4),
+        "lpips_3dgs": ("LPIPS (3DGS)", 4),
+    },
+    "relight": {
+        "psnr_linear_clamped": ("PSNR, linear", 2),
+        "psnr_display": ("PSNR, display", 2),
+        "ssim_display": ("SSIM, display", 4),
+        **{f"psnr_pooled_{key}": (name, 1) for key, name in CLASSES.items()},
+    },
+}
+"""Columns of each task, of metrics, with digits."""
+KEYS = (*(key for scores in SCORES.values() for key in scores), "psnr_worst", "primitives", "model_bytes")
+PAGES = {"static": DOCS / "static.md", "relight": DOCS / "relighting.md"}
 
 
-def scene_words(text: str) -> tuple[str, list[str]]:
-    """Name and settings of SCENE."""
+def scene_words(text: str) -> tuple[str, str, list[str]]:
+    """Task, name and settings of SCENE."""
     place, *settings = text.split(",")
     folder = Path(place)
     if not folder.is_dir():
-        return text, [f"scene={place}", *settings]
-    layouts = {"transforms_train.json": "blender", "transforms.json": "nerfstudio"}
-    layout = next((layout for file, layout in layouts.items() if (folder / file).exists()), "colmap")
-    name = ",".join([folder.resolve().name, *settings])
-    return name, [f"scene={layout}", f"scene.path='{folder.resolve()}'", *settings]
+        return ("relight" if place == "lit_solids" else "static"), text, [f"scene={place}", *settings]
+    name, transforms = ",".join([folder.resolve().name, *settings]), folder / "transforms_train.json"
+    layout = "nerfstudio" if (folder / "transforms.json").exists() else "colmap"
+    if transforms.exists():
+        layout = "olat" if '"pl_pos"' in transforms.read_text(encoding="utf-8") else "blender"
+    return (
+        ("relight" if layout == "olat" else "static"),
+        name,
+        [f"scene={layout}", f"scene.path='{folder.resolve()}'", *settings],
+    )
 
 
 def plan(args: argparse.Namespace) -> list[Trial]:
@@ -76,9 +99,9 @@ def plan(args: argparse.Namespace) -> list[Trial]:
     trials = []
     for seed in range(args.seeds):
         for budget, steps, iterations, seconds in budgets:
-            for name, words in map(scene_words, args.scenes):
-                own = ("task=static", *words, *shared, iterations, f"train.max_seconds={seconds}")
-                facts = (("scene", name), ("settings", " ".join(args.set)), ("budget", budget))
+            for task, name, words in map(scene_words, args.scenes):
+                own = (f"task={task}", *words, *shared, iterations, f"train.max_seconds={seconds}")
+                facts = (("task", task), ("scene", name), ("settings", " ".join(args.set)), ("budget", budget))
                 trial = "-".join([name, budget.replace(" ", "").replace(",", ""), *args.set, str(seed)])
                 trials.append(Trial(trial, own, steps, seed, HOLD_OUT if args.tune else 0, facts))
     return trials
@@ -144,7 +167,7 @@ def group_rows(runs: Sequence[Run]) -> Iterator[tuple[str, str, list[list[Run]]]
         yield scene, size, sorted(group_runs(own, "settings", "budget").values(), key=time_of)
 
 
-def row_cells(runs: Sequence[Run]) -> list[str]:
+def row_cells(runs: Sequence[Run], task: str = "static") -> list[str]:
     """Cells from the budget on of runs that differ by their seed alone, or of one published row."""
 
     def known(key: str) -> list[Run]:
@@ -154,7 +177,7 @@ def row_cells(runs: Sequence[Run]) -> list[str]:
         return form.format(statistics.mean(run[key] for run in known(key))) if known(key) else "–"
 
     sizes = [mean(key, "{:,.0f}") for key in ("primitives", "model_bytes", "compressed_bytes")]
-    scores = [spread_of(known(key), key, digits) for key, digits in SCORES]
+    scores = [spread_of(known(key), key, digits) for key, (_, digits) in SCORES[task].items()]
     budget = runs[0].get("budget", "–")
     if budget.endswith("steps"):
         budget += mean("cpu_seconds", " ({:.0f} s)")
@@ -163,13 +186,16 @@ def row_cells(runs: Sequence[Run]) -> list[str]:
 
 def table(record: Record) -> str:
     """All rows of a record, each scene's own and then the published ones."""
-    made = Table(*COLUMNS)
+    task = record["trials"][0].get("task", "static")
+    made = Table(*COLUMNS, *(title for title, _ in SCORES[task].values()), "ms a frame")
     for scene, size, rows in group_rows(record["trials"]):
         for runs in rows:
             settings = runs[0]["settings"]
-            made.row(f"{scene}, {size}", f"neuprim, `{settings}`" if settings else "neuprim", *row_cells(runs))
+            made.row(f"{scene}, {size}", f"neuprim, `{settings}`" if settings else "neuprim", *row_cells(runs, task))
         for row in published_rows(scene, size):
-            made.row(f"{scene}, {size}", row["method"], *row_cells([row]))
+            made.row(f"{scene}, {size}", row["method"], *row_cells([row], task))
+    if task == "relight":
+        return f"{made}\n\nOne thread of {record['cpu']}."
     sources = "\n".join(f"* {name}: {source}" for name, source in read_record(PUBLISHED)["sources"].items())
     return f"{made}\n\nOwn rows: one thread of {record['cpu']}.\n\n{sources}"
 
@@ -180,7 +206,8 @@ def readme_table(record: Record) -> str:
     runs = [run for run in record["trials"] if run["budget"] in budgets and not run["settings"]]
     if not runs:
         return ""
-    made, published = Table("scene", *(COLUMNS[2 + number] for number in README_CELLS)), []
+    titles = (*COLUMNS[2:], *(title for title, _ in SCORES["static"].values()), "ms a frame")
+    made, published = Table("scene", *(titles[number] for number in README_CELLS)), []
     for scene, size, rows in group_rows(runs):
         for own in rows:
             cells = row_cells(own)
@@ -200,17 +227,22 @@ def main() -> None:
     parser.add_argument("--set", nargs="*", default=[], metavar="KEY=VALUE", help="further settings of every run")
     parser.add_argument("--tune", action="store_true", help="judge by training views that are held out")
     parser.add_argument("--lpips", type=Path, help="weights, as metrics.lpips takes them")
-    parser.add_argument("--out", type=Path, default=Path("outputs/static_benchmark"), help="folder of the runs")
-    parser.add_argument("--record", type=Path, help="another record than benchmarks/results/static.json")
+    parser.add_argument("--out", type=Path, default=Path("outputs/quality"), help="folder of the runs")
+    parser.add_argument("--record", type=Path, help="another record than benchmarks/results/TASK.json")
     parser.add_argument("--readme", action="store_true", help="write the README's table")
     args = parser.parse_args()
-    path = args.record or (RESULTS / "static_tune.json" if args.tune else RECORD)
-    run_all(plan(args), path, args.out.absolute(), args.jobs, call="static:measure_row")
+    tasks = {scene_words(scene)[0] for scene in args.scenes} or {"static"}
+    if len(tasks) > 1:
+        parser.error("found scenes of two tasks; expected those of one")
+    (task,) = tasks
+    path = args.record or RESULTS / f"{task}{'_tune' if args.tune else ''}.json"
+    run_all(plan(args), path, args.out.absolute(), args.jobs, call="quality:measure_row")
     record = read_record(path)
     text = table(record)
     path.with_suffix(".md").write_text(f"{text}\n", encoding="utf-8")
     if args.docs:
-        between_markers(DOCS / "static.md", "static", text)
+        task = record["trials"][0].get("task", "static")
+        between_markers(PAGES[task], task, text)
     if args.readme:
         between_markers(README, "full-size", readme_table(record))
 

@@ -41,8 +41,9 @@ _CURVE_VIEWS = 5
 _CURVE_PSNR_MAX = 200.0
 """dB; equal images have an infinite PSNR, which a line of JSON cannot hold."""
 
-_TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS = 5000, 20, 2.0
-"""The training that measures the pace, with as many primitives in the end, and at most so many steps and seconds."""
+_TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM = 10_000, 20, 2.0, 3
+"""The training that measures the pace: so many primitives, as far as the data offer points for them, at most so many
+steps and seconds, and steps before the clock starts."""
 
 
 # ---------------------------------------------------------------- events
@@ -319,14 +320,18 @@ def _starting_count_of_run(config: RunConfig) -> int:
 def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> int:
     """The number of ``model.primitives=auto`` for ``train.max_seconds``, from the pace of a trial training."""
     config = job.config
-    trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES))
+    whole = replace(config.train, population=replace(config.train.population, grow_from=1.0))
+    trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES), train=whole)
     trainer = make_run_trainer(Job(trial, job.task), dataset, loss)
     compile_run_kernels(trainer, events)
     events(Preparing("a test of the pace, for model.primitives=auto"))
     with use_one_torch_thread_for_run():
-        while trainer.step < _TRIAL_STEPS and trainer.elapsed < _TRIAL_SECONDS:
+        for _ in range(_TRIAL_WARM):
             trainer.train_step()
-    pace = trainer.elapsed / (trainer.step * trainer.model.count)
+        start = trainer.elapsed
+        while trainer.step < _TRIAL_WARM + _TRIAL_STEPS and trainer.elapsed < start + _TRIAL_SECONDS:
+            trainer.train_step()
+    pace = (trainer.elapsed - start) / ((trainer.step - _TRIAL_WARM) * trainer.model.count)
     model, seconds = config.model.with_count_for(config.train, pace), config.train.max_seconds
     events(Note(f"model.primitives=auto: {model.count:,} for {seconds:g} s, as one takes {1e6 * pace:.2g} µs a step"))
     return model.count

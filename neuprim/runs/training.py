@@ -288,8 +288,8 @@ def make_run_finetune_trainer(
     """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
 
     Schedules are those of a run from the progress ``begin`` on, except for the rates (:data:`START`, :data:`COOL`);
-    the population is fixed, and views keep their resolution. Gains of photographs' exposures go on from the run's
-    checkpoint, if there is one.
+    the population is fixed, and views keep their resolution. Exposures and corrections of views go on from the
+    run's checkpoint, if there is one.
     """
     config, params = job.config, {name: value.detach().clone() for name, value in model.params.items()}
     copy = Primitives(model.density, model.colour, params)
@@ -312,8 +312,9 @@ def make_run_finetune_trainer(
     trainer = Trainer(copy, dataset, make_run_loss(job), settings, config.renderer, config.seed)
     trainer.step = total - steps
     saved = config.output_dir / "checkpoint.safetensors"
-    if trainer.exposures is not None and saved.exists():
-        trainer.exposures.load_state(select_state_tensors(checkpoint.read_tensors(saved, "checkpoint")[1], "exposure."))
+    for numbers, name in ((trainer.exposures, "exposure."), (trainer.corrections, "correction.")):
+        if numbers is not None and saved.exists():
+            numbers.load_state(select_state_tensors(checkpoint.read_tensors(saved, "checkpoint")[1], name))
     return trainer
 
 

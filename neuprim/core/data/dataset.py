@@ -37,6 +37,10 @@ def _composite_pixels(rgb, alpha, out, background):  # type: ignore[no-untyped-d
             out[i, c] = rgb[i, c] + uncovered * background[c]
 
 
+Correction = Literal["pose", "offset", "factor"]
+"""Of a camera; of a position in scene units, which it moves; of a strength, which it multiplies."""
+
+
 @dataclass(frozen=True)
 class View:
     """One frame without its pixels."""
@@ -177,6 +181,8 @@ class Dataset:
     placement: DensityGridPlacement | None = None  # the voxel files the scene was made from, if any
     largest: float | None = None  # largest extinction, 1/scene unit, if known; primitives stay below it
     points: PointSupervision | None = None  # for ``train.supervision=voxels`` and ``both``
+    # what of the training views is known only roughly, and learned with the model: "camera", names of conditions
+    refine: Mapping[str, Correction] = field(default_factory=dict)
     extra: object = None  # further knowledge in a class of the task, e.g. pixel classes; tasks accept None
 
     def __init_subclass__(cls) -> None:

@@ -35,6 +35,7 @@ from neuprim.core.train.training_views import (
     Exposures,
     PixelLoader,
     PixelStride,
+    ViewCorrections,
     choose_stride,
     count_covered_pixels,
     draw_stride,
@@ -79,6 +80,7 @@ class ViewResult(NamedTuple):
     Attributes:
         loss: its share of the step's loss; that of the last view includes points and regularisers.
         gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
+        correction: gradient of the view's corrections; None without them.
     """
 
     view: int
@@ -88,6 +90,7 @@ class ViewResult(NamedTuple):
     parts: dict[str, float]
     point_parts: dict[str, float]
     gain: list[float] | None
+    correction: list[float] | None
 
 
 class _RenderedView(NamedTuple):
@@ -144,6 +147,8 @@ class Trainer:
         size, rate = settings.angular_size, settings.exposure_rate
         self.max_screen_size = None if size is None else MaxScreenSize(train, size)
         self.exposures = Exposures(len(train), dataset.channels, rate, self.device) if rate > 0 else None
+        refine = dataset.refine
+        self.corrections = ViewCorrections(len(train), refine, dataset.extent, self.device) if refine else None
         self.covered_pixels = count_covered_pixels(train) if settings.stride == "auto" else 0.0
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order, self.step, self.elapsed = torch.empty(0, dtype=torch.int64), 0, 0.0
@@ -219,8 +224,9 @@ class Trainer:
                     loss = self._total_loss(loss, points)
                 cost = self._backward(loss, view, points)
                 gain = None if self.exposures is None else self.exposures.gradient(task.view)
+                moved = None if self.corrections is None else self.corrections.gradient(task.view)
                 point_parts = {} if points is None else points.parts
-                results.append(ViewResult(task.view, view.name, cost, view.psnr, view.parts, point_parts, gain))
+                results.append(ViewResult(task.view, view.name, cost, view.psnr, view.parts, point_parts, gain, moved))
                 each.append(self._exchange_gradients(view.contributions))
                 del view, loss  # free what autograd saved before the next view is rendered
             if tasks:
@@ -232,7 +238,7 @@ class Trainer:
                 cost = self._backward(self._total_loss(None, points), None, points)
                 contributions, parts, psnr, name = points.contributions(), points.parts, points.psnr, points.name
 
-            # Update the parameters and the exposures.
+            # Update the parameters, and the numbers of the views.
             self.population.observe(model, contributions)
             self.optimizer.step(model.params, self.rates())
             if self.dataset.largest is not None:
@@ -241,6 +247,9 @@ class Trainer:
                 model.params[parameter].detach()[mask] = 0
             if self.exposures is not None:
                 self.exposures.step({result.view: result.gain for result in results})
+            if self.corrections is not None:
+                factor = self.settings.final_rate**progress
+                self.corrections.step({result.view: result.correction for result in results}, factor)
             if self.max_screen_size is not None:
                 self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
             self.step += 1
@@ -330,6 +339,8 @@ class Trainer:
         """Render a view and compare it with its image."""
         index = task.view
         view, pixels = task.stride.take(self.dataset.train.view(index), self.loader.take(index, task.upcoming))
+        if self.corrections is not None:
+            view = self.corrections.apply(index, view)
         background = task.background.to(self.device, non_blocking=True)
         truth = pixels.over(background)
         output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
@@ -397,6 +408,7 @@ class Trainer:
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
         tensors |= {f"exposure.{k}": v for k, v in (self.exposures.state() if self.exposures else {}).items()}
+        tensors |= {f"correction.{k}": v for k, v in (self.corrections.state() if self.corrections else {}).items()}
         tensors |= {f"zeros.{k}": v for k, v in self.zero_masks.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
@@ -417,6 +429,8 @@ class Trainer:
         self.population.load_state(select_state_tensors(moved, "population."))
         if self.exposures is not None:
             self.exposures.load_state(select_state_tensors(moved, "exposure."))
+        if self.corrections is not None:
+            self.corrections.load_state(select_state_tensors(moved, "correction."))
         self.zero_masks = select_state_tensors(moved, "zeros.")
         self.order = tensors["order"].clone()
         self.generator.set_state(tensors["generator"])

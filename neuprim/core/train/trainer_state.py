@@ -11,6 +11,9 @@ from torch import Tensor
 
 from neuprim.core.errors import CheckpointError
 
+_FIXED = ("params", "adam", "exposure", "correction")
+"""Groups of tensors that are there in every state of the same settings."""
+
 
 def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
     """Tensors whose names begin with a prefix, without it."""
@@ -48,7 +51,7 @@ def _find_state_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], 
     means = tensors.get("params.means", torch.zeros(()))
     count = len(means) if means.dim() else 0
     # order, population and zeros may be of other shapes, or missing, at another step
-    names = [name for name in own if name.startswith(("params.", "adam.", "exposure.")) or name == "generator"]
+    names = [name for name in own if name.partition(".")[0] in (*_FIXED, "generator")]
     for name in names:
         like, found = own[name], tensors.get(name)
         shape = (count, *like.shape[1:]) if name.startswith(("params.", "adam.")) else tuple(like.shape)
@@ -64,7 +67,7 @@ def _find_state_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], 
             f"params.{rest}" not in names or value.shape != tensors[f"params.{rest}"].shape or value.dtype != torch.bool
         ):
             return f"{name} is {value.dtype} {tuple(value.shape)}"
-        if kind in ("params", "adam", "exposure") and name not in names:
+        if kind in _FIXED and name not in names:
             return f"it has {name}, which these settings do not use"
     order, age = tensors.get("order"), tensors["adam.age"]
     fits = order is not None and order.dim() == 1 and order.dtype == torch.int64

@@ -1,4 +1,5 @@
-"""Training views: loaded one ahead on a GPU, some of their pixels in a step, with a gain per photograph."""
+"""Training views: loaded one ahead on a GPU, some of their pixels in a step, with numbers of their own: a photograph's
+gain, and corrections of its camera and conditions."""
 
 from __future__ import annotations
 
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.data import Dataset, Pixels, View, ViewSet
+from neuprim.core.data.dataset import Correction
 from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.data.image_views import StoredPixels
 
@@ -31,6 +33,9 @@ _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
 """Used fraction of the budget -> divisor of the automatic stride until then; from the last one on views are whole."""
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
+
+_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [1e-3] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
+"""Of the numbers of each kind, at the start: of a pose in radians and units of length, the view's step of Adam each."""
 
 
 class PixelLoader:
@@ -122,51 +127,114 @@ def hash_training_views(views: ViewSet) -> str:
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
-class Exposures:
-    """A factor per training view and channel, by which a rendered image is multiplied before it is compared.
+class _NumbersOfViews:
+    """Some numbers per training view that a run learns beside the model, by Adam, in the steps that use the view."""
 
-    Adam learns the logarithms of the factors at ``rate``, each in the steps that use its view. The geometric mean over
-    the views stays 1, so that the model keeps the photographs' mean exposure, with which held-out views are rendered.
-    """
-
-    def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
-        self.rate = rate
-        self.log_gain = torch.zeros(views, channels, device=device)
-        self.m, self.v = torch.zeros_like(self.log_gain), torch.zeros_like(self.log_gain)
+    def __init__(self, views: int, rates: list[float], device: torch.device) -> None:
+        self.rates = torch.tensor(rates, device=device)
+        self.numbers = torch.zeros(views, len(rates), device=device)
+        self.m, self.v = torch.zeros_like(self.numbers), torch.zeros_like(self.numbers)
         self.seen = torch.zeros(views, dtype=torch.int64)
-        self._applied: dict[int, Tensor] = {}
+        self._rows: dict[int, Tensor] = {}
 
-    def apply(self, index: int, rgb: Tensor) -> Tensor:
-        """(H, W, C) as the camera of view ``index`` would have exposed it."""
-        gain = self.log_gain[index].clone().requires_grad_()
-        self._applied[index] = gain
-        return rgb * gain.exp()
+    def row(self, index: int) -> Tensor:
+        """The numbers of view ``index``, for :meth:`gradient` to find what its backward pass leaves there."""
+        self._rows[index] = row = self.numbers[index].clone().requires_grad_()
+        return row
 
     def gradient(self, index: int) -> list[float] | None:
-        """Gradient of the logarithms of a view's factors, after its backward pass; None without one."""
-        grad = self._applied.pop(index).grad
+        """Gradient of a view's numbers, after its backward pass; None without one."""
+        grad = self._rows.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
-    def step(self, gradients: Mapping[int, list[float] | None]) -> None:
-        """Move the factors of a step's views by their gradients."""
+    def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
+        """Move the numbers of a step's views by their gradients, at ``factor`` of the rates."""
         for index, numbers in gradients.items():
             if numbers is None:
                 continue
-            grad = torch.tensor(numbers, device=self.log_gain.device)
+            grad = torch.tensor(numbers, device=self.numbers.device)
             self.seen[index] += 1
             n = int(self.seen[index])
             self.m[index] += (1 - _BETA1) * (grad - self.m[index])
             self.v[index] += (1 - _BETA2) * (grad.square() - self.v[index])
-            scale = math.sqrt(1 - _BETA2**n) / (1 - _BETA1**n)
-            self.log_gain[index] -= self.rate * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
-        if gradients:
-            self.log_gain -= self.log_gain.mean(0)
+            scale = factor * math.sqrt(1 - _BETA2**n) / (1 - _BETA1**n)
+            self.numbers[index] -= self.rates * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
 
     def state(self) -> dict[str, Tensor]:
         """Tensors from which :meth:`load_state` goes on."""
-        return {"log_gain": self.log_gain, "m": self.m, "v": self.v, "seen": self.seen}
+        return {"numbers": self.numbers, "m": self.m, "v": self.v, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
         """Continue from a checked state."""
-        self.log_gain, self.m, self.v = state["log_gain"], state["m"], state["v"]
+        self.numbers, self.m, self.v = state["numbers"], state["m"], state["v"]
         self.seen = state["seen"].cpu()
+
+
+class Exposures(_NumbersOfViews):
+    """A factor per training view and channel, by which a rendered image is multiplied before it is compared.
+
+    Their logarithms are learned. The geometric mean over the views stays 1, so that the model keeps the photographs'
+    mean exposure, with which held-out views are rendered.
+    """
+
+    def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
+        super().__init__(views, [rate] * channels, device)
+
+    def apply(self, index: int, rgb: Tensor) -> Tensor:
+        """(H, W, C) as the camera of view ``index`` would have exposed it."""
+        return rgb * self.row(index).exp()
+
+    def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
+        super().step(gradients, factor)
+        if gradients:
+            self.numbers -= self.numbers.mean(0)
+
+
+class ViewCorrections(_NumbersOfViews):
+    """Corrections of what a data set knows of its training views only roughly (``Dataset.refine``).
+
+    Args:
+        kinds: "camera" or a condition -> "pose", "offset" or "factor". A pose has a rotation vector and a shift on the
+            camera's axes, an offset is added to a position, and of a factor the logarithm is learned.
+        unit: of shifts and offsets, in scene units.
+    """
+
+    def __init__(self, views: int, kinds: Mapping[str, Correction], unit: float, device: torch.device) -> None:
+        rates = [rate for kind in kinds.values() for rate in _CORRECTION_RATES[kind]]
+        super().__init__(views, rates, device)
+        self.kinds, self.unit = kinds, unit
+
+    def apply(self, index: int, view: View) -> View:
+        """The view as it is taken to be now."""
+        row, conditions, camera = self.row(index).double(), dict(view.conditions), view.camera
+        for name, part in zip(self.kinds, row.split(self._sizes()), strict=True):
+            if name in conditions:
+                value = conditions[name]
+                part = part.to(value)
+                conditions[name] = value * part.exp() if self.kinds[name] == "factor" else value + self.unit * part
+            else:
+                camera = replace(camera, viewmat=self._motion(part.cpu()) @ camera.viewmat.double())
+        return replace(view, camera=camera, conditions=conditions)
+
+    def _sizes(self) -> list[int]:
+        return [len(_CORRECTION_RATES[kind]) for kind in self.kinds.values()]
+
+    def _motion(self, part: Tensor) -> Tensor:
+        """(4, 4) of a rotation vector and a shift."""
+        (x, y, z), shift = part[:3], self.unit * part[3:]
+        zero = torch.zeros_like(x)
+        cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
+        top = torch.cat([torch.linalg.matrix_exp(cross), shift[:, None]], 1)
+        return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
+
+    def summary(self) -> str:
+        """How far the corrections went: root mean squares over the views."""
+        found = []
+        for name, part in zip(self.kinds, self.numbers.split(self._sizes(), 1), strict=True):
+            kind, sizes = self.kinds[name], part.square().unflatten(1, (-1, 3 if part.shape[1] > 1 else 1)).sum(-1)
+            first, *shift = sizes.mean(0).sqrt().tolist()
+            if kind == "pose":
+                found.append(f"{name} {math.degrees(first):.2g} degrees and {self.unit * shift[0]:.2g}")
+            else:
+                found.append(f"{name} {first:.1%}" if kind == "factor" else f"{name} {self.unit * first:.2g}")
+        return f"corrections of training views, root mean squares, scene units: {', '.join(found)}"

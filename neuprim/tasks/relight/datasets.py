@@ -11,7 +11,7 @@ straight alpha and become linear light; OpenEXR is linear and premultiplied.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -23,6 +23,7 @@ from torch import Tensor
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
 from neuprim.core.data import Clip, Dataset
+from neuprim.core.data.dataset import Correction
 from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,
@@ -47,6 +48,11 @@ from neuprim.tasks.relight.lighting import Lighting, measure_falloff, olat_perce
 
 _KEYS = ("camera_near", "camera_far", "img_path", "file_ext", "pl_pos", "pl_intensity", "R_opt", "T_opt")
 
+_CORRECTIONS: dict[str, dict[str, Correction]] = {
+    "light": {"light": "offset", "light_intensity": "factor"},
+    "camera": {"camera": "pose"},
+}
+
 
 @dataclass(frozen=True)
 class OlatSettings(FolderSettings):
@@ -62,6 +68,9 @@ class OlatSettings(FolderSettings):
     falloff: Literal["auto", "none", "inverse_square"] = "auto"
     # "camera": positions of lights are on the axes of each frame's camera, as of a flash: x right, y up, z backward
     light_space: Literal["world", "camera"] = "world"
+    # what of the training views is known only roughly, and learned with the model: lights (with their intensities),
+    # cameras
+    refine: list[Literal["light", "camera"]] = field(default_factory=list)
     # images are divided by this; "auto": by the 99.5th percentile of the training images
     exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
     ignore_corrections: bool = False  # poses are transform_matrix, even where a frame has the optimised R_opt and T_opt
@@ -88,7 +97,8 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     )
     dataset = assemble_dataset(str(folder), folder.resolve().name, train, test, options, context, details)
     falloff = measure_falloff(dataset) if options.falloff == "auto" else options.falloff
-    return replace(dataset, extra=Lighting(falloff))
+    kinds = {name: kind for part in options.refine for name, kind in _CORRECTIONS[part].items()}
+    return replace(dataset, extra=Lighting(falloff), refine=kinds)
 
 
 def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:

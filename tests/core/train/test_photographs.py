@@ -58,7 +58,7 @@ def test_gains_are_found_and_their_mean_is_one(plain: Dataset) -> None:
         errors.append(sum(r.psnr for r in reports[-count:]) / count)
     assert errors[0] > errors[1] + 1.0, errors
     assert with_gains.exposures is not None
-    found = with_gains.exposures.log_gain
+    found = with_gains.exposures.numbers
     assert found.mean(0).abs().max() < 1e-6
     assert (found - (gains.log() - gains.log().mean(0))).abs().max() < 0.06
     assert without.exposures is None and not any(k.startswith("exposure") for k in without.state()[0])
@@ -81,8 +81,8 @@ def test_gains_are_saved_and_go_on(plain: Dataset, tmp_path: Path) -> None:
     without = {k: v for k, v in tensors.items() if not k.startswith("exposure")}
     for trainer, damaged, message in (
         (tiny.trainer(plain, 30), tensors, r"it has exposure\.\w+, which these settings do not use"),
-        (make(), {**tensors, "exposure.log_gain": torch.zeros(1, 3)}, r"exposure\.log_gain is .* expected finite"),
-        (make(), without, r"it has no exposure\.log_gain"),
+        (make(), {**tensors, "exposure.numbers": torch.zeros(1, 3)}, r"exposure\.numbers is .* expected finite"),
+        (make(), without, r"it has no exposure\.numbers"),
     ):
         with pytest.raises(CheckpointError, match=message):
             trainer.load_state(damaged, header, "c")
@@ -101,11 +101,11 @@ def test_a_gain_moves_by_its_own_gradient_only() -> None:
     loss = (exposures.apply(1, image) - 2.0).abs().mean()
     loss.backward()
     exposures.step({1: exposures.gradient(1)})
-    assert torch.allclose(exposures.log_gain[1] - exposures.log_gain[0], torch.tensor(0.1), atol=1e-4)
-    assert torch.equal(exposures.log_gain[0], exposures.log_gain[2]) and exposures.seen.tolist() == [0, 1, 0]
-    before = exposures.log_gain.clone()
+    assert torch.allclose(exposures.numbers[1] - exposures.numbers[0], torch.tensor(0.1), atol=1e-4)
+    assert torch.equal(exposures.numbers[0], exposures.numbers[2]) and exposures.seen.tolist() == [0, 1, 0]
+    before = exposures.numbers.clone()
     exposures.step({})
-    assert torch.equal(exposures.log_gain, before), "no view, no step"
+    assert torch.equal(exposures.numbers, before), "no view, no step"
 
 
 def test_no_primitive_looks_larger_than_it_may(plain: Dataset) -> None:

@@ -184,14 +184,19 @@ def row_cells(runs: Sequence[Run], task: str = "static") -> list[str]:
     return [budget, *sizes, *scores, mean("frame_ms", "{:.1f}")]
 
 
+def method_cell(settings: str) -> str:
+    """Of own rows: the settings of the model, where there are any, else all."""
+    own = [word for word in settings.split() if word.startswith("model.")]
+    return f"neuprim, `{' '.join(own) or settings}`" if settings else "neuprim"
+
+
 def table(record: Record) -> str:
     """All rows of a record, each scene's own and then the published ones."""
     task = record["trials"][0].get("task", "static")
     made = Table(*COLUMNS, *(title for title, _ in SCORES[task].values()), "ms a frame")
     for scene, size, rows in group_rows(record["trials"]):
         for runs in rows:
-            settings = runs[0]["settings"]
-            made.row(f"{scene}, {size}", f"neuprim, `{settings}`" if settings else "neuprim", *row_cells(runs, task))
+            made.row(f"{scene}, {size}", method_cell(runs[0]["settings"]), *row_cells(runs, task))
         for row in published_rows(scene, size):
             made.row(f"{scene}, {size}", row["method"], *row_cells([row], task))
     if task == "relight":

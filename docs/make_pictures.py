@@ -4,8 +4,8 @@
     python docs/make_pictures.py RUN_DIR docs/pictures/solids.png 4 256
     python docs/make_pictures.py RUN_DIR docs/pictures/smoke_fire.png 6 192
 
-    neuprim run task=relight scene=lit_solids train.iterations=4000 output_dir=RUN_DIR
-    python docs/make_pictures.py RUN_DIR docs/pictures/lit_solids.png 6 160
+    python benchmarks/quality.py DIR/pt_bunny --seconds 120
+    python docs/make_pictures.py outputs/quality/pt_bunny-120s-0 docs/pictures/relight.png 5 240
 
 Arguments: RUN_DIR TARGET [VIEWS] [SIDE].
 VIEWS pictures of the run (4), each SIDE pixels wide (as rendered). A run with films shows its first held-out camera

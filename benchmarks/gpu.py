@@ -1,7 +1,7 @@
 """The CUDA backend on a GPU: parity with the float64 reference, times, frames per second, peak memory.
 
-    python benchmarks/gpu.py [--parts parity times kernels train] [--scenes 5000 20000 100000 300000 1000000]
-        [--sizes 800x800 1920x1080] [--chair DIR] [--fire DIR] [--trained chair fire lit_solids] [--record]
+    python benchmarks/gpu.py [--parts parity times kernels train runs] [--scenes 5000 20000 100000 300000 1000000]
+        [--sizes 800x800 1920x1080] [--chair DIR] [--fire DIR] [--mic DIR] [--trained chair fire lit_solids] [--record]
     python benchmarks/gpu.py --print [--docs]
 
     parity    images and all gradients of small scenes (thin, deep, around the camera) for several forms against the
@@ -12,6 +12,7 @@
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
     train     preset quick of each task with its usual steps on the GPU: ms a step of the second half, PSNR on the test
               views
+    runs      the static preset on NeRF-synthetic mic at 800x800 (--mic) for 60 and 140 seconds
 
 --record writes benchmarks/results/gpu/DEVICE.json and the tables of docs/gpu.md, in which every recorded device has its
 own; --print makes them from what is recorded. Times are absolute, of the device named there.
@@ -38,11 +39,14 @@ from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.runs.fit import train_to_end
+from neuprim.config import compose
+from neuprim.runs.fit import prepare_training, train_to_end
 
 FOLDER, PAGE = RESULTS / "gpu", DOCS / "gpu.md"
 FORMS = {"K=8 p=0": (8, 0), "K=2 p=2": (2, 2), "K=0 p=2": (0, 2)}
-PARTS = ("parity", "times", "kernels", "train")
+PARTS = ("parity", "times", "kernels", "train", "runs")
+RUNS = ((60, 25_000), (140, 30_000))
+"""Seconds and primitives."""
 STEPS = {"chair": 2500, "fire": 4000, "smoke_fire": 4000, "lit_solids": 2600}
 """Those of the recorded rows of the other benchmarks."""
 
@@ -174,6 +178,16 @@ def measure_training(names: Sequence[str], folders: Mapping[str, Any]) -> Iterat
         }
 
 
+def measure_runs(folder: Path) -> Iterator[Record]:
+    for seconds, count in RUNS:
+        words = ["task=static", "scene=blender", f"scene.path='{folder}'", f"model.primitives={count}"]
+        words += ["train.iterations=null", f"train.max_seconds={seconds}", "train.eval_every=0", "renderer.device=cuda"]
+        fitted = train_to_end(prepare_training(compose(words, check_output=False)))
+        metrics = fitted.metrics()
+        keys = ("primitives", "model_bytes", "iterations", "psnr", "ssim_3dgs")
+        yield {"scene": folder.name, "seconds": seconds, **{key: metrics[key] for key in keys}}
+
+
 # ---------------------------------------------------------------- tables
 
 
@@ -209,6 +223,15 @@ COLUMNS: dict[str, Columns] = {
         "ms a step": lambda row: f"{row['step_ms']:.2f}",
         "PSNR, dB": lambda row: f"{row['psnr']:.2f} ({row['of']})",
     },
+    "runs": {
+        "scene": lambda row: row["scene"],
+        "training": lambda row: f"{row['seconds']} s",
+        "primitives": lambda row: f"{row['primitives']:,}",
+        "bytes": lambda row: f"{row['model_bytes']:,}",
+        "steps": lambda row: f"{row['iterations']:,}",
+        "PSNR": lambda row: f"{row['psnr']:.2f}",
+        "SSIM (3DGS)": lambda row: f"{row['ssim_3dgs']:.4f}",
+    },
 }
 
 
@@ -231,7 +254,7 @@ def make_tables(records: Sequence[Record]) -> dict[str, str]:
     texts = {part: tables(part, columns) for part, columns in COLUMNS.items()}
     if first := tables("times_before", COLUMNS["times"]):
         texts["times"] += f"\n\nThe first version that ran there, up to a million primitives:\n\n{first}"
-    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-training": "train"}
+    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-training": "train", "gpu-runs": "runs"}
     return {marker: texts[part] for marker, part in markers.items() if texts[part]}
 
 
@@ -240,6 +263,7 @@ def main() -> None:
     parser.add_argument("--parts", nargs="*", default=PARTS, choices=PARTS)
     parser.add_argument("--scenes", nargs="*", type=int, default=[5_000, 20_000, 100_000, 300_000, 1_000_000])
     parser.add_argument("--sizes", nargs="*", default=["800x800", "1920x1080"])
+    parser.add_argument("--mic", type=Path, help="NeRF-synthetic mic at 800x800")
     parser.add_argument("--device", default="cuda", choices=("cuda", "cpu"), help="of the part parity")
     parser.add_argument("--trained", nargs="*", default=["chair", "fire", "lit_solids"], choices=list(STEPS))
     args = parser.parse_args()
@@ -252,7 +276,10 @@ def main() -> None:
             "times": lambda: list(measure_times(args.scenes, sizes)),
             "kernels": lambda: measure_kernels(max((c for c in args.scenes if c <= 100_000), default=5000), *sizes[0]),
             "train": lambda: list(measure_training(args.trained, vars(args))),
+            "runs": lambda: list(measure_runs(args.mic)),
         }
+        if "runs" in args.parts and args.mic is None:
+            parser.error("the part runs wants --mic DIR")
         if "train" in args.parts:
             require_folders(parser, args, args.trained)
         for part in args.parts:

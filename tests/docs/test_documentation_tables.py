@@ -87,7 +87,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     ),
     **{
         name: ("docs/gpu.md", "gpu", lambda s, name=name: s.make_tables(s.read_records())[name])
-        for name in ("gpu-parity", "gpu-times", "gpu-training")
+        for name in ("gpu-parity", "gpu-times", "gpu-training", "gpu-runs")
     },
     "ranks": ("docs/scaling.md", "ranks", lambda s: s.pace_table(record_of(s))),
     "larger-steps": ("docs/scaling.md", "ranks", lambda s: s.steps_table(record_of(s)["larger steps"])),

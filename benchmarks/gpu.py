@@ -34,12 +34,12 @@ from shared.scenes import lower, random_scene, view
 from shared.tables import DOCS, RESULTS, Columns, Record, Run, between_markers, make_table, read_record, update_record
 from shared.trials import Trial, begin
 
+from neuprim.config import compose
 from neuprim.core.cameras import Camera
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
-from neuprim.config import compose
 from neuprim.runs.fit import prepare_training, train_to_end
 
 FOLDER, PAGE = RESULTS / "gpu", DOCS / "gpu.md"

@@ -68,7 +68,10 @@ SMALL_IMAGES = {"solids": "scene.size=64", "chair": "scene.downsample=4"}
 
 
 def words_of(form: str, scene: str, args: argparse.Namespace, count: int) -> tuple[str, ...]:
-    own = SCENES[scene].all_words(vars(args), scene)
+    own = [
+        *SCENES[scene].all_words(vars(args), scene),
+        *(["model.colour.form=additive"] if scene == "lit_solids" else []),
+    ]
     return (*own, *AS_RECORDED, *Form.named(form).words, f"model.primitives={count}")
 
 

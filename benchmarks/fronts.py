@@ -61,7 +61,7 @@ SCENES = {
     ),
     "lit_solids": Scene(
         "relight: lit_solids (generated), 128×128",
-        ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=6000"),
+        ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=6000", "model.colour.form=additive"),
         ("model.primitives", "model.colour.visibility"),
         "40m",
     ),

@@ -69,7 +69,7 @@ class Scene:
 _SOLIDS = ("task=static", "scene=solids", "scene.size=64", "train.iterations=3000")
 _CHAIR = ("task=static", "scene=blender", "train.iterations=2500")
 _FIRE = ("task=dynamic", "scene=vdb", "scene.size=64", "train.iterations=4000")
-_LIT = ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=3000")
+_LIT = ("task=relight", "scene=lit_solids", "scene.size=128", "train.iterations=3000", "model.colour.form=additive")
 SCENES = {
     "solids": Scene(_SOLIDS, (40, 80, 160, 320), ("", "model.colour.lobes=1"), (26.0, 28.0), 90.0, 400),
     "chair": Scene(_CHAIR, (200, 400, 800, 1600), ("", "model.colour.lobes=1"), (33.0,), 240.0, 2800),

@@ -184,9 +184,9 @@ def row_cells(runs: Sequence[Run], task: str = "static") -> list[str]:
     return [budget, *sizes, *scores, mean("frame_ms", "{:.1f}")]
 
 
-def method_cell(settings: str) -> str:
-    """Of own rows: the settings of the model, where there are any, else all."""
-    own = [word for word in settings.split() if word.startswith("model.")]
+def method_cell(settings: str, task: str) -> str:
+    """Of own rows: the settings; of relighting those of the model, as a network trains with many of its own."""
+    own = [word for word in settings.split() if word.startswith("model.")] if task == "relight" else []
     return f"neuprim, `{' '.join(own) or settings}`" if settings else "neuprim"
 
 
@@ -196,7 +196,7 @@ def table(record: Record) -> str:
     made = Table(*COLUMNS, *(title for title, _ in SCORES[task].values()), "ms a frame")
     for scene, size, rows in group_rows(record["trials"]):
         for runs in rows:
-            made.row(f"{scene}, {size}", method_cell(runs[0]["settings"]), *row_cells(runs, task))
+            made.row(f"{scene}, {size}", method_cell(runs[0]["settings"], task), *row_cells(runs, task))
         for row in published_rows(scene, size):
             made.row(f"{scene}, {size}", row["method"], *row_cells([row], task))
     if task == "relight":

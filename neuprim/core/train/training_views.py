@@ -34,7 +34,7 @@ _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
-_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [1e-3] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
+_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [3e-4] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
 """Of the numbers of each kind, at the start: of a pose in radians and units of length, the view's step of Adam each."""
 
 

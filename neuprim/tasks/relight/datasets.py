@@ -71,8 +71,8 @@ class OlatSettings(FolderSettings):
     # what of the training views is known only roughly, and learned with the model: lights (with their intensities),
     # cameras
     refine: list[Literal["light", "camera"]] = field(default_factory=list)
-    # images are divided by this; "auto": by the 99.5th percentile of the training images
-    exposure: Annotated[float, Range(above=0)] | Literal["auto"] = 1.0
+    # images are divided by this, None by 1; "auto": by the 99.5th percentile of the training images
+    exposure: Annotated[float, Range(above=0)] | Literal["auto"] | None = None
     ignore_corrections: bool = False  # poses are transform_matrix, even where a frame has the optimised R_opt and T_opt
 
 
@@ -92,7 +92,7 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         to_linear=True,
         exposure=(lambda views: olat_percentile_exposure(views, str(folder)))
         if options.exposure == "auto"
-        else options.exposure,
+        else options.exposure or 1.0,
         positions=("light",),
     )
     dataset = assemble_dataset(str(folder), folder.resolve().name, train, test, options, context, details)

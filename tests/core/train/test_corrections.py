@@ -69,7 +69,7 @@ def test_cameras_are_found() -> None:
     first = tiny.trainer(exact, 400)
     list(first.run())
     rough = with_moved_cameras(exact)
-    second = tiny.trainer(rough, 240, rates=fixed(first), final_rate=0.05)
+    second = tiny.trainer(rough, 900, rates=fixed(first), final_rate=0.05)
     second.model.params = {name: value.detach().clone().requires_grad_() for name, value in first.model.params.items()}
     list(second.run())
     points = 0.3 * torch.randn(50, 3, generator=torch.Generator().manual_seed(0))

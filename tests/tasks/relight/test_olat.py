@@ -15,6 +15,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.config import compose
 from neuprim.core.data import Dataset
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import srgb_to_linear, write_png
@@ -266,6 +267,12 @@ def test_images_say_how_light_weakens(
     dataset: Any = SimpleNamespace(center=torch.ones(3), train=Views(), name=f"{count} {range_of_distances}")
     with nullcontext() if told else pytest.warns(match="do not say whether light weakens"):
         assert measure_falloff(dataset) == falloff
+
+
+def test_exposures_may_be_typed(folder: Path) -> None:
+    for text, value in (("auto", "auto"), ("2.5", 2.5)):
+        words = ["task=relight", "scene=olat", f"scene.path='{folder}'", f"scene.exposure={text}"]
+        assert compose(words, check_output=False).scene["exposure"] == value
 
 
 def test_starting_points_and_orbit(folder: Path, context: SceneContext) -> None:

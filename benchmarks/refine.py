@@ -1,0 +1,104 @@
+"""How much `scene.refine` wins back where lights or cameras of a relighting capture are only roughly known.
+
+    python benchmarks/refine.py DIR [--steps 5000] [--jobs 1] [--docs] [--print]
+
+DIR holds a data set in the layout of `scene=olat`. Of its training views cameras are shifted, or lights are shifted and
+their intensities multiplied, by normal noise of a root mean square given in percent of their distance from the origin;
+the test views stay as they are and judge. One seed, one thread, 6,000 primitives. Results go to
+benchmarks/results/refine.json after every run, and only what is missing is run; --docs puts the table between the
+markers of docs/capture.md, --print runs nothing.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from shared.arguments import make_parser
+from shared.tables import DOCS, RESULTS, Record, Table, between_markers, read_record
+from shared.trials import Trial, run_all
+
+RECORD = RESULTS / "refine.json"
+CASES = (("camera", 0.5), ("camera", 2.0), ("light", 2.0))
+"""What is moved, and by how many percent."""
+KEYS = ("psnr_linear_clamped", "psnr_display", "ssim_display")
+
+
+def write_perturbed(source: Path, target: Path, moved: str, percent: float) -> Path:
+    """The data set with links to its images and other training views."""
+    target.mkdir()
+    for folder in source.iterdir():
+        if folder.is_dir():
+            (target / folder.name).symlink_to(folder, target_is_directory=True)
+    (target / "transforms_test.json").write_bytes((source / "transforms_test.json").read_bytes())
+    document, random = json.loads((source / "transforms_train.json").read_bytes()), np.random.default_rng(0)
+
+    def shift(place: Any) -> Any:
+        return place + percent / 100 / math.sqrt(3) * np.linalg.norm(place) * random.standard_normal(3)
+
+    for frame in document["frames"]:
+        if moved == "camera":
+            pose = np.array(frame["transform_matrix"])
+            pose[:3, 3] = shift(pose[:3, 3])
+            frame["transform_matrix"] = pose.tolist()
+        else:
+            frame["pl_pos"] = shift(np.array(frame["pl_pos"])).tolist()
+            strength = np.array(frame.get("pl_intensity", 1.0)) * math.exp(percent / 100 * random.standard_normal())
+            frame["pl_intensity"] = strength.tolist()
+    (target / "transforms_train.json").write_text(json.dumps(document), encoding="utf-8")
+    return target
+
+
+def plan(source: Path, work: Path, steps: int) -> list[Trial]:
+    def trial(folder: Path, name: str, moved: str, percent: float, refined: bool) -> Trial:
+        words = ["task=relight", "scene=olat", f"scene.path='{folder}'", "model.primitives=6000"]
+        words += [f"scene.refine=[{moved}]"] if refined else []
+        facts = (("moved", moved), ("percent", percent), ("refined", refined))
+        return Trial(name, tuple(words), steps, 0, 0, facts, interventions=None)
+
+    trials = [trial(source, "exact", "", 0.0, False)]
+    for moved, percent in CASES:
+        folder = write_perturbed(source, work / f"{moved}-{percent:g}", moved, percent)
+        trials += [
+            trial(folder, f"{moved}-{percent:g}-{refined}", moved, percent, refined) for refined in (False, True)
+        ]
+    return trials
+
+
+def table(record: Record) -> str:
+    """A row per case."""
+    runs = {(run["moved"], run["percent"], run["refined"]): run for run in record["trials"]}
+    made, exact = Table("training views", "as they are", "refined", "exact"), runs["", 0.0, False]
+
+    def cell(run: Record) -> str:
+        return f"{run['psnr_linear_clamped']:.2f} dB, {run['psnr_display']:.2f} dB"
+
+    for moved, percent in CASES:
+        made.row(
+            f"{moved}s off by {percent:g} %", *(cell(runs[moved, percent, on]) for on in (False, True)), cell(exact)
+        )
+    steps = f"{exact['iterations']:,}"
+    return f"{made}\n\nPSNR of linear light and of display values, test views of `pt_bunny`, {steps} steps, one seed."
+
+
+def main() -> None:
+    parser = make_parser(__doc__, "--jobs", "--docs", "--print")
+    parser.add_argument("folder", type=Path, nargs="?", metavar="DIR", help="a data set")
+    parser.add_argument("--steps", type=int, default=5000)
+    args = parser.parse_args()
+    if not args.only_print:
+        if args.folder is None:
+            parser.error("found no DIR; expected the folder of a data set")
+        with tempfile.TemporaryDirectory() as work:
+            run_all(plan(args.folder.resolve(), Path(work), args.steps), RECORD, KEYS, args.jobs)
+    text = table(read_record(RECORD))
+    if args.docs:
+        between_markers(DOCS / "capture.md", "refine", text)
+
+
+if __name__ == "__main__":
+    main()

@@ -233,6 +233,8 @@ def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iter
     if trainer.settings.population.strategy == "relocate" and count < wanted:
         why = "too few interventions of the population, or places with an error, to split for the others"
         events(Note(f"{count:,} primitives of model.primitives={wanted:,}: {why}; see train.population.every"))
+    if trainer.corrections is not None and trainer.rank == 0:
+        events(Note(trainer.corrections.summary()))
 
 
 def _next_run_curve_progress(trainer: Trainer) -> float:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Callable, Mapping
 from contextlib import nullcontext
 from pathlib import Path
@@ -20,6 +21,7 @@ from neuprim.core.data import Dataset
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import srgb_to_linear, write_png
 from neuprim.core.task import SceneContext
+from neuprim.runs.fit import Note, prepare_training, train_to_end
 from neuprim.tasks import relight
 from neuprim.tasks.relight.datasets import load_olat as load
 from neuprim.tasks.relight.lighting import dataset_lighting, measure_falloff
@@ -344,3 +346,16 @@ def test_darkness_has_no_exposure(folder: Path, context: SceneContext, scenes: A
     for png in (folder / "test").glob("*.png"):
         write_png(png, straight(0)[..., :3])
     scenes.refused(load, {"path": str(folder), "exposure": "auto"}, context, str(folder), "99.5 %", "scene.exposure")
+
+
+def test_corrections_of_lights_and_cameras(folder: Path, tmp_path: Path) -> None:
+    """A short run, from the command line's words to the line that says how far they went."""
+    words = ["task=relight", "scene=olat", f"scene.path='{folder}'", "scene.refine=[light,camera]"]
+    words += ["model.primitives=20", "train.iterations=9", f"output_dir='{tmp_path / 'run'}'"]
+    said: list[str] = []
+    fitted = prepare_training(compose(words))
+    train_to_end(fitted, lambda event: said.append(event.text) if isinstance(event, Note) else None)
+    assert fitted.dataset.refine == {"light": "offset", "light_intensity": "factor", "camera": "pose"}
+    (line,) = [text for text in said if text.startswith("corrections of training views")]
+    assert re.search(r"light [\d.e-]+, light_intensity [\d.]+%, camera [\d.e-]+ degrees and [\d.e-]+$", line), line
+    assert fitted.trainer.corrections is not None and float(fitted.trainer.corrections.numbers.abs().max()) > 1e-4

@@ -1,12 +1,13 @@
-"""How much `scene.refine` wins back where lights or cameras of a relighting capture are only roughly known.
+"""Captures for relighting: how many photographs, and how much `scene.refine` wins back where lights or cameras are only
+roughly known.
 
-    python benchmarks/refine.py DIR [--steps 5000] [--jobs 1] [--docs] [--print]
+    python benchmarks/capture.py DIR [--steps 5000] [--jobs 1] [--docs] [--print]
 
-DIR holds a data set in the layout of `scene=olat`. Of its training views cameras are shifted, or lights are shifted and
-their intensities multiplied, by normal noise of a root mean square given in percent of their distance from the origin;
-the test views stay as they are and judge. One seed, one thread, 6,000 primitives. Results go to
-benchmarks/results/refine.json after every run, and only what is missing is run; --docs puts the table between the
-markers of docs/capture.md, --print runs nothing.
+DIR holds a data set in the layout of `scene=olat`, of which the first COUNTS training views are used, or all; then
+cameras are shifted, or lights are shifted and their intensities multiplied, by normal noise of a root mean square given
+in percent of their distance from the origin; the test views stay as they are and judge. One seed, one thread, 6,000
+primitives. Results go to benchmarks/results/capture.json after every run, and only what is missing is run; --docs puts
+the tables between the markers of docs/capture.md, --print runs nothing.
 """
 
 from __future__ import annotations
@@ -22,14 +23,15 @@ from shared.arguments import make_parser
 from shared.tables import DOCS, RESULTS, Record, Table, between_markers, read_record
 from shared.trials import Trial, run_all
 
-RECORD = RESULTS / "refine.json"
+RECORD = RESULTS / "capture.json"
+COUNTS = (30, 60, 120)
 CASES = (("camera", 0.5), ("camera", 2.0), ("light", 2.0))
 """What is moved, and by how many percent."""
 KEYS = ("psnr_linear_clamped", "psnr_display", "ssim_display")
 
 
-def write_perturbed(source: Path, target: Path, moved: str, percent: float) -> Path:
-    """The data set with links to its images and other training views."""
+def write_changed(source: Path, target: Path, moved: str, percent: float, count: int | None = None) -> Path:
+    """The data set with links to its images and other training views, the first ``count``."""
     target.mkdir()
     for folder in source.iterdir():
         if folder.is_dir():
@@ -40,7 +42,8 @@ def write_perturbed(source: Path, target: Path, moved: str, percent: float) -> P
     def shift(place: Any) -> Any:
         return place + percent / 100 / math.sqrt(3) * np.linalg.norm(place) * random.standard_normal(3)
 
-    for frame in document["frames"]:
+    document["frames"] = document["frames"][:count]
+    for frame in document["frames"] if moved else ():
         if moved == "camera":
             pose = np.array(frame["transform_matrix"])
             pose[:3, 3] = shift(pose[:3, 3])
@@ -61,18 +64,22 @@ def plan(source: Path, work: Path, steps: int) -> list[Trial]:
         return Trial(name, tuple(words), steps, 0, 0, facts, interventions=None)
 
     trials = [trial(source, "exact", "", 0.0, False)]
+    for count in COUNTS:
+        folder = write_changed(source, work / f"{count}", "", 0.0, count)
+        trials.append(trial(folder, f"{count}-views", f"{count} views", 0.0, False))
     for moved, percent in CASES:
-        folder = write_perturbed(source, work / f"{moved}-{percent:g}", moved, percent)
+        folder = write_changed(source, work / f"{moved}-{percent:g}", moved, percent)
         trials += [
             trial(folder, f"{moved}-{percent:g}-{refined}", moved, percent, refined) for refined in (False, True)
         ]
     return trials
 
 
-def table(record: Record) -> str:
-    """A row per case."""
+def tables(record: Record) -> str:
+    """By the number of photographs, and by what is known roughly."""
     runs = {(run["moved"], run["percent"], run["refined"]): run for run in record["trials"]}
-    made, exact = Table("training views", "as they are", "refined", "exact"), runs["", 0.0, False]
+    exact, counted = runs["", 0.0, False], Table("training views", *map(str, COUNTS), "all")
+    made = Table("training views", "as they are", "refined", "exact")
 
     def cell(run: Record) -> str:
         return f"{run['psnr_linear_clamped']:.2f} dB, {run['psnr_display']:.2f} dB"
@@ -82,7 +89,7 @@ def table(record: Record) -> str:
             f"{moved}s off by {percent:g} %", *(cell(runs[moved, percent, on]) for on in (False, True)), cell(exact)
         )
     steps = f"{exact['iterations']:,}"
-    return f"{made}\n\nPSNR of linear light and of display values, test views of `pt_bunny`, {steps} steps, one seed."
+    return f"{counted}\n\n{made}\n\nTest views of `pt_bunny`, {steps} steps, one seed."
 
 
 def main() -> None:
@@ -95,9 +102,9 @@ def main() -> None:
             parser.error("found no DIR; expected the folder of a data set")
         with tempfile.TemporaryDirectory() as work:
             run_all(plan(args.folder.resolve(), Path(work), args.steps), RECORD, KEYS, args.jobs)
-    text = table(read_record(RECORD))
+    text = tables(read_record(RECORD))
     if args.docs:
-        between_markers(DOCS / "capture.md", "refine", text)
+        between_markers(DOCS / "capture.md", "capture", text)
 
 
 if __name__ == "__main__":

@@ -101,7 +101,8 @@ def test_a_losss_options_belong_to_task_options_while_it_is_chosen(
     [
         ("task=toy model.sh_degree=2", "model.sh_degree: task 'toy'{}; it uses model.neurons"),
         ("task=toy model={sh_every:0}", "model.sh_every: task 'toy'{}; it uses model.neurons"),
-        ("task=relight train.ssim_weight=0.5", "train.ssim_weight: task 'relight'{}; it uses model.neurons"),
+        ("task=relight train.ssim_weight=0.5", "train.ssim_weight: loss 'compressed'{}"),
+        ("task=relight train.loss=null train.ssim_weight=0.5", "train.ssim_weight: task 'relight'{}; it uses model"),
         ("task=static train.loss=l1 train.ssim_weight=0.5", "train.ssim_weight: loss 'l1'{}"),
     ],
 )

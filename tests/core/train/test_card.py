@@ -29,9 +29,11 @@ from tests.tasks.dynamic.sequences import blob
 
 LIT = "task=relight scene=lit_solids scene.size=24 scene.train_views=6 scene.test_views=2 scene.supersampling=1".split()
 SMALL = ["model.primitives=80", "model.neurons=2", "train.max_seconds=null"]
+NETWORK = ["model.colour.form=additive", "model.colour.hidden=3", "train.loss=l1", "train.rates.c_dc=5e-3"]
 TASKS = {
-    "lights": [*LIT, *SMALL, "model.colour.hidden=3"],
-    "shadows per pixel": [*LIT, *SMALL, "model.colour.hidden=3", "model.colour.visibility=pixel"],
+    "lights": [*LIT, *SMALL],
+    "network": [*LIT, *SMALL, *NETWORK],
+    "shadows per pixel": [*LIT, *SMALL, *NETWORK, "model.colour.visibility=pixel"],
 }
 
 
@@ -56,7 +58,7 @@ def trained(words: list[str], dataset: Dataset | None, steps: int) -> tuple[Fitt
     return fitted, [fitted.trainer.train_step() for _ in range(steps)]
 
 
-@pytest.mark.parametrize("task", ["static", "lights", "shadows per pixel", "time"])
+@pytest.mark.parametrize("task", ["static", "lights", "network", "shadows per pixel", "time"])
 def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Steps with interventions in the population, and looks at voxels. Bit for bit what the twins compute on the
     processor, and but for rounding what its own kernels do: training multiplies that, as Adam's first steps are as long

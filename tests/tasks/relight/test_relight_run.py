@@ -20,7 +20,7 @@ from tests.reports import offered
 SCENE = (
     "task=relight scene=lit_solids scene.size=32 scene.train_views=24 scene.test_views=6 scene.supersampling=1".split()
 )
-SMALL = ["model.primitives=150", "model.neurons=2", "model.colour.hidden=3", "train.max_seconds=null"]
+SMALL = ["model.primitives=150", "model.neurons=2", "train.max_seconds=null"]
 
 
 @pytest.fixture(scope="module")

@@ -79,9 +79,9 @@ else:
 SMALL = ["model.primitives=80", "model.neurons=2", "train.max_seconds=null", "train.iterations=12"]
 SCENES = {
     "dynamic": "scene=smoke_fire scene.size=16 scene.cameras=4 scene.timesteps=2 scene.resolution=16",
-    "relight": "scene=lit_solids scene.size=24 scene.train_views=3 scene.test_views=1 scene.supersampling=1 "
-    "model.colour.hidden=3",
+    "relight": "scene=lit_solids scene.size=24 scene.train_views=3 scene.test_views=1 scene.supersampling=1",
 }
+SCENES["network"] = f"{SCENES['relight']} model.colour.form=additive model.colour.hidden=3"
 
 
 @pytest.mark.parametrize("task", ["static", *SCENES])
@@ -90,7 +90,12 @@ def test_first_gradients_are_the_cpu_backends(task: str, tmp_path: Path) -> None
     if task == "static":
         config = words(tiny.write_blender(tmp_path / "two"), tmp_path / "run", 12)
     else:
-        config = [f"task={task}", *SCENES[task].split(), *SMALL, f"output_dir='{tmp_path / 'run'}'"]
+        config = [
+            f"task={'relight' if task == 'network' else task}",
+            *SCENES[task].split(),
+            *SMALL,
+            f"output_dir='{tmp_path / 'run'}'",
+        ]
     one = prepare_training(compose([*config, "renderer.backend=cpu"]))
     other = prepare_training(compose([*config, "renderer.backend=cuda", "renderer.device=cpu"]), dataset=one.dataset)
     reports = [x.trainer.train_step() for x in (one, other)]

@@ -78,16 +78,19 @@ def plan(source: Path, work: Path, steps: int) -> list[Trial]:
 def tables(record: Record) -> str:
     """By the number of photographs, and by what is known roughly."""
     runs = {(run["moved"], run["percent"], run["refined"]): run for run in record["trials"]}
-    exact, counted = runs["", 0.0, False], Table("training views", *map(str, COUNTS), "all")
-    made = Table("training views", "as they are", "refined", "exact")
+    exact = runs["", 0.0, False]
 
     def cell(run: Record) -> str:
         return f"{run['psnr_linear_clamped']:.2f} dB, {run['psnr_display']:.2f} dB"
 
+    counted = Table("training views", *map(str, COUNTS), "all")
+    counted.row(
+        "PSNR, linear and display", *(cell(runs[f"{count} views", 0.0, False]) for count in COUNTS), cell(exact)
+    )
+    made = Table("training views", "as they are", "refined", "exact")
     for moved, percent in CASES:
-        made.row(
-            f"{moved}s off by {percent:g} %", *(cell(runs[moved, percent, on]) for on in (False, True)), cell(exact)
-        )
+        own = [runs[moved, percent, refined] for refined in (False, True)]
+        made.row(f"{moved}s off by {percent:g} %", *map(cell, [*own, exact]))
     steps = f"{exact['iterations']:,}"
     return f"{counted}\n\n{made}\n\nTest views of `pt_bunny`, {steps} steps, one seed."
 

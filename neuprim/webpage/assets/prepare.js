@@ -125,7 +125,9 @@ function preparer(page, tensors, density, colour) {
   function extentTowards(i, point) {
     for (let a = 0; a < 3; a++) place[a] = point[a] - scene[3 * i + a];
     lib.unit(place);
-    return 2 * unit[i] * Math.hypot(...[0, 1, 2].map(a => whitened(i, a, ...place)));
+    const [x, y, z] = place;
+    const a = whitened(i, 0, x, y, z), b = whitened(i, 1, x, y, z), c = whitened(i, 2, x, y, z);
+    return 2 * unit[i] * Math.sqrt(a * a + b * b + c * c);
   }
 
   // Which primitives live under these conditions, ascending, and in `scene` where they are.

@@ -39,7 +39,7 @@ function lightCamera(scene, scales, living, light, { size, layers }) {
   return { R, t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, diameter: 2 * radius };
 }
 
-// Visibility of the point (x, y, z), behind which light fades over `fade` scene units; maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
+// Visibility of the point (x, y, z); light fades over `fade` scene units behind a depth image. maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
 function arrivingAt(px, py, pz, camera, maps, fade) {
   const { R, t, fx, width: size, near } = camera;
   const x = R[0] * px + R[1] * py + R[2] * pz + t[0], y = R[3] * px + R[4] * py + R[5] * pz + t[1], z = R[6] * px + R[7] * py + R[8] * pz + t[2];

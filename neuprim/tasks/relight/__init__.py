@@ -41,32 +41,37 @@ from neuprim.tasks.relight.lighting import (
 )
 from neuprim.tasks.relight.surface import INDIRECT, SurfaceColour
 
-_SETTINGS: dict[str, tuple[Any, ...] | type] = {
-    "form": (*FORMS, "surface", "harmonics"),
-    "hidden": int,
-    "lobes": int,
-    "indirect": int,
-    "visibility": VISIBILITY,
-    "boost": float,
-    "degree": int,
+_NETWORK = {"hidden": 8, "visibility": "primitive", "boost": 5.0}
+_OF_FORM: dict[str, dict[str, Any]] = {
+    "surface": {"lobes": 2, "indirect": 4, "visibility": "primitive"},
+    **dict.fromkeys(FORMS, _NETWORK),
+    "harmonics": {"degree": 5},
 }
+"""Settings of each form of colour, with what they are where model.colour does not say."""
 
 
 def _light_colour_field(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
-    chosen = {"form": "additive", "degree": 5, "lobes": 2, "indirect": 4, **model["colour"]}
-    surface = {name: chosen.pop(name) for name in ("lobes", "indirect")}
-    degree = chosen.pop("degree")
-    if chosen["form"] == "harmonics":
-        return LightHarmonics(degree, falloff=falloff, typical=typical)
-    if chosen["form"] == "surface":
-        visibility = chosen.get("visibility", "primitive")
-        return SurfaceColour(**surface, visibility=visibility, falloff=falloff, typical=typical)
-    return LightNetwork(falloff=falloff, typical=typical, **chosen)
+    form = model["colour"].get("form", "additive")
+    chosen = {**_OF_FORM[form], **model["colour"], "form": form, "falloff": falloff, "typical": typical}
+    if form in FORMS:
+        return LightNetwork(**chosen)
+    del chosen["form"]
+    return SurfaceColour(**chosen) if form == "surface" else LightHarmonics(**chosen)
 
 
 def _check_relight_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", DENSITY_OPTIONS)
-    validate_choices(model["colour"], "model.colour", _SETTINGS)
+    colour = model["colour"]
+    types: dict[str, tuple[Any, ...] | type] = {"hidden": int, "lobes": int, "indirect": int, "degree": int}
+    validate_choices(
+        colour, "model.colour", {"form": tuple(_OF_FORM), "visibility": VISIBILITY, "boost": float, **types}
+    )
+    form = colour.get("form", "additive")
+    for key in colour:
+        if key != "form" and key not in _OF_FORM[form]:
+            owners = " or ".join(name for name, own in _OF_FORM.items() if key in own)
+            expected = f"model.colour.form={owners} with it, or none"
+            raise ConfigError(f"model.colour.{key}={colour[key]}: not a setting of form={form}; expected {expected}")
     try:
         _light_colour_field(model)
     except ValueError as error:

@@ -86,6 +86,8 @@ class ParameterSpec:
         lr_unit: what rates are multiplied by: "absolute", nothing; "extent", the data set's
             :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the start.
             ``train.rate_units.NAME`` overrides it.
+        low: least value that training leaves. Where a model takes max(0, value), a value below 0 gets no gradient and
+            stays there; with 0 it can rise again.
     """
 
     name: str
@@ -93,6 +95,7 @@ class ParameterSpec:
     lr: float
     init: Callable[[InitContext], Tensor]
     lr_unit: RateUnit = "absolute"
+    low: float = -math.inf
 
     @property
     def fixed(self) -> bool:

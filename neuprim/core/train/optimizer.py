@@ -6,6 +6,7 @@ take a first step 3.2 times its rate (method: "splitting exactly"), so bias corr
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -111,7 +112,7 @@ class RowAdam:
         self.age = torch.zeros(params["means"].shape[0], dtype=torch.int64, device=params["means"].device)
 
     def step(self, params: dict[str, Tensor], rates: dict[str, float]) -> None:
-        """Update ``params`` in place from their ``.grad``.
+        """Update ``params`` in place from their ``.grad``, and lift them to the least values of their specs.
 
         Raises:
             NonFiniteError: a gradient is NaN or infinite; names parameter and primitive, and changes nothing.
@@ -124,12 +125,17 @@ class RowAdam:
                     _ParameterUpdate(name, params[name].detach(), grad, self.m[name], self.v[name], rates[name])
                 )
         float32 = all(update.value.dtype == torch.float32 for update in updates)
-        if updates and float32 and device.on_warp(self.age) and self._step_on_gpu(updates):
-            return
+        if not (updates and float32 and device.on_warp(self.age) and self._step_on_gpu(updates)):
+            self._step(updates, float32 and device.on_numba(self.age))
+        for spec in self.specs:
+            if spec.low > -math.inf:
+                params[spec.name].detach().clamp_(min=spec.low)
+
+    def _step(self, updates: list[_ParameterUpdate], fused: bool) -> None:
         if updates and not _all_gradients_finite([update.grad for update in updates]):
             raise NonFiniteError(_describe_bad_gradient(updates))
         self.age += 1
-        if float32 and device.on_numba(self.age):
+        if fused:
             self._step_on_cpu(updates)
             return
         for update in updates:

@@ -161,13 +161,13 @@ class SurfaceColour(ColourField):
     def parameters(self) -> list[ParameterSpec]:
         L, B, C = self.lobes, self.indirect, self.channels
         specs = [
-            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(DARKEST).float()),
+            ParameterSpec("c_dc", (C,), 1e-2, lambda c: c.colors.clamp_min(0).float(), low=0.0),
             ParameterSpec("normal", (3,), 1e-2, initial_normals),
         ]
         if L:
             sharpness = torch.tensor([math.log(_GLOSS) + j * math.log(6.0) for j in range(L)])
             specs += [
-                ParameterSpec("highlight", (L, C), 1e-2, lambda c: torch.full((c.count, L, C), _HIGHLIGHT)),
+                ParameterSpec("highlight", (L, C), 1e-2, lambda c: torch.full((c.count, L, C), _HIGHLIGHT), low=0.0),
                 ParameterSpec("log_gloss", (L,), 3e-2, lambda c: sharpness.expand(c.count, L).clone()),
             ]
         if B:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from neuprim.core.data import Dataset
+from neuprim.core.data.dataset import hold_out_views
 from neuprim.core.data.image_views import ImageViews
 from neuprim.core.task import SceneContext
 from neuprim.scenes import PIXEL_CLASSES
@@ -193,10 +194,12 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
     shown, rgb, free = [], [], []
     for i in range(len(forty.test)):
         pixels = forty.test.pixels(i)
-        assert pixels.alpha is not None and torch.equal(known.classes(i) == 0, pixels.alpha < 0.5)
-        shown.append(known.classes(i))
+        assert pixels.alpha is not None and torch.equal(known.classes(forty.test, i) == 0, pixels.alpha < 0.5)
+        shown.append(known.classes(forty.test, i))
         rgb.append(pixels.rgb)
-        free.append(known.baselines["no_cast_shadows"](i))
+        image = known.baselines["no_cast_shadows"](forty.test, i)
+        assert image is not None
+        free.append(image)
     kinds, seen, unshadowed = torch.stack(shown), torch.stack(rgb).mean(-1), torch.stack(free).mean(-1)
     assert bool((torch.stack(rgb) <= torch.stack(free) + 1e-3).all())
     by_class = {name: seen[kinds == value] for value, name in enumerate(PIXEL_CLASSES)}
@@ -205,6 +208,14 @@ def test_classes_agree_with_the_images(forty: Dataset) -> None:
     assert by_class["cast_shadow"].quantile(0.7) == 0  # hard shadows: only edges share a pixel with light
     assert by_class["attached_shadow"].mean() < 0.1 * by_class["lit"].mean() < 0.1 * by_class["highlight"].mean()
     assert by_class["highlight"].min() > 0.2
+
+
+def test_classes_and_baselines_follow_views_that_are_held_out(forty: Dataset) -> None:
+    held, known = hold_out_views(forty, 8), dataset_lighting(forty)
+    assert known.classes is not None
+    for i in range(len(held.test)):
+        assert torch.equal(known.classes(held.test, i) == 0, held.test.pixels(i).alpha < 0.5)  # type: ignore[operator]
+    assert set(relight.lighting_baseline_scores(held)) == {"black", "no_cast_shadows"}
 
 
 def test_baselines_rank_as_they_should(forty: Dataset) -> None:

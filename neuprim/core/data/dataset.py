@@ -110,6 +110,10 @@ class ViewSubset(ViewSet):
     def pixels(self, index: int) -> Pixels:
         return self._views.pixels(self._indices[index])
 
+    def source(self, index: int) -> tuple[ViewSet, int]:
+        """The set that has the view, and its index there."""
+        return self._views, self._indices[index]
+
 
 @dataclass(frozen=True)
 class PointCloud:

@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.data import Clip, Dataset, View
+from neuprim.core.data import Clip, Dataset, View, ViewSet
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.metrics import mean_metrics as mean_metrics
@@ -122,7 +122,7 @@ def relight_metrics(
     if part is not None:
         result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
     return (
-        result if known.classes is None else result | relight_pixel_class_errors(rendered, truth, known.classes(index))
+        result if known.classes is None else result | relight_pixel_class_errors(rendered, truth, known.classes(dataset.test, index))
     )
 
 
@@ -134,24 +134,27 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
     if not flip_available():
         result["flip_missing"] = "pip install 'neuprim[flip]'"
     if known.classes is not None:
-        result["class_percent"] = relight_pixel_class_shares([known.classes(i) for i in range(len(dataset.test))])
+        result["class_percent"] = relight_pixel_class_shares([known.classes(dataset.test, i) for i in range(len(dataset.test))])
     return result
 
 
 def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
     """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
 
-    def mean_of(guess: Callable[[int], Tensor] | None) -> dict[str, Any]:
+    def black(views: ViewSet, index: int) -> Tensor:
+        return torch.zeros_like(views.pixels(index).rgb)
+
+    found = {}
+    for name, guess in {"black": black, **dataset_lighting(dataset).baselines}.items():
         entries = []
         for i in range(len(dataset.test)):
-            truth = dataset.test.pixels(i).over(dataset.background)
-            image = torch.zeros_like(truth) if guess is None else guess(i)
-            entries.append(relight_metrics(dataset, i, image, truth, structure=False))
-        return mean_metrics(entries)
-
-    return {"black": mean_of(None)} | {
-        name: mean_of(guess) for name, guess in dataset_lighting(dataset).baselines.items()
-    }
+            image = guess(dataset.test, i)
+            if image is not None:
+                truth = dataset.test.pixels(i).over(dataset.background)
+                entries.append(relight_metrics(dataset, i, image, truth, structure=False))
+        if entries:
+            found[name] = mean_metrics(entries)
+    return found
 
 
 def relight_clips(dataset: Dataset) -> Sequence[Clip]:

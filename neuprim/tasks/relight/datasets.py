@@ -22,8 +22,8 @@ from PIL import Image
 from torch import Tensor
 
 from neuprim.core.cameras import Camera, opengl_to_viewmat
-from neuprim.core.data import Clip, Dataset
-from neuprim.core.data.dataset import Correction
+from neuprim.core.data import Clip, Dataset, ViewSet
+from neuprim.core.data.dataset import Correction, ViewSubset
 from neuprim.core.data.image_views import ImageFrame, ImageViews
 from neuprim.core.data.posed_images import (
     IMAGE_SUFFIXES,
@@ -225,18 +225,15 @@ def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneCo
 
 def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
     """Pixel classes, parts of the test split, two baselines without a model, and a film of the light going round."""
-    test = dataset.test
-    assert isinstance(test, ImageViews)  # as posed_images makes them
-    baselines = {"no_cast_shadows": partial(_read_lit_companion_image, test, "unshadowed.exr")}
-    if _lit_companion_path(test, "nearest.exr", 0).is_file():  # not where training views are held out
-        baselines[f"nearest_light_of_{NEAR_LIGHTS}"] = partial(_read_lit_companion_image, test, "nearest.exr")
+    names = {"no_cast_shadows": "unshadowed.exr", f"nearest_light_of_{NEAR_LIGHTS}": "nearest.exr"}
+    baselines = {name: partial(_read_lit_companion_image, ending) for name, ending in names.items()}
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))
     circle = ImageViews([image_frame_in_scene(f, dataset.world, ("light",)) for f in views], to_linear=True)
     film = Clip("light_round", range(len(circle)), 12.0, circle)
-    return Lighting("inverse_square", partial(read_lit_pixel_classes, test), PARTS, baselines, (film,))
+    return Lighting("inverse_square", read_lit_pixel_classes, PARTS, baselines, (film,))
 
 
-def read_lit_pixel_classes(views: ImageViews, index: int) -> Tensor:
+def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
     """(H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
     path = _lit_companion_path(views, "classes.png", index)
     try:
@@ -246,12 +243,15 @@ def read_lit_pixel_classes(views: ImageViews, index: int) -> Tensor:
         raise DataError(f"{path}: damaged ({error}); delete its folder to draw the scene again") from None
 
 
-def _read_lit_companion_image(views: ImageViews, ending: str, index: int) -> Tensor:
-    """(H, W, 3) a further image of a view, linear light over the exposure."""
-    camera = views.view(index).camera
-    return read_image(_lit_companion_path(views, ending, index), (camera.width, camera.height))[..., :3].float()
+def _read_lit_companion_image(ending: str, views: ViewSet, index: int) -> Tensor | None:
+    """(H, W, 3) a further image of a view, linear light over the exposure; training views lack the nearest light."""
+    camera, path = views.view(index).camera, _lit_companion_path(views, ending, index)
+    return read_image(path, (camera.width, camera.height))[..., :3].float() if path.is_file() else None
 
 
-def _lit_companion_path(views: ImageViews, ending: str, index: int) -> Path:
+def _lit_companion_path(views: ViewSet, ending: str, index: int) -> Path:
+    while isinstance(views, ViewSubset):
+        views, index = views.source(index)
+    assert isinstance(views, ImageViews)  # as posed_images makes them
     file = views.file(index)
     return file.with_name(f"{file.stem}_{ending}")

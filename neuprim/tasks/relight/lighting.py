@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.world import World
-from neuprim.core.data import Clip, Dataset
+from neuprim.core.data import Clip, Dataset, ViewSet
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.errors import ConfigError, DataError, warn_once
@@ -41,14 +41,14 @@ class Lighting:
     # "inverse_square" if images darken with the square of the light's distance, so that a renderer divides by it;
     # "none" if intensities are given as they arrive, or unknown
     falloff: Falloff = "none"
-    # index of a test view -> (H, W) uint8 pixel classes, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`; errors are
-    # then reported per class
-    classes: Callable[[int], Tensor] | None = None
+    # (views, index) -> (H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`; errors
+    # are then reported per class. The views may be a :class:`~neuprim.core.data.dataset.ViewSubset`
+    classes: Callable[[ViewSet, int], Tensor] | None = None
     # prefixes of names of test views that get scores of their own, e.g. those with a new light
     parts: tuple[str, ...] = ()
-    # name -> function of a test view's index that gives (H, W, 3) linear light over the exposure, an image without a
-    # model; a black one is always included
-    baselines: Mapping[str, Callable[[int], Tensor]] = field(default_factory=dict)
+    # name -> function of (views, index) that gives (H, W, 3) linear light over the exposure, an image without a model,
+    # or None for views that have none; a black one is always included
+    baselines: Mapping[str, Callable[[ViewSet, int], Tensor | None]] = field(default_factory=dict)
     clips: tuple[Clip, ...] = ()  # films besides the test views
 
 

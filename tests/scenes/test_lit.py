@@ -214,7 +214,8 @@ def test_classes_and_baselines_follow_views_that_are_held_out(forty: Dataset) ->
     held, known = hold_out_views(forty, 8), dataset_lighting(forty)
     assert known.classes is not None
     for i in range(len(held.test)):
-        assert torch.equal(known.classes(held.test, i) == 0, held.test.pixels(i).alpha < 0.5)  # type: ignore[operator]
+        alpha = held.test.pixels(i).alpha
+        assert alpha is not None and torch.equal(known.classes(held.test, i) == 0, alpha < 0.5)
     assert set(relight.lighting_baseline_scores(held)) == {"black", "no_cast_shadows"}
 
 

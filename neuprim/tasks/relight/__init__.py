@@ -121,9 +121,9 @@ def relight_metrics(
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
         result[f"psnr_linear_clamped_{part}"] = result["psnr_linear_clamped"]
-    return (
-        result if known.classes is None else result | relight_pixel_class_errors(rendered, truth, known.classes(dataset.test, index))
-    )
+    if known.classes is None:
+        return result
+    return result | relight_pixel_class_errors(rendered, truth, known.classes(dataset.test, index))
 
 
 def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
@@ -134,7 +134,8 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
     if not flip_available():
         result["flip_missing"] = "pip install 'neuprim[flip]'"
     if known.classes is not None:
-        result["class_percent"] = relight_pixel_class_shares([known.classes(dataset.test, i) for i in range(len(dataset.test))])
+        maps = [known.classes(dataset.test, i) for i in range(len(dataset.test))]
+        result["class_percent"] = relight_pixel_class_shares(maps)
     return result
 
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 from torch import Tensor
@@ -155,6 +157,21 @@ def test_parameters_without_a_gradient_stay() -> None:
     optimizer.step(p, RATES)
     assert torch.equal(p["W1"], before)
     assert optimizer.m["W1"].abs().max() == 0
+
+
+@pytest.mark.usefixtures("either_way")
+def test_values_stay_above_their_least_and_rise_again() -> None:
+    specs = (replace(SPECS[0], low=0.0), *SPECS[1:])
+    bound = {name: torch.full_like(v, 0.01).requires_grad_() for name, v in params().items()}
+    optimizer = RowAdam(specs, bound)
+    for sign in (1.0, -1.0):
+        for _ in range(20):
+            for v in bound.values():
+                v.grad = torch.full_like(v, sign)
+            optimizer.step(bound, RATES)
+        if sign > 0:
+            assert bound["means"].eq(0).all() and bound["b2"].lt(-1).all()
+    assert bound["means"].gt(0.02).all()
 
 
 def test_it_does_not_depend_on_the_number_of_threads() -> None:

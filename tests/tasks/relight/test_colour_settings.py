@@ -23,9 +23,18 @@ def test_each_form_takes_its_own_settings() -> None:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["model.colour.hidden=4"], "model.colour.hidden=4: not a setting of form=surface; expected model.colour.form="),
-        (["model.colour.form=additive", "model.colour.lobes=1"], "model.colour.lobes=1: not a setting of form=additive"),
-        (["model.colour.form=harmonics", "model.colour.visibility=none"], "model.colour.visibility=none: not a setting"),
+        (
+            ["model.colour.hidden=4"],
+            "model.colour.hidden=4: not a setting of form=surface; expected model.colour.form=",
+        ),
+        (
+            ["model.colour.form=additive", "model.colour.lobes=1"],
+            "model.colour.lobes=1: not a setting of form=additive",
+        ),
+        (
+            ["model.colour.form=harmonics", "model.colour.visibility=none"],
+            "model.colour.visibility=none: not a setting",
+        ),
         (["model.colour.visibility=pixel"], "model.colour: visibility 'pixel'; expected none or primitive"),
         (["model.colour.form=surfaces"], "model.colour.form=surfaces: expected"),
     ],

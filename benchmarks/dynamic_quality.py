@@ -51,7 +51,8 @@ from neuprim.core.metrics import psnr
 from neuprim.core.model.geometry import GEOMETRY_SPECS
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import render_image
-from neuprim.tasks.dynamic import TimeHarmonics, vdb_recording_of
+from neuprim.tasks.dynamic import vdb_recording_of
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 
 RECORD = RESULTS / "dynamic_quality.json"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 
 from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from tests import scenes
 

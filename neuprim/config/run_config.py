@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -246,8 +246,10 @@ class Job:
 
     @classmethod
     def of(cls, config: RunConfig) -> Job:
-        """Load the task of a configuration. Raises as :func:`load_config_task`."""
-        return cls(config, load_config_task(config, config.source))
+        """Load the task of a configuration, with the conditions of its scene. Raises as :func:`load_config_task`."""
+        task = load_config_task(config, config.source)
+        conditions = tuple(spec for spec in task.conditions if spec.of_scene(config.scene))
+        return cls(config, task if conditions == task.conditions else replace(task, conditions=conditions))
 
     @property
     def scene(self) -> FoundScene:

@@ -14,7 +14,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.report.run_report import VIEWER_LIMIT, Viewer, write_report
 from neuprim.runs.export import export_run
 from neuprim.runs.open import open_run
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.webpage.model_page import held_out_webpage_views
 from tests.core import tiny

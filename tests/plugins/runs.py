@@ -12,7 +12,7 @@ from neuprim.core.checkpoint import save_model
 from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 
 NUMBERS = (4, 5, 6)

@@ -14,7 +14,7 @@ from PIL import Image
 
 from neuprim.core.io.images import encode_webp_data_uri
 from neuprim.core.model.cosine import CosineDensity
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.static import SphericalHarmonics

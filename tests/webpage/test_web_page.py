@@ -14,7 +14,7 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.edge import edge_profile
 from neuprim.core.model.gaussian import GaussianDensity
-from neuprim.tasks.relight import colour as light_colour
+from neuprim.core.render import light as light_rendering
 from neuprim.tasks.relight.colour import LightNetwork
 from neuprim.tasks.relight.surface import SurfaceColour
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
@@ -111,9 +111,9 @@ def test_the_controls_of_conditions(tmp_path: Path) -> None:
 
 def test_the_script_s_shadows_are_those_of_the_model() -> None:
     """Constants that stand in both languages."""
-    assert (light_colour.FADE, light_colour.EXTENTS, light_colour.PIXEL_FADE) == (1 / 50, 1.5, 1 / 10)
+    assert (light_rendering.FADE, light_rendering.EXTENTS, light_rendering.PIXEL_FADE) == (1 / 50, 1.5, 1 / 10)
     for text in (LightNetwork(2).script(), SurfaceColour().script()):
-        for name, value in (("size", light_colour.SIZE), ("layers", light_colour.LAYERS)):
+        for name, value in (("size", light_rendering.SIZE), ("layers", light_rendering.LAYERS)):
             assert f"{name}: {value}" in text
     assert 'fade: visibility === "pixel" ? 1 / 10 : 1 / 50, extents: 1.5 ' in LightNetwork(2).script()
     assert "fade: 1 / 50, extents: 1.5 " in SurfaceColour().script()

@@ -18,6 +18,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.cameras.world import World
+from neuprim.core.model.colour_constants import C0
 from neuprim.core.model.forms import (  # noqa: F401 - the forms are part of this interface
     Constant,
     Cosine,
@@ -54,6 +55,7 @@ class ConditionSpec:
         sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
         in_frames: (text, count) -> the text that means the same in so many frames, if it does not say how many.
         place: for positions: ``parse`` of a text in the world of the user's files, (text, world) -> scene units.
+        of_scene: (scene settings) -> whether the views of a scene have the condition.
     """
 
     name: str
@@ -65,6 +67,7 @@ class ConditionSpec:
     sweep: str = ""
     in_frames: Callable[[str, int], str | None] = lambda text, count: None
     place: Callable[[str, World], list[Tensor]] | None = None
+    of_scene: Callable[[Mapping[str, Any]], bool] = lambda scene: True
 
     def within(self, world: World) -> ConditionSpec:
         """The condition of a model in ``world``: users write positions in the coordinates of their files."""
@@ -209,6 +212,11 @@ class ColourField(Field):
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
         """Return (N, C) and (N, B, C) or None for :func:`neuprim.core.model.sh.sh_colors`, or None."""
         return None
+
+    def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
+        """(N, C) the part of the colour, 0 or more, that depends on neither direction nor light: what voxels teach."""
+        found = self.harmonics(params, conditions)
+        return None if found is None else (found[0] * C0 + 0.5).clamp_min(0.0)
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:

@@ -19,7 +19,6 @@ from neuprim.core.model.cosine import cosine_density
 from neuprim.core.model.fields import Conditions, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActivePrimitives, Primitives
-from neuprim.core.model.sh import C0
 from neuprim.core.volumes.points_cpu import NOT_FINITE, CosinePointValues, PointCells, sort_points_into_cells
 
 
@@ -74,8 +73,8 @@ def volume_values_at(
     active = model.active(conditions)
     geometry, count = active.geometry, active.geometry.count
     colour_params = {spec.name: active.params[spec.name] for spec in model.colour.parameters()}
-    harmonics = model.colour.harmonics(colour_params, conditions) if colour else None
-    colors = [] if harmonics is None else [(harmonics[0] * C0 + 0.5).clamp_min(0.0)]
+    isotropic = model.colour.isotropic(colour_params, conditions) if colour else None
+    colors = [] if isotropic is None else [isotropic]
     named = model.density.components(active.own)
     columns = [*colors, *(share[:, None] for share in named.values())]
     weights = torch.cat(columns, 1) if columns else geometry.means.new_zeros(count, 0)

@@ -4,149 +4,34 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras.pinhole import AnyCamera
-from neuprim.core.compute import device
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
-from neuprim.core.model import sh
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.edge import NORMS, edge_profile
 from neuprim.core.model.fields import (
     ColourField,
-    Conditions,
     ConditionSpec,
-    Constant,
     Cosine,
     DensityField,
-    read_script,
 )
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.model.prunable import PrunableUnit
-from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices
-from neuprim.tasks.dynamic.time_density import TimeDensity, get_frame_time
-
-FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
-"""Angle of the first Fourier term at xi = 1. The paper prints i xi, a nearly rank-deficient basis on [0, 1] (condition
-5e13); whole periods are well conditioned (2e5)."""
-
-_TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
-
-_FITTED_TIMES = 256  # at which fewer terms are fitted to all terms
-_MIN_SINGULAR = 1e-7  # relative singular value of a fit; weaker coefficients would not survive float32
-
-
-class TimeHarmonics(ColourField):
-    """c = max(0, C0 S(xi) + sum of higher bands + 1/2), S(xi) = S0 + sum_i a_i xi^i + sum_i b_i cos(w i xi) + c_i sin(w
-    i xi).
-
-    Per channel 1 + n + 2 l parameters in the zero-order coefficient, i = 1..n and 1..l; the higher bands do not change.
-    With n = l = 4, three channels and degree 3: 84 parameters, 39 at degree 0. ``frequencies`` chooses w, see
-    :data:`FREQUENCIES`.
-    """
-
-    def __init__(
-        self, degree: int = 3, channels: int = 3, sh_every: float = 0.0, powers: int = 4, waves: int = 4,
-        frequencies: str = "periods",
-    ) -> None:  # fmt: skip
-        if not isinstance(degree, int) or not 0 <= degree <= 3:
-            raise ValueError(f"spherical-harmonics degree {degree!r}; expected 0..3")
-        if not isinstance(channels, int) or channels < 1:
-            raise ValueError(f"{channels!r} colour channels; expected at least 1")
-        if not all(isinstance(n, int) and 0 <= n <= 16 for n in (powers, waves)):
-            raise ValueError(f"{powers!r} powers and {waves!r} waves; expected 0..16")
-        if frequencies not in FREQUENCIES:
-            raise ValueError(f"frequencies {frequencies!r}; expected {' or '.join(FREQUENCIES)}")
-        self.degree, self.channels, self.sh_every = degree, channels, sh_every
-        self.powers, self.waves, self.frequencies = powers, waves, frequencies
-        self.active = degree
-
-    def settings(self) -> dict[str, Any]:
-        names = ("degree", "channels", "powers", "waves", "frequencies")
-        return {name: getattr(self, name) for name in names}
-
-    def set_progress(self, progress: float) -> None:
-        self.active = min(self.degree, int(progress / self.sh_every + 1e-9)) if self.sh_every > 0 else self.degree
-
-    def parameters(self) -> list[ParameterSpec]:
-        C, rest = self.channels, sh.sh_coefficient_count(self.degree) - 1
-        specs = [ParameterSpec("sh_dc", (C,), 1e-2, lambda c: sh.initial_sh_dc(c.colors))]
-        specs += [ParameterSpec(name, (n, C), 5e-3, _zero_time_colours(n, C)) for name, n in self._term_counts() if n]
-        return specs + ([ParameterSpec("sh_rest", (rest, C), 2e-3, _zero_time_colours(rest, C))] if rest else [])
-
-    def _term_counts(self) -> list[tuple[str, int]]:
-        return list(zip(_TIME_TENSORS, (self.powers, self.waves, self.waves), strict=True))
-
-    def reductions(self) -> dict[str, tuple[int, ...]]:
-        most = {"degree": self.degree, "powers": self.powers, "waves": self.waves}
-        return {name: tuple(range(value - 1, -1, -1)) for name, value in most.items() if value}
-
-    def reduce(
-        self, params: Params, geometry: Geometry, name: str, value: int
-    ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
-        """Fit fewer terms in time to all terms, by least squares over the sequence."""
-        field = TimeHarmonics(**{**self.settings(), name: value})
-        if name == "degree":
-            return field, sh.truncate_sh_bands(params, "sh_rest", value)
-        times = (torch.arange(_FITTED_TIMES, dtype=torch.float64) + 0.5) / _FITTED_TIMES
-        all_terms, fewer_terms = (
-            torch.stack([torch.cat([torch.ones_like(x)[None], *f._terms(x).values()]) for x in times])
-            for f in (self, field)
-        )
-        # coefficients of all terms -> of those that stay
-        fit = torch.linalg.pinv(fewer_terms, rtol=_MIN_SINGULAR) @ all_terms
-        stored = torch.cat([params["sh_dc"][:, None], *(params[key] for key in _TIME_TENSORS if key in params)], 1)
-        sizes = {key: len(basis) for key, basis in field._terms(times[0]).items()}
-        dc, *rest = (
-            (device.to_device_like(fit, stored.double()) @ stored.double()).to(stored).split([1, *sizes.values()], 1)
-        )
-        others = {key: value for key, value in params.items() if key not in _TIME_TENSORS}
-        kept = {key: part.contiguous() for key, part in zip(sizes, rest, strict=True) if sizes[key]}
-        return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
-
-    def _terms(self, xi: Tensor) -> dict[str, Tensor]:
-        """Basis of each tensor at a time, float64."""
-        turn = FREQUENCIES[self.frequencies] * xi
-        waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
-        powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
-        return dict(zip(_TIME_TENSORS, (powers, waves.cos(), waves.sin()), strict=True))
-
-    def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None]:
-        dc, xi = params["sh_dc"], get_frame_time(conditions)
-        terms = self._terms(xi) if self.powers or self.waves else {}  # a frame of still colours computes none
-        for name, basis in terms.items():
-            if name in params:
-                dc = dc + (params[name] * device.to_device_like(basis, dc)[:, None]).sum(1)
-        return dc, params.get("sh_rest")
-
-    def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Coefficients of the direction, per channel, and single terms in time."""
-        terms = ((name, i) for name, count in self._term_counts() for i in range(count))
-        units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
-        return (*sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest"), *units)
-
-    def script(self) -> str:
-        return read_script(__package__, "colour.js")
-
-    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
-        dc, rest = self.harmonics(params, conditions)
-        return Constant(sh.sh_colors(geometry.means, dc, rest, camera.position, self.active))
-
-
-def _zero_time_colours(terms: int, channels: int) -> Any:
-    return lambda ctx: torch.zeros(ctx.count, terms, channels)
-
+from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
+from neuprim.tasks.relight.lighting import LIGHT_CONDITIONS, typical_light
 
 if TYPE_CHECKING:
     from neuprim.tasks.dynamic.volume.capture_dataset import VolumeRecording
@@ -180,7 +65,14 @@ def _tunable_time_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, ...
 def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     components = () if dataset.points is None else dataset.points.components
     density = TimeDensity(model["neurons"], **model["density"], components=components)
-    return density, TimeHarmonics(model["sh_degree"], dataset.channels, model["sh_every"], **model["colour"])
+    settings = (model["sh_degree"], dataset.channels, model["sh_every"])
+    if "light" in dataset.train.view(0).conditions:
+        return density, ScatteringHarmonics(*settings, **model["colour"], typical=typical_light(dataset, False))
+    return density, TimeHarmonics(*settings, **model["colour"])
+
+
+def _has_lights(scene: Mapping[str, Any]) -> bool:
+    return scene.get("lights", 1) > 1
 
 
 def parse_dynamic_time(text: str) -> list[Tensor]:
@@ -328,8 +220,15 @@ TASK = TaskSpec(
     loss=photometric,
     check=_check_dynamic_model,
     tunable_settings=_tunable_time_settings,
-    conditions=(ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_dynamic_time, sweep="0:1"),),
-    fields={"TimeDensity": TimeDensity, "TimeHarmonics": TimeHarmonics},
+    conditions=(
+        ConditionSpec("time", (), "fraction of the sequence", (0.0, 1.0), parse_dynamic_time, sweep="0:1"),
+        *(replace(spec, of_scene=_has_lights) for spec in LIGHT_CONDITIONS),
+    ),
+    fields={
+        "TimeDensity": TimeDensity,
+        "TimeHarmonics": TimeHarmonics,
+        "ScatteringHarmonics": ScatteringHarmonics,
+    },
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
     mask=matter_mask,
     diagnose=compare_with_vdb_recording,

@@ -22,20 +22,19 @@ from neuprim.core.metrics import mean_metrics as mean_metrics
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.lpips import flip, flip_available
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
-from neuprim.core.model.fields import ColourField, ConditionSpec, DensityField
+from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
+from neuprim.core.render.light import VISIBILITY
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
 from neuprim.scenes import PIXEL_CLASSES
-from neuprim.tasks.relight.colour import FORMS, VISIBILITY, LightHarmonics, LightNetwork
+from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork
 from neuprim.tasks.relight.lighting import (
+    LIGHT_CONDITIONS,
     dataset_lighting,
-    light_orbit_in_frames,
     lights_from_environment,
-    parse_light_intensities,
-    parse_light_positions,
     summarize_lights,
     typical_light,
 )
@@ -277,19 +276,7 @@ TASK = TaskSpec(
     loss=l1,
     check=_check_relight_model,
     tunable_settings=_tunable_relight_settings,
-    conditions=(
-        ConditionSpec(
-            "light",
-            (3,),
-            "position, scene units",
-            (-1e6, 1e6),
-            parse_light_positions,
-            sweep="orbit",
-            in_frames=light_orbit_in_frames,
-            place=parse_light_positions,
-        ),
-        ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_light_intensities),
-    ),
+    conditions=LIGHT_CONDITIONS,
     fields={
         "CosineDensity": CosineDensity,
         "LightNetwork": LightNetwork,

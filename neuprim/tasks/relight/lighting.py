@@ -19,6 +19,7 @@ from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.json_reader import JsonReader
+from neuprim.core.model.fields import ConditionSpec
 from neuprim.tasks.relight.colour import real_light_harmonics
 
 if TYPE_CHECKING:
@@ -173,6 +174,21 @@ def _parse_light_numbers(text: str, name: str, expected: str) -> Tensor:
         raise ConfigError(f"--{name} {text}: {expected}")
     return torch.tensor(values, dtype=torch.float64)
 
+
+LIGHT_CONDITIONS = (
+    ConditionSpec(
+        "light",
+        (3,),
+        "position, scene units",
+        (-1e6, 1e6),
+        parse_light_positions,
+        sweep="orbit",
+        in_frames=light_orbit_in_frames,
+        place=parse_light_positions,
+    ),
+    ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_light_intensities),
+)
+"""Position of a light, and its intensity."""
 
 # ---------------------------------------------------------------- environments
 

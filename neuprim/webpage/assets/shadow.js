@@ -1,4 +1,4 @@
-// Light that arrives at primitives or points, by depth images out of the light in slabs: neuprim/tasks/relight/colour.py has the mathematics.
+// Light that arrives at primitives or points, by depth images out of the light in slabs: neuprim/core/render/light.py has the mathematics.
 const FAR = 1e3; // scene radii
 
 // The light's camera over all living primitives, and the depths between slabs; null where the light is in the middle of everything.
@@ -39,8 +39,8 @@ function lightCamera(scene, scales, living, light, { size, layers }) {
   return { R, t, fx: focal, fy: focal, cx: size / 2, cy: size / 2, width: size, height: size, near, edges, diameter: 2 * radius };
 }
 
-// Visibility of the point (x, y, z); light fades over `fade` scene units behind a depth image. maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
-function arrivingAt(px, py, pz, camera, maps, fade) {
+// Visibility of the point (x, y, z); light fades over `fade` scene units, the share `before` of them in front of a depth image. maps: per slab Float32Array (size, size, 4) whose first number is sum of w z and whose last is T.
+function arrivingAt(px, py, pz, camera, maps, fade, before = 0) {
   const { R, t, fx, width: size, near } = camera;
   const x = R[0] * px + R[1] * py + R[2] * pz + t[0], y = R[3] * px + R[4] * py + R[5] * pz + t[1], z = R[6] * px + R[7] * py + R[8] * pz + t[2];
   if (!(z > near)) return 1;
@@ -60,7 +60,7 @@ function arrivingAt(px, py, pz, camera, maps, fade) {
       nearness += weight / Math.max(map[o] / opacity, near);
     }
     const behind = z - alpha / Math.max(nearness, 1e-30);
-    const s = Math.min(Math.max(behind / fade, 0), 1);
+    const s = Math.min(Math.max(behind / fade + before, 0), 1);
     found *= 1 - alpha * s * s * (3 - 2 * s);
   }
   return found;

@@ -24,7 +24,7 @@ from neuprim.core.model.prunable import (
 )
 from neuprim.core.task import TaskSpec
 from neuprim.plugins.registry import load_task
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.relight.surface import SurfaceColour

@@ -15,7 +15,7 @@ from neuprim.core.model.fields import Field
 from neuprim.core.model.gaussian import GaussianDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.relight.surface import SurfaceColour

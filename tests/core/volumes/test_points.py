@@ -16,7 +16,7 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.volumes.density_grid import density_at
 from neuprim.core.volumes.points import find_point_pairs, volume_values_at
 from neuprim.core.volumes.points_cpu import sort_points_into_cells
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.static import SphericalHarmonics
 from tests.cosine_models import model as cosine_model

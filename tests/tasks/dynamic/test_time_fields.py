@@ -19,7 +19,8 @@ from neuprim.core.render.layer_frame import LayerFrame
 from neuprim.core.render.output import Contributions
 from neuprim.core.train.population import RelocatePopulation, split_population
 from neuprim.core.train.settings import PopulationSettings
-from neuprim.tasks.dynamic import TASK, TimeHarmonics, invisible_fraction_over_time
+from neuprim.tasks.dynamic import TASK, invisible_fraction_over_time
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TIME_PARTS, TimeDensity
 from tests import scenes
 from tests.backends import BACKENDS, by

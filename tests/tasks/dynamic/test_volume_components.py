@@ -18,7 +18,7 @@ from neuprim.runs.export import export_run
 from neuprim.runs.fit import prepare_training
 from neuprim.runs.open import open_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic import TimeHarmonics
+from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.capture import Capture
 from tests.tasks.dynamic.sequences import dataset, recorded

@@ -15,11 +15,12 @@ from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import RayNet
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.light import normalize_direction
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.losses import compressed_loss, l1, relative_loss
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
-from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork, normalize_direction
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.relight.surface import SurfaceColour
 from tests import scenes
 from tests.core import tiny

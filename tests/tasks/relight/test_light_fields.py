@@ -16,18 +16,9 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.schema import InitContext
 from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.light import FADE, PIXEL_FADE, extents_towards, light_visibility, shade_by_light
 from neuprim.core.train.population import split_population
-from neuprim.tasks.relight.colour import (
-    FADE,
-    FORMS,
-    PIXEL_FADE,
-    LightHarmonics,
-    LightNetwork,
-    extents_towards,
-    light_visibility,
-    real_light_harmonics,
-    shade_by_light,
-)
+from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_light_harmonics
 from neuprim.tasks.relight.lighting import parse_light_intensities, parse_light_positions
 from tests import scenes
 from tests.lit_models import COUNT, light, model

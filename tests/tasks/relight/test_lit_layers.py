@@ -11,19 +11,18 @@ from neuprim.core.cameras import Camera, look_at
 from neuprim.core.model.fields import RayNet
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.layer_frame import LayerFrame
-from neuprim.core.render.output import unproject_rendered_depth
-from neuprim.tasks.relight import TASK
-from neuprim.tasks.relight.colour import (
+from neuprim.core.render.light import (
     EXTENTS,
     FADE,
     PIXEL_FADE,
-    LightHarmonics,
-    LightNetwork,
     _visibility_kernel,
     extents_towards,
     light_visibility,
     sample_visibility,
 )
+from neuprim.core.render.output import unproject_rendered_depth
+from neuprim.tasks.relight import TASK
+from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from tests import scenes
 from tests.chords import chords
 from tests.lit_models import light, model

@@ -40,11 +40,19 @@ from neuprim.core.volumes.density_truth import (
     TruthFrame,
     measure_density_errors,
 )
-from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Optics, build_medium
+from neuprim.tasks.dynamic.volume.optics import (
+    DATA_DEPENDENT,
+    UP_AXES,
+    Light,
+    Optics,
+    build_medium,
+    draw_frame_lights,
+    light_medium,
+)
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 
-RENDERER_VERSION = 2
+RENDERER_VERSION = 3
 """Part of the cache's key: raise it with every change to the march, the optics, the cameras or the files' layout."""
 
 POINTS = 8192
@@ -63,7 +71,8 @@ class Capture:
 
     Attributes:
         frames: the files, in order.
-        cameras: all of them, those held out included; ``samples``: rays per pixel side.
+        cameras: all of them, the last ``held_out`` of which are not trained on; ``samples``: rays per pixel side.
+        lights: of each frame, which the training cameras take in turns; of more than one, held-out cameras have others.
         bounds: (2, 3) box around all matter, scene units.
         ends: frame numbers whose times are 0 and 1; None: the first and the last frame's.
         measured: frame number -> extent of its extinction grid; empty if unknown.
@@ -76,6 +85,8 @@ class Capture:
     samples: int
     normalisation: CaptureNormalisation
     bounds: np.ndarray
+    lights: int = 1
+    held_out: int = 0
     ends: tuple[int, int] | None = None
     measured: Mapping[int, GridExtent] = field(default_factory=dict)
 
@@ -103,11 +114,19 @@ class Capture:
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
         optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
-        parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation]
+        parts = [RENDERER_VERSION, stats, optics, names, cameras, self.samples, normalisation, self.lights]
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
+    def frame_lights(self, frame: VdbFrame) -> list[Light | None]:
+        """The lights of a frame by camera; the first camera has the optics' own."""
+        if self.lights == 1:
+            return [self.optics.light] * len(self.cameras)
+        drawn = draw_frame_lights(self.optics, frame.number, self.lights + self.held_out)
+        training = len(self.cameras) - self.held_out
+        return [drawn[c % self.lights] for c in range(training)] + drawn[self.lights :]
+
     def medium(self, frame: VdbFrame) -> Medium:
-        """The medium of a frame's file; empty if the file lacks the grids that absorb in others."""
+        """The medium of a frame's file without its light; empty if the file lacks the grids that absorb in others."""
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids and not (self.components and self.optics.flame_grid in grids):
             return Medium.without_voxels()
@@ -154,6 +173,7 @@ class Capture:
             "grids": dict(self.reader.names),
             "look": json.loads(json.dumps(asdict(self.optics), default=_encode_capture_value)),
             "cameras": len(self.cameras),
+            "lights": self.lights,
             "size": [self.cameras[0].width, self.cameras[0].height],
             "samples": self.samples,
             "normalisation": asdict(self.normalisation),
@@ -167,9 +187,11 @@ class Capture:
             OSError: a file cannot be written.
         """
         medium = self.medium(frame)
+        lights = self.frame_lights(frame)
+        media = {light: light_medium(medium, light) for light in dict.fromkeys(lights)}
         brightest = 0.0
-        for c, camera in enumerate(self.cameras):
-            rgba = render_medium(medium, camera, self.samples)
+        for c, (camera, light) in enumerate(zip(self.cameras, lights, strict=True)):
+            rgba = render_medium(media[light], camera, self.samples)
             peak = float(rgba[..., :3].max().half())  # as stored: values that half floats round to 0 are no light
             if not np.isfinite(peak):
                 raise DataError(
@@ -180,7 +202,7 @@ class Capture:
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)
         largest = np.float32(medium.values[..., 0].max(initial=0.0))
-        points = _sample_medium_points(medium, frame.number)
+        points = _sample_medium_points(media[lights[0]], frame.number)
         np.savez(folder / LAST_FILE, brightest=np.float32(brightest), largest=largest, **points)
 
 

@@ -24,10 +24,14 @@ from neuprim.core.io.json_reader import read_npz_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
+from neuprim.tasks.dynamic.volume.optics import Light, light_medium
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
+
+LIGHT_DISTANCE = 1e4
+"""Of directional lights from the middle of the scene, scene units."""
 
 _MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
 
@@ -88,7 +92,8 @@ class VdbFrameViews(ViewSet):
     def view(self, index: int) -> View:
         camera, t = self._split_index(index)
         name = f"cam_{camera:02d}_frame_{self.frames[t].number:04d}"
-        return View(name, self.capture.cameras[camera], {"time": self.times[t]})
+        lit = light_conditions(self.capture, self.capture.frame_lights(self.frames[t])[camera])
+        return View(name, self.capture.cameras[camera], {"time": self.times[t], **lit})
 
     def pixels(self, index: int) -> Pixels:
         rgba = self._images[index].float()
@@ -107,6 +112,16 @@ class VdbFrameViews(ViewSet):
         except DataError as error:
             address = self.folder.at(self.capture.frame_folder(frame)).address
             raise DataError(f"{error}; delete the folder {address} to render the frame again") from error
+
+
+def light_conditions(capture: Capture, light: Light | None) -> dict[str, Tensor]:
+    """What a view says of its light: a position so far away that its rays are parallel, and the irradiance; nothing
+    where all views have one light."""
+    if capture.lights == 1 or light is None:
+        return {}
+    towards = torch.tensor(light.direction, dtype=torch.float64)
+    irradiance = torch.tensor(light.irradiance, dtype=torch.float32)
+    return {"light": (LIGHT_DISTANCE * towards / towards.norm()).float(), "light_intensity": irradiance}
 
 
 @dataclass(frozen=True, eq=False)
@@ -407,11 +422,16 @@ class FrameVoxels(PointSupervision):
     def _read_voxels(self, t: int) -> MediumVoxels:
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
+    def _supervised_medium(self, frame: VdbFrame) -> Medium:
+        """With all light where there is one, else with that which depends on no light: models add the others."""
+        medium = self.capture.medium(frame)
+        return light_medium(medium, self.capture.frame_lights(frame)[0]) if self.capture.lights == 1 else medium
+
     def _read_or_make_voxels(self, frame: VdbFrame) -> MediumVoxels:
         name = f"{self.capture.frame_folder(frame)}/voxels.npz"
         path = self.folder.fetch_file(name, _MAX_VOXEL_BYTES)
         if not path.is_file():
-            made = MediumVoxels.of(self.capture.medium(frame))
+            made = MediumVoxels.of(self._supervised_medium(frame))
             try:
                 self.folder.write_file(name, made.write)
             except OSError as error:

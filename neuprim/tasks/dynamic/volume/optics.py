@@ -14,7 +14,7 @@ from scipy import ndimage
 from neuprim.core.errors import ConfigError, DataError, nearest
 from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, VdbGrid
 from neuprim.core.validation import Accepts, Range, Unbounded, field_types, validate_fields, validate_setting_names
-from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance
+from neuprim.tasks.dynamic.volume.raymarch import NOT_FINITE, Medium, light_transmittance
 
 Axis = Literal["y", "z"]
 """The upward axis of a sequence's files."""
@@ -203,13 +203,46 @@ def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
     return replace(optics, **changes)
 
 
+# ---------------------------------------------------------------- lights of a frame
+
+_LOWEST = math.radians(10.0)  # of drawn lights, above the horizon
+
+
+def draw_frame_lights(optics: Optics, frame: int, count: int) -> list[Light | None]:
+    """The optics' own light, and ``count`` - 1 others as strong from directions that are drawn for the frame of this
+    number, uniformly over the sky."""
+    own = optics.light
+    if own is None:
+        return [None] * count
+    lights: list[Light | None] = [own]
+    for across, up in np.random.default_rng([20261126, frame]).random((count - 1, 2)).tolist():
+        height = math.sin(_LOWEST) + (1 - math.sin(_LOWEST)) * up
+        around = math.sqrt(1 - height * height)
+        x, y = around * math.cos(2 * math.pi * across), around * math.sin(2 * math.pi * across)
+        lights.append(Light((x, y, height) if optics.up == "z" else (y, height, x), own.irradiance))
+    return lights
+
+
 # ---------------------------------------------------------------- the medium of a frame
+
+
+def light_medium(medium: Medium, light: Light | None) -> Medium:
+    """The medium with the part of a light that it scatters once, isotropically, with shadows."""
+    if light is None or medium.empty or medium.scattered is None:
+        return medium
+    values = medium.values.copy()
+    arriving = np.array(light.irradiance, np.float32) / np.float32(4.0 * math.pi)
+    values[..., 1:] += medium.scattered * (light_transmittance(medium, light.direction)[..., None] * arriving)
+    if not np.isfinite(values).all():
+        raise DataError(NOT_FINITE)
+    return replace(medium, values=values)
+
 
 _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
 
 
 def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray) -> Medium:
-    """Build the medium of one frame on the voxels of its extinction grid.
+    """Build the medium of one frame on the voxels of its extinction grid, without the optics' light.
 
     Other grids are sampled at those voxels' centres, trilinearly unless their transform is the same. If flames absorb,
     the medium contains all of them. An empty frame gives an empty medium.
@@ -243,17 +276,12 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
     values[..., 0] = sigma
     scene_from_index = scene_from_world @ base.transform
     scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
-    arriving: np.ndarray = np.array(optics.ambient, np.float32)
-    if optics.light is not None:
-        padded = Medium.padded(values, scene_from_index)
-        lit = light_transmittance(padded, optics.light.direction)[1:-1, 1:-1, 1:-1]
-        irradiance = np.array(optics.light.irradiance, np.float32) / np.float32(4.0 * math.pi)
-        arriving = arriving + lit[..., None] * irradiance.astype(np.float32)
-    albedo = _scattering_albedo(grids, optics, base.transform, box, scene_from_index)
-    values[..., 1:] = sigma_s[..., None] * (albedo * arriving)
+    scattered = sigma_s[..., None] * _scattering_albedo(grids, optics, base.transform, box, scene_from_index)
+    values[..., 1:] = scattered * np.array(optics.ambient, np.float32)
     if flame is not None and optics.emission > 0.0:
         values[..., 1:] += sigma[..., None] * _flame_radiance(flame, optics)
-    return Medium.padded(values, scene_from_index, sigma_s if optics.mixes(grids) else None)
+    mixed = sigma_s if optics.mixes(grids) else None
+    return Medium.padded(values, scene_from_index, mixed, None if optics.light is None else scattered)
 
 
 def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:

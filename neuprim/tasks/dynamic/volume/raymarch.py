@@ -37,6 +37,8 @@ _HALF, _ONE, _ZERO = np.float32(0.5), np.float32(1.0), np.float32(0.0)
 _C2, _C3, _C4, _C5, _C6, _C7 = (np.float32(1.0 / n) for n in range(2, 8))
 
 
+NOT_FINITE = "medium: values are NaN or infinite; expected finite ones (scene.optics)"
+
 _NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest source, below which a voxel is empty
 
 
@@ -51,25 +53,37 @@ class Medium:
             The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
         scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
+        scattered: (X, Y, Z, 3) float32, that part times the albedo, by which light is scattered; None: by nothing.
     """
 
     values: np.ndarray
     scene_from_index: np.ndarray
     scattering: np.ndarray | None = None
+    scattered: np.ndarray | None = None
 
     @staticmethod
-    def padded(values: np.ndarray, scene_from_index: np.ndarray, scattering: np.ndarray | None = None) -> Medium:
+    def padded(
+        values: np.ndarray,
+        scene_from_index: np.ndarray,
+        scattering: np.ndarray | None = None,
+        scattered: np.ndarray | None = None,
+    ) -> Medium:
         """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels.
 
         Raises:
             DataError: a value is not finite.
         """
         if not np.isfinite(values).all():
-            raise DataError("medium: values are NaN or infinite; expected finite ones (scene.optics)")
+            raise DataError(NOT_FINITE)
         shift = np.eye(4)
         shift[:3, 3] = -1.0
-        around = np.pad(values, ((1, 1), (1, 1), (1, 1), (0, 0)))
-        return Medium(around, scene_from_index @ shift, None if scattering is None else np.pad(scattering, 1))
+        around = ((1, 1), (1, 1), (1, 1), (0, 0))
+        return Medium(
+            np.pad(values, around),
+            scene_from_index @ shift,
+            None if scattering is None else np.pad(scattering, 1),
+            None if scattered is None else np.pad(scattered, around),
+        )
 
     @staticmethod
     def without_voxels() -> Medium:

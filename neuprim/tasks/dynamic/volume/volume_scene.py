@@ -85,6 +85,8 @@ class VdbSceneSettings:
         look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
         size: width and height of the images in pixels; ``samples``: rays per pixel side.
         cameras: on the upper hemisphere; two are held out. ``field_of_view``: degrees.
+        lights: different directional lights of each frame, the look's own and drawn ones, which the cameras take in
+            turns; models of more than one know light, others have it in their colours.
         train_every: train on every n-th frame only; the test views keep all.
         up: "y" or "z", the upward axis of the files.
         cache: folder or URL where the ground truth is stored; None: the user's cache on this machine.
@@ -105,6 +107,7 @@ class VdbSceneSettings:
     cameras: Annotated[int, Range(4, 1000)] = 40
     field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
     samples: Annotated[int, Range(1, 16)] = 2
+    lights: Annotated[int, Range(1, 64)] = 1
     train_every: Annotated[int, Range(1, 1000)] = 1
     up: Axis = "z"
     cache: Annotated[str, nonempty_text("a folder, or a URL as s3://BUCKET/FOLDER")] | None = None
@@ -255,7 +258,13 @@ def _prepare_vdb_scene(
         options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
     )
     views = ([*train, *test], options.samples)
-    capture = Capture(frames, reader, optics, *views, normalisation, bounds, measured=measured)
+    if options.lights > 1 and optics.light is None:
+        found = f"scene.lights={options.lights}: look {options.look} has no light"
+        raise ConfigError(
+            f"{found}; expected scene.optics.light={{direction: [x, y, z], irradiance: [r, g, b]}} with it"
+        )
+    lights = (options.lights, len(test))
+    capture = Capture(frames, reader, optics, *views, normalisation, bounds, *lights, measured=measured)
     source: DataSource = "simulated" if options.vdb is None else "real"
     return _PreparedVdbScene(options, name, source, capture, range(len(train), len(train) + len(test)))
 

@@ -1,0 +1,226 @@
+"""Light at primitives: its direction, its strength, and how much of it arrives through the others."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from functools import partial
+from typing import Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.compute import device
+from neuprim.core.compute.kernels import exact_kernel
+from neuprim.core.compute.threads import parallel_for
+from neuprim.core.model.fields import Conditions, LoweredDensity, Shading
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.render import render_slabs
+from neuprim.core.settings import RenderSettings
+
+VISIBILITY = ("none", "primitive", "pixel")
+"""Where the light's depth images are read: nowhere, at centres of primitives, or at the point that a pixel shows."""
+
+# ---------------------------------------------------------------- directions
+
+_MIN_LENGTH = 1e-6  # in units of ``size``; a direction's gradient, 1/length, stays below 1e6 per size
+_MIN_LIGHT_DISTANCE = 1e-4  # in units of a primitive's size; a nearer light does not get stronger
+
+
+def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
+    """(..., 3) unit vectors; those shorter than 1e-6 of ``size`` (..., 1) are scaled by 1e6/size."""
+    scaled = vector / vector.detach().abs().amax(-1, keepdim=True).clamp_min(_MIN_LENGTH * size)
+    return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
+
+
+def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
+    """(N, C) intensity of the light over ``typical``, with ``falloff`` divided by the squared distance to the
+    centres."""
+    means = geometry.means
+    strength = device.to_device_like(conditions["light_intensity"], means) / typical
+    if not falloff:
+        return strength.reshape(1, -1).expand(len(means), -1)
+    squared = (device.to_device_like(conditions["light"], means) - means).square().sum(-1, keepdim=True)
+    return strength / squared.clamp_min((_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square())
+
+
+# ---------------------------------------------------------------- visibility
+
+SIZE = 192  # pixels of the depth images, square
+LAYERS = 4  # of equal depth; more of them separate depths better and take longer
+VOLUME_SIZE, VOLUME_LAYERS = 64, 16  # of smoke, which is smooth and shadows itself in every depth
+
+FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
+"""How far behind a depth image light fades: at a primitive over FADE scene diameters, as the light sees the scene, and
+EXTENTS times its own extent towards the light; at a pixel over PIXEL_FADE diameters. Surfaces made of ellipsoids are
+bumpy: where light fades faster, the bumps shadow each other, and where it fades slower, shadows come off their casters.
+A point on a depth image itself keeps all of its light."""
+
+_FAR = 1e3  # scene radii; from there all rays are parallel, and a float32 depth image keeps no digits
+_CHUNK = 1024  # points per unit of work
+
+
+def shade_by_light(
+    where: str, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+) -> Shading | None:
+    """The visibility of the frame's light ``where`` it is asked for, one of :data:`VISIBILITY`."""
+    if where == "none":
+        return None
+    light = conditions["light"]
+    visible = light_visibility(geometry, density, light, settings)
+    if where == "pixel":
+        return Shading(pixels=partial(visible, fade=PIXEL_FADE))
+    return Shading(primitives=visible(geometry.means, FADE, EXTENTS * extents_towards(geometry, light)))
+
+
+def shade_volume_by_light(
+    geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+) -> Shading:
+    """The visibility of the frame's light from the centres of primitives that overlap, as those of smoke do: each slab
+    takes away its light evenly over its own depth."""
+    visible = light_visibility(geometry, density, conditions["light"], settings, VOLUME_SIZE, VOLUME_LAYERS)
+    return Shading(primitives=visible(geometry.means, 1 / VOLUME_LAYERS, before=0.5))
+
+
+@torch.no_grad()
+def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
+    """(N,) how long each ellipsoid is in the direction from its centre to ``point`` (3,): between the two planes across
+    it that touch the ellipsoid, in scene units."""
+    towards = device.to_device_like(point, geometry.means) - geometry.means
+    units = normalize_direction(towards, geometry.length_scale[:, None])
+    return 2 * ((geometry.rotations * units[:, :, None]).sum(1) * geometry.scales).norm(dim=-1)
+
+
+class Visibility(Protocol):
+    """Scene points (M, 3) -> (M,) float32 visibility 0..1. Light fades over ``fade`` scene diameters and (M,) ``more``
+    scene units; the share ``before`` of that lies in front of a depth image, the rest behind it."""
+
+    def __call__(self, points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor: ...
+
+
+def light_visibility(
+    geometry: Geometry,
+    density: LoweredDensity,
+    light: Tensor,
+    settings: RenderSettings,
+    size: int = SIZE,
+    layers: int = LAYERS,
+) -> Visibility:
+    """The visibility of a point light (3,), by layered shadow maps.
+
+    The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity
+    A_k and mean depth d_k. The light's transmittance at a point x of depth z is
+
+        V(x) = prod_k (1 - A_k s((z - d_k)/fade)),      s a smooth step from 0 at 0 to 1 at 1,
+
+    exactly 1 where nothing lies in front, and 1 - A behind something of opacity A. One slab, a common shadow map, would
+    know one mean depth per pixel: half way between a translucent thing and the floor below it. Depths are read as
+    inverse depth, weighted by opacity, bilinearly: that is exact on planes, so that a lit floor does not shadow itself
+    at grazing light. V carries no gradient.
+
+    The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of
+    them lie, and points behind it count as lit. ``settings`` are the frame's own: its backend and threads draw the
+    depth images too.
+    """
+    with torch.no_grad():
+        means = geometry.means.detach().double()
+        light = light.detach().double()
+        middle = (means.amin(0) + means.amax(0)) / 2
+        far, largest = (means - middle).norm(dim=-1).max(), geometry.scales.detach().max()
+        *place, far_away, margin = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one synchronisation
+        center, light = torch.tensor(place, dtype=torch.float64), light.cpu()
+        radius = far_away + margin
+        distance = float((light - center).norm())
+        if distance < 1e-9 * max(radius, 1e-30):
+            return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
+        if distance > _FAR * radius:
+            light, distance = center + (light - center) * (_FAR * radius / distance), _FAR * radius
+        focal = 0.5 * size / math.tan(math.asin(min(radius / distance, 0.94)))
+        overhead = abs(float(light[2] - center[2])) >= 0.9 * distance
+        up = torch.tensor([0.0, 1.0, 0.0] if overhead else [0.0, 0.0, 1.0], dtype=torch.float64)
+        camera = Camera(look_at(light, center, up), focal, focal, size / 2, size / 2, size, size)
+        near = max(1e-4 * radius, distance - 1.5 * radius)
+        depths = means @ device.to_device_like(camera.viewmat[2, :3], means) + camera.viewmat[2, 3]
+        low, high = torch.stack([depths.min(), depths.max()]).tolist()
+        edges = torch.linspace(low, high, layers + 1, dtype=torch.float64)
+        slabs = torch.bucketize(depths, device.to_device_like(edges[1:-1], means))
+        own = replace(settings, depth=True, near=near, samples=1)
+        opacities, distances = render_slabs(geometry, density, slabs, layers, camera, own)
+    view = camera.viewmat[:3].contiguous()
+
+    def visibility(points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor:
+        points = points.detach().double().contiguous()
+        fades = torch.full_like(points[:, 0], fade * 2.0 * radius)
+        if more is not None:
+            fades += more
+        if not device.on_numba(points, opacities):
+            place = device.to_device_like(view, points)
+            return sample_visibility(points, place, near, focal, opacities, distances, fades, before)
+        found = np.empty(len(points), np.float32)
+        places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy())
+        kernel = _visibility_kernel
+        parallel_for(kernel, len(found), _CHUNK, settings.threads, *places, *images, fades.numpy(), before, found)
+        return torch.from_numpy(found)
+
+    return visibility
+
+
+def sample_visibility(
+    points: Tensor,
+    view: Tensor,
+    near: float,
+    focal: float,
+    alphas: Tensor,
+    depths: Tensor,
+    fades: Tensor,
+    before: float = 0.0,
+) -> Tensor:
+    """(M,) float32 visibility of ``points`` (M, 3) float64 in torch code, for a GPU: the twin of the kernel below."""
+    nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
+    images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
+    x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
+    ahead = (z > near) & x.isfinite() & y.isfinite() & z.isfinite()
+    scale = 2.0 * focal / alphas.shape[1] / torch.where(ahead, z, 1.0)
+    where = torch.where(ahead[:, None], torch.stack([x * scale, y * scale], -1), 0.0).clamp(-3.0, 3.0)
+    # outside of the images nothing absorbs
+    read = F.grid_sample(images.flatten(0, 1)[None], where[None, None], align_corners=False)[0, :, 0]
+    alpha, inverse_depth = read.unflatten(0, (-1, 2)).unbind(1)
+    behind = z - alpha / inverse_depth.clamp_min(1e-30)
+    s = (behind / fades + before).clamp(0.0, 1.0)
+    return torch.where(ahead, (1.0 - alpha * s * s * (3.0 - 2.0 * s)).prod(0), 1.0).float()
+
+
+@exact_kernel
+def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, fades, before, found):  # type: ignore[no-untyped-def]
+    """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
+    size = alphas.shape[1]
+    for p in range(start, stop):
+        x = view[0, 0] * points[p, 0] + view[0, 1] * points[p, 1] + view[0, 2] * points[p, 2] + view[0, 3]
+        y = view[1, 0] * points[p, 0] + view[1, 1] * points[p, 1] + view[1, 2] * points[p, 2] + view[1, 3]
+        z = view[2, 0] * points[p, 0] + view[2, 1] * points[p, 1] + view[2, 2] * points[p, 2] + view[2, 3]
+        found[p] = 1.0
+        if not z > near:  # behind the light's camera
+            continue
+        # in pixels, 0 the middle of the first
+        u, v = focal * x / z + 0.5 * size - 0.5, focal * y / z + 0.5 * size - 0.5
+        if not (-1.0 < u < size and -1.0 < v < size):
+            continue
+        i, j = int(np.floor(v)), int(np.floor(u))
+        down, right = v - i, u - j
+        arrives = 1.0
+        for k in range(alphas.shape[0]):
+            alpha, nearness = 0.0, 0.0
+            for di in range(2):
+                for dj in range(2):
+                    if 0 <= i + di < size and 0 <= j + dj < size and alphas[k, i + di, j + dj] > 0.0:
+                        own = np.float64(alphas[k, i + di, j + dj])
+                        weight = (down if di else 1.0 - down) * (right if dj else 1.0 - right) * own
+                        alpha += weight
+                        nearness += weight / max(np.float64(depths[k, i + di, j + dj]), near)
+            behind = z - alpha / max(nearness, 1e-30)
+            s = min(max(behind / fades[p] + before, 0.0), 1.0)
+            arrives *= 1.0 - alpha * s * s * (3.0 - 2.0 * s)
+        found[p] = arrives

@@ -1,0 +1,61 @@
+"""Colour of smoke and fire that scatter a light and know it: :class:`ScatteringHarmonics`."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from torch import Tensor
+
+from neuprim.core.cameras.pinhole import AnyCamera
+from neuprim.core.compute import device
+from neuprim.core.model.colour_constants import C0
+from neuprim.core.model.fields import Conditions, Constant, LoweredDensity, Shading, read_script
+from neuprim.core.model.geometry import Geometry
+from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.render.light import shade_volume_by_light
+from neuprim.core.settings import RenderSettings
+from neuprim.tasks.dynamic.colour import TimeHarmonics
+
+
+class ScatteringHarmonics(TimeHarmonics):
+    """c = TimeHarmonics(xi, d) + T max(0, a) E/typical: what shines by itself, and single scattering of one light.
+
+    a (C,) per primitive is its albedo, times the share of its extinction that scatters, times the isotropic phase
+    function 1/4 pi. T is the transmittance of the model's own extinction from the primitive's centre to the light
+    (:func:`~neuprim.core.render.light.shade_volume_by_light`), without gradient; E is the condition
+    ``light_intensity``, the light's irradiance as it arrives, and ``typical`` that of a usual training light.
+    """
+
+    def __init__(self, *settings: Any, typical: float = 1.0, **more: Any) -> None:
+        super().__init__(*settings, **more)
+        if not 0 < typical < float("inf"):
+            raise ValueError(f"typical light {typical!r}; expected a number above 0")
+        self.typical = float(typical)
+
+    def settings(self) -> dict[str, Any]:
+        return {**super().settings(), "typical": self.typical}
+
+    def parameters(self) -> list[ParameterSpec]:
+        C = self.channels
+        dc, *others = super().parameters()
+        scattered = ParameterSpec("scattered", (C,), 1e-2, lambda c: c.colors.clamp_min(0).float(), low=0.0)
+        return [dc, scattered, *others]
+
+    def harmonics(self, params: Params, conditions: Conditions) -> None:
+        """None: light is in no harmonics."""
+
+    def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
+        return (self.lowest_band(params, conditions) * C0 + 0.5).clamp_min(0.0)
+
+    def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
+        own = super().lower(params, geometry, camera, conditions).rgb
+        strength = device.to_device_like(conditions["light_intensity"], own) / self.typical
+        return Constant(params["scattered"].clamp_min(0.0) * strength, own)
+
+    def shade(
+        self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
+    ) -> Shading:
+        return shade_volume_by_light(geometry, density, conditions, settings)
+
+    def script(self) -> str:
+        return read_script(__package__, "scattering.js").replace("TIME_HARMONICS", super().script().strip())

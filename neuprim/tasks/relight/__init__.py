@@ -42,7 +42,7 @@ from neuprim.tasks.relight.surface import INDIRECT, SurfaceColour
 
 _NETWORK = {"hidden": 8, "visibility": "primitive", "boost": 5.0}
 _OF_FORM: dict[str, dict[str, Any]] = {
-    "surface": {"lobes": 2, "indirect": 4, "visibility": "primitive"},
+    "surface": {"lobes": 1, "indirect": 4, "visibility": "primitive"},
     **dict.fromkeys(FORMS, _NETWORK),
     "harmonics": {"degree": 5},
 }

@@ -138,7 +138,7 @@ class SurfaceColour(ColourField):
 
     def __init__(
         self,
-        lobes: int = 2,
+        lobes: int = 1,
         indirect: int = 4,
         channels: int = 3,
         visibility: str = "primitive",

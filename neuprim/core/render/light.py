@@ -125,6 +125,8 @@ def light_visibility(
     them lie, and points behind it count as lit. ``settings`` are the frame's own: its backend and threads draw the
     depth images too.
     """
+    if not geometry.count:
+        return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
     with torch.no_grad():
         means = geometry.means.detach().double()
         light = light.detach().double()

@@ -88,7 +88,7 @@ def test_an_animation_over_time(finished: Path, tmp_path: Path, suffix: str) -> 
 
 def test_cameras_of_a_file_need_a_time(finished: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     task = load_run(finished).task
-    assert task is TASK
+    assert [spec.name for spec in task.conditions] == ["time"]
     matrix = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2.7], [0, 0, 0, 1]]
     cameras = {"w": 24, "h": 24, "camera_angle_x": 0.5, "frames": [{"name": "a", "transform_matrix": matrix}]}
     path = tmp_path / "cameras.json"

@@ -18,8 +18,8 @@ from neuprim.core.conditions import (
     split_conditions,
 )
 from neuprim.core.errors import ConfigError
+from neuprim.core.light_conditions import light_orbit_in_frames, parse_light_positions
 from neuprim.core.model.fields import ConditionSpec
-from neuprim.tasks.relight.lighting import light_orbit_in_frames, parse_light_positions
 
 
 def number(text: str) -> list[Tensor]:

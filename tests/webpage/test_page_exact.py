@@ -19,6 +19,7 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import render
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.relight.colour import LightHarmonics, LightNetwork
 from neuprim.tasks.relight.surface import SurfaceColour
@@ -166,6 +167,20 @@ def test_relit_models(hidden: int, visibility: str, falloff: bool, chromium: Any
     colour = LightNetwork(hidden, form=form, visibility=visibility, falloff=falloff)
     model, bound = random_model(CosineDensity(2, edge=2), colour, seed=3), ERROR if visibility == "none" else 5 * ERROR
     assert_equal_under_lights(model, bound, chromium, tmp_path)
+
+
+def test_smoke_under_a_light(chromium: Any, tmp_path: Path) -> None:
+    colour = ScatteringHarmonics(1, powers=1, waves=1, typical=2.0)
+    model = random_model(TimeDensity(0, "window+motion", edge=2, gain=True), colour, count=80, seed=6)
+    time = torch.tensor(0.4, dtype=torch.float64)
+    near, far = torch.tensor([0.3, -0.2, 0.1]), torch.tensor([4e3, -3e3, 8e3])
+    strength = torch.tensor([2.0, 1.0, 4.0])
+    page_of(model, tmp_path / "p.html", {"time": time, "light": far, "light_intensity": strength})
+    with open_tab(chromium, tmp_path / "p.html") as tab:
+        for light in (far, near):
+            conditions = {"time": time, "light": light, "light_intensity": strength}
+            assert error(tab, model, camera_at(EYES[0]), conditions) < 5 * ERROR
+        assert tab.faults == []
 
 
 @pytest.mark.parametrize(

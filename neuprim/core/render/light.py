@@ -132,7 +132,7 @@ def light_visibility(
         light = light.detach().double()
         middle = (means.amin(0) + means.amax(0)) / 2
         far, largest = (means - middle).norm(dim=-1).max(), geometry.scales.detach().max()
-        *place, far_away, margin = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one synchronisation
+        *place, far_away, margin = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one wait for a GPU
         center, light = torch.tensor(place, dtype=torch.float64), light.cpu()
         radius = far_away + margin
         distance = float((light - center).norm())

@@ -14,6 +14,7 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
+from neuprim.core.light_conditions import LIGHT_CONDITIONS, typical_light
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.edge import NORMS, edge_profile
 from neuprim.core.model.fields import (
@@ -31,7 +32,6 @@ from neuprim.core.validation import validate_choices
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
 from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.tasks.relight.lighting import LIGHT_CONDITIONS, typical_light
 
 if TYPE_CHECKING:
     from neuprim.tasks.dynamic.volume.capture_dataset import VolumeRecording
@@ -67,6 +67,9 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
     density = TimeDensity(model["neurons"], **model["density"], components=components)
     settings = (model["sh_degree"], dataset.channels, model["sh_every"])
     if "light" in dataset.train.view(0).conditions:
+        if dataset.channels != 3:
+            found = f"{dataset.name}: {dataset.channels} colour channels"
+            raise ConfigError(f"{found}; task dynamic expects 3 of views with a light, as light_intensity has")
         return density, ScatteringHarmonics(*settings, **model["colour"], typical=typical_light(dataset, False))
     return density, TimeHarmonics(*settings, **model["colour"])
 

@@ -76,7 +76,7 @@ class TimeHarmonics(ColourField):
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
         """Fit fewer terms in time to all terms, by least squares over the sequence."""
-        field = TimeHarmonics(**{**self.settings(), name: value})
+        field = type(self)(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.truncate_sh_bands(params, "sh_rest", value)
         times = (torch.arange(_FITTED_TIMES, dtype=torch.float64) + 0.5) / _FITTED_TIMES

@@ -10,8 +10,7 @@
         look(i, centre, { base: rest.base });
         for (let c = 0; c < channels; c++) {
           out.ambient[c] = Math.max(rest.base[c], 0);
-          out.base[c] = Math.max(scattered[channels * i + c], 0);
-          out.factor[c] = light_intensity[c] / typical;
+          out.base[c] = (Math.max(scattered[channels * i + c], 0) * light_intensity[c]) / typical;
         }
       },
     };

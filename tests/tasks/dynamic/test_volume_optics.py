@@ -22,6 +22,7 @@ from neuprim.tasks.dynamic.volume.optics import (
     black_body_rgb,
     black_body_xyz,
     build_medium,
+    light_medium,
 )
 from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
@@ -78,7 +79,8 @@ def test_the_equation_of_a_look() -> None:
     grids["color"] = grid_of("color", np.array([0.5, 1.0, 2.0]).reshape(1, 1, 1, 3))
 
     def value(**settings: object) -> list[float]:
-        found = build_medium(grids, Optics(extinction=4.0, **settings), SAME)  # type: ignore[arg-type]
+        optics = Optics(extinction=4.0, **settings)  # type: ignore[arg-type]
+        found = light_medium(build_medium(grids, optics, SAME), optics.light)
         assert found.values.shape == (3, 3, 3, 4)
         return found.values[1, 1, 1].tolist()
 

@@ -16,6 +16,7 @@ from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
 from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels
+from neuprim.tasks.dynamic.volume.optics import light_medium
 from tests.tasks.dynamic.sequences import VOXEL, dataset, empty_frame, recorded, write_blobs
 
 SMALL = (
@@ -68,7 +69,7 @@ def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_pat
     capture = recorded(data).capture
     assert sorted(drawn) == [f"frame_{n:04d}" for n in range(1, 6)]
     for frame in capture.frames[:4]:
-        medium = capture.medium(frame)
+        medium = light_medium(capture.medium(frame), capture.optics.light)
         for samples in drawn[f"frame_{frame.number:04d}"]:
             assert float(samples.conditions["time"]) == pytest.approx((frame.number - 1) / 4)
             index = samples.points.double().numpy() @ medium.index_from_scene[:3, :3].T + medium.index_from_scene[:3, 3]

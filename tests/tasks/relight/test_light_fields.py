@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError
+from neuprim.core.light_conditions import parse_light_intensities, parse_light_positions
 from neuprim.core.model import sh
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.fields import Cosine, RayNet
@@ -19,7 +20,6 @@ from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.light import FADE, PIXEL_FADE, extents_towards, light_visibility, shade_by_light
 from neuprim.core.train.population import split_population
 from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork, real_light_harmonics
-from neuprim.tasks.relight.lighting import parse_light_intensities, parse_light_positions
 from tests import scenes
 from tests.lit_models import COUNT, light, model
 

@@ -102,7 +102,7 @@ def test_both_read_the_same(slabs: int) -> None:
     found = np.full(len(points), -1.0, np.float32)
     images = (alphas.numpy(), depths.numpy())
     fades = 0.1 + torch.rand(len(points), generator=generator, dtype=torch.float64)
-    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, fades.numpy(), found)
+    _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, fades.numpy(), 0.0, found)
     wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, fades)
     assert wanted.dtype == torch.float32 and torch.allclose(torch.from_numpy(found), wanted, rtol=0, atol=5e-7)
     assert 0.1 < float((wanted < 0.99).float().mean()) and float(wanted.min()) < 0.3

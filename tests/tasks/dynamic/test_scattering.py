@@ -177,7 +177,7 @@ def test_a_view_shows_its_own_light(files: Path, tmp_path: Path) -> None:
 def test_one_light_is_none_to_know(files: Path, tmp_path: Path) -> None:
     assert set(sequences.dataset(files, tmp_path).train.view(0).conditions) == {"time"}
     words = {"vdb": str(files), "size": 24, "cameras": 6, "look": "embergen_fire", "lights": 2, "samples": 1}
-    with pytest.raises(ConfigError, match="scene.lights=2: look embergen_fire has no light"):
+    with pytest.raises(ConfigError, match="look embergen_fire has no light"):
         load_volume_scene({**words, "grids": {"temperature": "density"}}, SceneContext(0, tmp_path / "cache"))
 
 

@@ -22,7 +22,7 @@ from neuprim.runs.open import load_run
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.tasks.dynamic.volume.optics import draw_frame_lights
+from neuprim.tasks.dynamic.volume.optics import draw_lights
 from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
 from tests.page_models import camera_at
 from tests.tasks.dynamic import sequences
@@ -141,7 +141,7 @@ def test_cameras_take_the_lights_in_turns_and_held_out_ones_have_others(files: P
     data = sequences.dataset(files, tmp_path, lights=3, cameras=8)
     capture = sequences.recorded(data).capture
     for t, frame in enumerate(capture.frames):
-        drawn = draw_frame_lights(capture.optics, frame.number, 5)
+        drawn = [capture.optics.light, *draw_lights(capture.optics, 2, frame.number), *draw_lights(capture.optics, 2)]
         towards = [normalize(torch.tensor(one.direction), dim=0) for one in drawn if one is not None]
         assert len(towards) == 5 and all(one[2] > 0.1 for one in towards)
         seen = [data.train.view(c * 3 + t).conditions for c in range(6)] + [
@@ -151,7 +151,7 @@ def test_cameras_take_the_lights_in_turns_and_held_out_ones_have_others(files: P
             light = normalize(conditions["light"], dim=0)
             assert torch.allclose(light, towards[number].float(), atol=1e-6)
             assert conditions["light_intensity"].tolist() == pytest.approx([5.0, 5.0, 5.2])
-    assert drawn != draw_frame_lights(capture.optics, 1, 5)
+    assert draw_lights(capture.optics, 2, 1) != draw_lights(capture.optics, 2, 2)
 
 
 def test_a_view_shows_its_own_light(files: Path, tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ from neuprim.tasks.dynamic.volume.optics import (
     Light,
     Optics,
     build_medium,
-    draw_frame_lights,
+    draw_lights,
     light_medium,
 )
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
@@ -118,12 +118,12 @@ class Capture:
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def frame_lights(self, frame: VdbFrame) -> list[Light | None]:
-        """The lights of a frame by camera; the first camera has the optics' own."""
+        """The lights of a frame by camera. The first camera has the optics' own; held-out cameras keep theirs."""
         if self.lights == 1:
             return [self.optics.light] * len(self.cameras)
-        drawn = draw_frame_lights(self.optics, frame.number, self.lights + self.held_out)
+        lights = [self.optics.light, *draw_lights(self.optics, self.lights - 1, frame.number)]
         training = len(self.cameras) - self.held_out
-        return [drawn[c % self.lights] for c in range(training)] + drawn[self.lights :]
+        return [lights[c % self.lights] for c in range(training)] + draw_lights(self.optics, self.held_out)
 
     def medium(self, frame: VdbFrame) -> Medium:
         """The medium of a frame's file without its light; empty if the file lacks the grids that absorb in others."""

@@ -203,19 +203,18 @@ def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
     return replace(optics, **changes)
 
 
-# ---------------------------------------------------------------- lights of a frame
+# ---------------------------------------------------------------- further lights
 
 _LOWEST = math.radians(10.0)  # of drawn lights, above the horizon
 
 
-def draw_frame_lights(optics: Optics, frame: int, count: int) -> list[Light | None]:
-    """The optics' own light, and ``count`` - 1 others as strong from directions that are drawn for the frame of this
-    number, uniformly over the sky."""
+def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
+    """Lights as strong as the optics' own, from directions uniform over the sky; another ``key`` draws others."""
     own = optics.light
     if own is None:
         return [None] * count
-    lights: list[Light | None] = [own]
-    for across, up in np.random.default_rng([20261126, frame]).random((count - 1, 2)).tolist():
+    lights: list[Light | None] = []
+    for across, up in np.random.default_rng([20261126, *key]).random((count, 2)).tolist():
         height = math.sin(_LOWEST) + (1 - math.sin(_LOWEST)) * up
         around = math.sqrt(1 - height * height)
         x, y = around * math.cos(2 * math.pi * across), around * math.sin(2 * math.pi * across)

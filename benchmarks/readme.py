@@ -14,7 +14,7 @@ from typing import Any
 from shared.tables import README, RESULTS, Run, Table, between_markers, read_trials, spread
 
 RELIT = {"pt_bunny": "`pt_bunny` (path traced), 160×160", "lit_solids": "`lit_solids` (generated), 256×256"}
-EQUAL_BYTES = "model.primitives=8300"
+EQUAL_BYTES = "model.primitives=9250"
 EQUATION_14 = (
     "model.colour.form=additive model.primitives=2655 train.loss=l1 train.rates.c_dc=5e-3 train.size_weight=0 "
     "train.population.fraction=0.05 train.population.stop=0.5 train.population.grow_from=1 model.colour.visibility=none"

@@ -29,12 +29,12 @@ from neuprim.core.channels import Channels
 from neuprim.core.data import View
 from neuprim.core.environment import Environment
 from neuprim.core.io.images import write_png
+from neuprim.core.light_conditions import lights_from_environment
 from neuprim.core.metrics import psnr
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
-from neuprim.tasks.relight.lighting import lights_from_environment
 
 MANY, DISTANT = 1024, 1e4
 PIXELS = 176  # of one image in the picture

@@ -76,7 +76,7 @@ CORE: dict[str, set[str]] = {
     "data": {"cameras", "validation", "compute", "errors", "io", "model", "volumes"},
     "task": {"validation", "data", "environment", "model", "render", "volumes"},
     "conditions": {"errors", "model"},
-    "light_conditions": {"cameras", "data", "errors", "model"},
+    "light_conditions": {"cameras", "data", "environment", "errors", "io", "model"},
     "channels": {"data", "errors", "io", "task"},
     "checkpoint": {"compression", "errors", "io", "model", "task"},
     "extensions": {

@@ -1,17 +1,23 @@
-"""A point light as a condition of frames: where it is, how strong, and how users write that."""
+"""A point light as a condition of frames: where it is, how strong, how users write it; many make an environment."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
+from neuprim.core.environment import Environment, Illumination
 from neuprim.core.errors import ConfigError
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import ConditionSpec
 
+MAX_LIGHT_ANGLE = 15.0  # degrees from every training light beyond which a direction counts as unseen
+_MAX_DIRECTIONS = 256  # of training lights in a model's header
 _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, frames
 
 
@@ -87,3 +93,68 @@ LIGHT_CONDITIONS = (
     ConditionSpec("light_intensity", (3,), "radiometric", (0.0, 1e6), parse_light_intensities),
 )
 """Position of a light, and its intensity."""
+
+
+# ---------------------------------------------------------------- environments
+
+
+def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
+    """Summarise lights (L, 3) for a model's header: mean distance, at most 256 directions, farthest-point sampled."""
+    offsets = lights.double() - center.double()
+    distance = offsets.norm(dim=-1)
+    units = offsets / distance.clamp_min(1e-30)[:, None]
+    chosen = [0]
+    nearest = units @ units[0]
+    while len(chosen) < min(_MAX_DIRECTIONS, len(units)):
+        chosen.append(int(nearest.argmin()))
+        nearest = torch.maximum(nearest, units @ units[chosen[-1]])
+    directions = [[round(float(x), 4) for x in units[i]] for i in chosen]
+    return {
+        "distance": float(distance.mean()),
+        "directions": directions,
+        "falloff": falloff,
+        "exposure": float(exposure),
+    }
+
+
+def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
+    """Approximate an environment by point lights like those of the training; a black one gives one of intensity 0.
+
+    Each direction becomes a light at the training lights' mean distance r, of the intensity that gives the centre the
+    environment's irradiance E: exposure E r^2 with falloff inverse_square (the model draws I/distance^2 over the
+    exposure), exposure E with falloff irradiance (which intensities are then), else exposure E / pi. Away from the
+    centre light differs from parallel light by about 2 offset/r.
+    ``facts`` are the dataset's, of the model's header; raises DataError if they are damaged.
+    """
+    data = JsonReader(dict(facts), "the model's header: data")
+    center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))
+    lights = data.values.get("lights")
+    if not isinstance(lights, dict):
+        raise data.fail("lights", "an object with distance, directions, falloff and exposure")
+    known = JsonReader(lights, f"{data.where}: lights")
+    distance = known.number("distance", "a distance above 0", 0.0)
+    exposure = known.number("exposure", "a number above 0", 0.0)
+    falloff = known.text("falloff")
+    factors = {"none": 1 / math.pi, "inverse_square": distance**2, "irradiance": 1.0}
+    if falloff not in factors:
+        raise known.fail("falloff", " or ".join(factors))
+    listed = known.values.get("directions")
+    number = len(listed) if isinstance(listed, list) and 0 < len(listed) <= _MAX_DIRECTIONS else 1
+    trained = known.array("directions", (number, 3), f"1 to {_MAX_DIRECTIONS} directions of 3 numbers")
+    trained = trained / trained.norm(dim=-1, keepdim=True).clamp_min(1e-30)
+    factor = exposure * factors[falloff]
+    found = environment.directional_lights(count)
+    frames = [
+        {"light": (center + distance * d).float(), "light_intensity": (factor * e).float()}
+        for d, e in zip(found.directions, found.irradiance, strict=True)
+    ]
+    if not frames:
+        dark = {"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)}
+        return Illumination((dark,), ("the environment is black",))
+    unseen = environment.share_beyond(trained, MAX_LIGHT_ANGLE)
+    extrapolated = ((found.directions @ trained.T).amax(1) < math.cos(math.radians(MAX_LIGHT_ANGLE))).tolist()
+    note = (
+        f"{unseen:.0%} of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees off every training "
+        "light, where the model guesses"
+    )
+    return Illumination(tuple(frames), (note,) if unseen > 0.01 else (), tuple(extrapolated))

@@ -14,7 +14,7 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset
 from neuprim.core.data.dataset_check import get_extra
 from neuprim.core.errors import ConfigError
-from neuprim.core.light_conditions import LIGHT_CONDITIONS, typical_light
+from neuprim.core.light_conditions import LIGHT_CONDITIONS, summarize_lights, typical_light
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE
 from neuprim.core.model.edge import NORMS, edge_profile
 from neuprim.core.model.fields import (
@@ -30,7 +30,7 @@ from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices
 from neuprim.tasks.dynamic.colour import FREQUENCIES, TimeHarmonics
-from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics, light_smoke_by_environment
 from neuprim.tasks.dynamic.time_density import TimeDensity
 
 if TYPE_CHECKING:
@@ -72,6 +72,14 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
             raise ConfigError(f"{found}; task dynamic expects 3 of views with a light, as light_intensity has")
         return density, ScatteringHarmonics(*settings, **model["colour"], typical=typical_light(dataset, False))
     return density, TimeHarmonics(*settings, **model["colour"])
+
+
+def _light_facts(dataset: Dataset) -> Mapping[str, Any]:
+    lights = [dataset.train.view(i).conditions.get("light") for i in range(len(dataset.train))]
+    known = [light for light in lights if light is not None]
+    if not known:
+        return {}
+    return {"lights": summarize_lights(torch.stack(known), dataset.center, "irradiance", dataset.exposure)}
 
 
 def _has_lights(scene: Mapping[str, Any]) -> bool:
@@ -232,6 +240,8 @@ TASK = TaskSpec(
         "TimeHarmonics": TimeHarmonics,
         "ScatteringHarmonics": ScatteringHarmonics,
     },
+    environment=light_smoke_by_environment,
+    facts=_light_facts,
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
     mask=matter_mask,
     diagnose=compare_with_vdb_recording,

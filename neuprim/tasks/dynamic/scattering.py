@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.compute import device
+from neuprim.core.environment import Environment, Illumination
+from neuprim.core.errors import DataError
+from neuprim.core.light_conditions import lights_from_environment
 from neuprim.core.model.colour_constants import C0
 from neuprim.core.model.fields import Conditions, Constant, LoweredDensity, Shading, read_script
 from neuprim.core.model.geometry import Geometry
@@ -15,6 +21,19 @@ from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.render.light import shade_volume_by_light
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
+
+SHINES = "shines"
+"""Condition of a frame, 0 or 1, that is one of several which add up: whether it has what shines by itself."""
+
+
+def light_smoke_by_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
+    """As :func:`~neuprim.core.light_conditions.lights_from_environment`; smoke shines by itself under the first light
+    alone."""
+    if "lights" not in facts:
+        raise DataError("--environment: this model has one light baked in; expected one trained with scene.lights=4")
+    found = lights_from_environment(environment, count, facts)
+    lights = [{**light, SHINES: torch.tensor(float(not i))} for i, light in enumerate(found.conditions)]
+    return replace(found, conditions=tuple(lights))
 
 
 class ScatteringHarmonics(TimeHarmonics):
@@ -49,6 +68,8 @@ class ScatteringHarmonics(TimeHarmonics):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         own = super().lower(params, geometry, camera, conditions).rgb
+        if SHINES in conditions:
+            own = own * device.to_device_like(conditions[SHINES], own)
         strength = device.to_device_like(conditions["light_intensity"], own) / self.typical
         return Constant(params["scattered"].clamp_min(0.0) * strength, own)
 

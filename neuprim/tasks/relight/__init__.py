@@ -18,7 +18,7 @@ from torch import Tensor
 from neuprim.core.data import Clip, Dataset, View, ViewSet
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import linear_to_srgb
-from neuprim.core.light_conditions import LIGHT_CONDITIONS, typical_light
+from neuprim.core.light_conditions import LIGHT_CONDITIONS, lights_from_environment, summarize_lights, typical_light
 from neuprim.core.metrics import mean_metrics as mean_metrics
 from neuprim.core.metrics import psnr, ssim
 from neuprim.core.metrics.lpips import flip, flip_available
@@ -32,7 +32,7 @@ from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
 from neuprim.scenes import PIXEL_CLASSES
 from neuprim.tasks.relight.colour import FORMS, LightHarmonics, LightNetwork
-from neuprim.tasks.relight.lighting import dataset_lighting, lights_from_environment, summarize_lights
+from neuprim.tasks.relight.lighting import dataset_lighting
 from neuprim.tasks.relight.surface import INDIRECT, SurfaceColour
 
 _NETWORK = {"hidden": 8, "visibility": "primitive", "boost": 5.0}

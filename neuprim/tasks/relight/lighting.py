@@ -1,4 +1,4 @@
-"""Lights of datasets, of the command line, and of environments.
+"""What a data set for relighting says of its light.
 
 Every view has two conditions: "light" (3,), the position in scene units, and "light_intensity" (3,), radiant.
 """
@@ -8,16 +8,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 from neuprim.core.data import Clip, Dataset, ViewSet
 from neuprim.core.data.dataset_check import get_extra
-from neuprim.core.environment import Environment, Illumination
 from neuprim.core.errors import DataError, warn_once
-from neuprim.core.io.json_reader import JsonReader
 from neuprim.tasks.relight.colour import real_light_harmonics
 
 if TYPE_CHECKING:
@@ -28,8 +26,6 @@ Falloff = Literal["none", "inverse_square"]
 EXPOSURE_PERCENTILE = 99.5  # an automatic exposure lets this percentile of the training images' values be 1
 FALLOFF_VIEWS = 200  # training views, evenly spread, whose brightness says how light weakens with distance
 FALLOFF_SPREAD = 0.4  # standard error of the exponent beyond which they do not say it
-MAX_LIGHT_ANGLE = 15.0  # degrees from every training light beyond which a direction counts as unseen
-_MAX_DIRECTIONS = 256  # of training lights in a model's header
 
 
 @dataclass(frozen=True)
@@ -109,66 +105,3 @@ def measure_falloff(dataset: Dataset) -> Falloff:
         )
         return "inverse_square"
     return "none" if slope > -1 else "inverse_square"
-
-
-# ---------------------------------------------------------------- environments
-
-
-def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
-    """Summarise lights (L, 3) for a model's header: mean distance, at most 256 directions, farthest-point sampled."""
-    offsets = lights.double() - center.double()
-    distance = offsets.norm(dim=-1)
-    units = offsets / distance.clamp_min(1e-30)[:, None]
-    chosen = [0]
-    nearest = units @ units[0]
-    while len(chosen) < min(_MAX_DIRECTIONS, len(units)):
-        chosen.append(int(nearest.argmin()))
-        nearest = torch.maximum(nearest, units @ units[chosen[-1]])
-    directions = [[round(float(x), 4) for x in units[i]] for i in chosen]
-    return {
-        "distance": float(distance.mean()),
-        "directions": directions,
-        "falloff": falloff,
-        "exposure": float(exposure),
-    }
-
-
-def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
-    """Approximate an environment by point lights like those of the training; a black one gives one of intensity 0.
-
-    Each direction becomes a light at the training lights' mean distance r, of the intensity that gives the centre the
-    environment's irradiance E: exposure E r^2 with falloff inverse_square (the model draws I/distance^2 over the
-    exposure), else exposure E / pi. Away from the centre light differs from parallel light by about 2 offset/r.
-    ``facts`` are the dataset's, of the model's header; raises DataError if they are damaged.
-    """
-    data = JsonReader(dict(facts), "the model's header: data")
-    center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))
-    lights = data.values.get("lights")
-    if not isinstance(lights, dict):
-        raise data.fail("lights", "an object with distance, directions, falloff and exposure")
-    known = JsonReader(lights, f"{data.where}: lights")
-    distance = known.number("distance", "a distance above 0", 0.0)
-    exposure = known.number("exposure", "a number above 0", 0.0)
-    falloff = known.text("falloff")
-    if falloff not in ("none", "inverse_square"):
-        raise known.fail("falloff", "none or inverse_square")
-    listed = known.values.get("directions")
-    number = len(listed) if isinstance(listed, list) and 0 < len(listed) <= _MAX_DIRECTIONS else 1
-    trained = known.array("directions", (number, 3), f"1 to {_MAX_DIRECTIONS} directions of 3 numbers")
-    trained = trained / trained.norm(dim=-1, keepdim=True).clamp_min(1e-30)
-    factor = exposure * (distance**2 if falloff == "inverse_square" else 1.0 / math.pi)
-    found = environment.directional_lights(count)
-    frames = [
-        {"light": (center + distance * d).float(), "light_intensity": (factor * e).float()}
-        for d, e in zip(found.directions, found.irradiance, strict=True)
-    ]
-    if not frames:
-        dark = {"light": (center + distance * up).float(), "light_intensity": torch.zeros(3)}
-        return Illumination((dark,), ("the environment is black",))
-    unseen = environment.share_beyond(trained, MAX_LIGHT_ANGLE)
-    extrapolated = ((found.directions @ trained.T).amax(1) < math.cos(math.radians(MAX_LIGHT_ANGLE))).tolist()
-    note = (
-        f"{unseen:.0%} of the environment's light comes from more than {MAX_LIGHT_ANGLE:g} degrees off every training "
-        "light, where the model guesses"
-    )
-    return Illumination(tuple(frames), (note,) if unseen > 0.01 else (), tuple(extrapolated))

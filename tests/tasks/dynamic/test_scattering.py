@@ -11,16 +11,19 @@ from torch.nn.functional import normalize
 
 from neuprim.cli import main
 from neuprim.config import compose
+from neuprim.core.environment import Environment
 from neuprim.core.errors import ConfigError
+from neuprim.core.io.exr import write_exr
 from neuprim.core.model.cosine import cosine_density
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.light import shade_volume_by_light
 from neuprim.core.task import SceneContext
-from neuprim.runs.open import load_run
+from neuprim.runs.measure import render_light_sum
+from neuprim.runs.open import load_run, open_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics, light_smoke_by_environment
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.optics import draw_lights
 from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
@@ -199,8 +202,32 @@ def test_time_and_light_move_together(lit: Path, tmp_path: Path) -> None:
     assert main(["render", str(lit), "--camera", "test", "--light", "1,0,2", "--out", str(tmp_path / "still")]) == 0
 
 
+def test_light_from_all_around_leaves_what_shines_once(lit: Path, tmp_path: Path) -> None:
+    """Twice the lights of half the strength make the same image, flames and ambient light included."""
+    made = open_run(lit)
+    view = made.dataset().test.view(4)
+    sky = light_smoke_by_environment(Environment(torch.full((16, 32, 3), 0.5)), 8, made.header["data"])
+    assert len(sky.conditions) > 4 and [float(c["shines"]) for c in sky.conditions[:3]] == [1.0, 0.0, 0.0]
+    black = torch.zeros(3)
+    whole = render_light_sum(made.model, view, sky.conditions, made.settings, black)
+    dark = render_light_sum(made.model, view, [{"light_intensity": torch.zeros(3)}], made.settings, black)
+    halves = [
+        {**c, "light_intensity": c["light_intensity"] / 2, "shines": c["shines"] * part}
+        for c in sky.conditions
+        for part in (1.0, 0.0)
+    ]
+    assert torch.allclose(render_light_sum(made.model, view, halves, made.settings, black), whole, atol=1e-5)
+    assert float((whole - dark).max()) > 0.01 and float((whole - dark).min()) > -1e-6
+    write_exr(tmp_path / "sky.exr", torch.full((16, 32, 3), 0.5))
+    words = ["render", str(lit), "--camera", "test", "--time", "0.5", "--environment", str(tmp_path / "sky.exr")]
+    assert main([*words, "--environment-samples", "4", "--out", str(tmp_path / "sky")]) == 0
+
+
 def test_a_model_of_one_light_takes_no_other(files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     scene = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "scene.look=smoke_fire"]
     baked = run(compose([*scene, *SMALL, f"output_dir='{tmp_path / 'baked'}'"]))
     assert main(["render", str(baked), "--camera", "test", "--light", "1,0,2"]) == 2
     assert "--light" in capsys.readouterr().err
+    write_exr(tmp_path / "sky.exr", torch.full((8, 16, 3), 0.5))
+    assert main(["render", str(baked), "--camera", "test", "--environment", str(tmp_path / "sky.exr")]) == 2
+    assert "this model has one light baked in" in capsys.readouterr().err

@@ -21,6 +21,7 @@ from neuprim.core.environment import Environment
 from neuprim.core.errors import DataError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.images import read_image
+from neuprim.core.light_conditions import MAX_LIGHT_ANGLE, lights_from_environment, summarize_lights
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -31,7 +32,6 @@ from neuprim.scenes.lit import build_lit_solids, shade_point_light
 from neuprim.scenes.raycast import Scene
 from neuprim.tasks.relight import TASK
 from neuprim.tasks.relight.colour import LightNetwork
-from neuprim.tasks.relight.lighting import MAX_LIGHT_ANGLE, lights_from_environment, summarize_lights
 from tests import scenes
 
 UNSHADOWED = "none"  # LightNetwork's ``visibility``

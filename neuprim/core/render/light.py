@@ -19,6 +19,7 @@ from neuprim.core.compute.threads import parallel_for
 from neuprim.core.model.fields import Conditions, LoweredDensity, Shading
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.render import render_slabs
+from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.settings import RenderSettings
 
 VISIBILITY = ("none", "primitive", "pixel")
@@ -226,3 +227,32 @@ def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, f
             s = min(max(behind / fades[p] + before, 0.0), 1.0)
             arrives *= 1.0 - alpha * s * s * (3.0 - 2.0 * s)
         found[p] = arrives
+
+
+# ---------------------------------------------------------------- layers
+
+
+def unshadowed_layer(frame: LayerFrame) -> Tensor | None:
+    """(H, W, C) the frame without shadows; None for colours without shadows."""
+    return None if frame.shading is None else frame.unshaded
+
+
+def visibility_layer(frame: LayerFrame) -> Tensor | None:
+    """(H, W) mean visibility of the light; None for colours without shadows."""
+    return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # rounding may exceed 1
+
+
+LIGHT_LAYERS = (
+    LayerSpec(
+        "unshadowed",
+        "the image as if the light arrived everywhere, linear light, premultiplied by alpha",
+        unshadowed_layer,
+    ),
+    LayerSpec(
+        "visibility",
+        "how much of the light arrives, 0 to 1: the mean over what the pixel shows, "
+        "weighted by its part in the pixel; 0 where alpha is 0",
+        visibility_layer,
+        ("Y",),
+    ),
+)

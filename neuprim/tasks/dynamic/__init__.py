@@ -26,6 +26,7 @@ from neuprim.core.model.fields import (
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
+from neuprim.core.render.light import LIGHT_LAYERS
 from neuprim.core.task import API_VERSION, SceneSpec, TaskSpec
 from neuprim.core.train.losses import photometric
 from neuprim.core.validation import validate_choices
@@ -246,5 +247,5 @@ TASK = TaskSpec(
     mask=matter_mask,
     diagnose=compare_with_vdb_recording,
     clips=held_out_clips,
-    layers=_LAYERS,
+    layers=(*_LAYERS, *LIGHT_LAYERS),
 )

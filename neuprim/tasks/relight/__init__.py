@@ -25,8 +25,7 @@ from neuprim.core.metrics.lpips import flip, flip_available
 from neuprim.core.model.cosine import DENSITY_OPTIONS, DENSITY_TRADE, CosineDensity
 from neuprim.core.model.fields import ColourField, DensityField
 from neuprim.core.model.primitives import Primitives
-from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
-from neuprim.core.render.light import VISIBILITY
+from neuprim.core.render.light import LIGHT_LAYERS, VISIBILITY
 from neuprim.core.task import API_VERSION, SceneContext, SceneSpec, TaskSpec
 from neuprim.core.train.losses import l1
 from neuprim.core.validation import validate_choices
@@ -221,35 +220,6 @@ def relight_pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
     return {name: 100.0 * float(counts[i]) / whole for i, name in enumerate(PIXEL_CLASSES) if i}
 
 
-# ---------------------------------------------------------------- layers
-
-
-def unshadowed_layer(frame: LayerFrame) -> Tensor | None:
-    """(H, W, C) the frame without shadows; None for colours without shadows."""
-    return None if frame.shading is None else frame.unshaded
-
-
-def visibility_layer(frame: LayerFrame) -> Tensor | None:
-    """(H, W) mean visibility of the light; None for colours without shadows."""
-    return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # rounding may exceed 1
-
-
-LAYERS = (
-    LayerSpec(
-        "unshadowed",
-        "the image as if the light arrived everywhere, linear light, premultiplied by alpha",
-        unshadowed_layer,
-    ),
-    LayerSpec(
-        "visibility",
-        "how much of the light arrives, 0 to 1: the mean over what the pixel shows, "
-        "weighted by its part in the pixel; 0 where alpha is 0",
-        visibility_layer,
-        ("Y",),
-    ),
-)
-
-
 TASK = TaskSpec(
     api=API_VERSION,
     name="relight",
@@ -286,5 +256,5 @@ TASK = TaskSpec(
     clips=relight_clips,
     facts=light_facts,
     orbit=light_orbit,
-    layers=LAYERS,
+    layers=LIGHT_LAYERS,
 )

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
+import OpenEXR
 import pytest
 import torch
 from torch import Tensor
@@ -200,6 +202,18 @@ def test_time_and_light_move_together(lit: Path, tmp_path: Path) -> None:
     words = ["--camera", "orbit", "--time", "0:1", "--light", "orbit:4:40:6", "--light-intensity", "5"]
     assert main(["render", str(lit), *words, "--out", str(target)]) == 0 and target.stat().st_size > 100
     assert main(["render", str(lit), "--camera", "test", "--light", "1,0,2", "--out", str(tmp_path / "still")]) == 0
+
+
+def test_layers_of_light(lit: Path, tmp_path: Path) -> None:
+    words = ["--camera", "orbit", "--frames", "1", "--time", "0.5", "--light", "1,1,2", "--light-intensity", "5"]
+    assert main(["render", str(lit), *words, "--format", "exr", "--out", str(tmp_path)]) == 0
+    (path,) = tmp_path.glob("*.exr")
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        found = {name: np.array(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    assert {"unshadowed.R", "visibility.Y", "emission.R", "absorption.R"} <= set(found)
+    shown = found["A"] > 0.1
+    assert (found["unshadowed.R"] >= found["R"] - 1e-3)[shown].all()
+    assert (found["visibility.Y"][shown] > 0).all() and (found["visibility.Y"][shown] < 1).any()
 
 
 def test_light_from_all_around_leaves_what_shines_once(lit: Path, tmp_path: Path) -> None:

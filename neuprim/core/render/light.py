@@ -163,7 +163,8 @@ def light_visibility(
             place = device.to_device_like(view, points)
             return sample_visibility(points, place, near, focal, opacities, distances, fades, before)
         found = np.empty(len(points), np.float32)
-        places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy())
+        nearest = torch.where(opacities > 0, distances, math.inf).amin((1, 2)).numpy()  # of each slab
+        places, images = (points.numpy(), view.numpy(), near, focal), (opacities.numpy(), distances.numpy(), nearest)
         kernel = _visibility_kernel
         parallel_for(kernel, len(found), _CHUNK, settings.threads, *places, *images, fades.numpy(), before, found)
         return torch.from_numpy(found)
@@ -197,7 +198,7 @@ def sample_visibility(
 
 
 @exact_kernel
-def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, fades, before, found):  # type: ignore[no-untyped-def]
+def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, nearest, fades, before, found):  # type: ignore[no-untyped-def]
     """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
     size = alphas.shape[1]
     for p in range(start, stop):
@@ -215,6 +216,8 @@ def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, f
         down, right = v - i, u - j
         arrives = 1.0
         for k in range(alphas.shape[0]):
+            if z + before * fades[p] <= nearest[k]:  # the step below is 0
+                continue
             alpha, nearness = 0.0, 0.0
             for di in range(2):
                 for dj in range(2):

@@ -100,7 +100,8 @@ def test_both_read_the_same(slabs: int) -> None:
     local = torch.stack([side, 0.4 * (edge[:, 2] - 0.5), torch.ones(200, dtype=torch.float64)], -1) * 3
     points = torch.cat([points, (local - view[:, 3]) @ view[:, :3]])
     found = np.full(len(points), -1.0, np.float32)
-    images = (alphas.numpy(), depths.numpy())
+    nearest = torch.where(alphas > 0, depths, torch.inf).amin((1, 2))
+    images = (alphas.numpy(), depths.numpy(), nearest.numpy())
     fades = 0.1 + torch.rand(len(points), generator=generator, dtype=torch.float64)
     _visibility_kernel(0, len(points), points.numpy(), view.numpy(), NEAR, FOCAL, *images, fades.numpy(), 0.0, found)
     wanted = sample_visibility(points, view, NEAR, FOCAL, alphas, depths, fades)

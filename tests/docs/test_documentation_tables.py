@@ -68,6 +68,7 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     },
     "webpage": ("docs/export.md", "webpage", lambda s: s.page_table(record_of(s)["runs"])),
     "webpage-prepare": ("docs/export.md", "webpage", lambda s: s.prepare_table(record_of(s)["prepare"])),
+    "lit volumes": ("docs/dynamic.md", "lit_volumes", lambda s: s.table(record_of(s))),
     "capture": ("docs/capture.md", "capture", lambda s: s.tables(record_of(s))),
     "fronts": ("docs/tradeoffs.md", "fronts", reports),
     "target": ("docs/tradeoffs.md", "target", reports),

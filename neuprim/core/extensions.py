@@ -6,7 +6,7 @@ Each kind has its own entry-point group; :mod:`neuprim.plugins.registry` finds a
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -16,8 +16,9 @@ from torch import Tensor
 
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import Channels, read_stored_channels
-from neuprim.core.conditions import conditions_per_frame
+from neuprim.core.conditions import condition_flag, conditions_per_frame
 from neuprim.core.data import Dataset
+from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.settings import RenderSettings
 from neuprim.core.task import Loss, SceneSpec, TaskSpec
@@ -77,9 +78,17 @@ class ExportJob:
     conditions: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[str, float], None] = lambda text, fraction: None
 
-    def frames(self, several: bool = False) -> list[dict[str, Tensor]]:
-        """Return the task's conditions of each frame that the user named; one frame unless ``several``."""
-        return conditions_per_frame(self.run.task.conditions, self.conditions, several)
+    def frames(self, several: bool = False, names: Collection[str] | None = None) -> list[dict[str, Tensor]]:
+        """Return the task's conditions of each frame that the user named; one frame unless ``several``.
+
+        Args:
+            names: of the conditions that what is written depends on; None: all of the task's. Others are refused.
+        """
+        specs = [spec for spec in self.run.task.conditions if names is None or spec.name in names]
+        for name in self.conditions:
+            if name not in [spec.name for spec in specs]:
+                raise ConfigError(f"{condition_flag(name)}: what is written does not depend on it; expected none")
+        return conditions_per_frame(specs, self.conditions, several)
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
         """Return an option that is a finite number from ``low`` to ``high``, or None; raises ConfigError otherwise."""

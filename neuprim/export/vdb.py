@@ -172,7 +172,8 @@ def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) 
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
-        frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True))]
+        names = None if placement is None else placement.times.keys()
+        frames = [_GridFrame(i, c) for i, c in enumerate(job.frames(several=True, names=names))]
         return [_GridFrame(f.number, f.conditions, _export_source_frame(f.conditions, placement)) for f in frames]
     return [_GridFrame(n, _export_frame_conditions(placement, i), i) for i, n in enumerate(placement.numbers)]
 

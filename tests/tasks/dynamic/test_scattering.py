@@ -204,6 +204,17 @@ def test_time_and_light_move_together(lit: Path, tmp_path: Path) -> None:
     assert main(["render", str(lit), "--camera", "test", "--light", "1,0,2", "--out", str(tmp_path / "still")]) == 0
 
 
+def test_voxels_do_not_ask_for_a_light(lit: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["export", str(lit), "--format", "vdb", "--time", "0.5"]
+    assert main([*words, "--out", str(tmp_path / "a.vdb")]) == 0 and (tmp_path / "a.vdb").is_file()
+    assert main([*words, "--light", "1,0,2", "--out", str(tmp_path / "b.vdb")]) == 2
+    assert "--light: what is written does not depend on it" in capsys.readouterr().err
+    assert (
+        main(["export", str(lit), "--format", "gaussian-ply", "--time", "0.5", "--out", str(tmp_path / "g.ply")]) == 2
+    )
+    assert "--light: required" in capsys.readouterr().err
+
+
 def test_layers_of_light(lit: Path, tmp_path: Path) -> None:
     words = ["--camera", "orbit", "--frames", "1", "--time", "0.5", "--light", "1,1,2", "--light-intensity", "5"]
     assert main(["render", str(lit), *words, "--format", "exr", "--out", str(tmp_path)]) == 0

@@ -18,7 +18,6 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.cameras.world import World
-from neuprim.core.model.colour_constants import C0
 from neuprim.core.model.forms import (  # noqa: F401 - the forms are part of this interface
     Constant,
     Cosine,
@@ -33,6 +32,7 @@ from neuprim.core.model.forms import (  # noqa: F401 - the forms are part of thi
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
+from neuprim.core.model.sh import lowest_band_colors
 
 if TYPE_CHECKING:
     from neuprim.core.settings import RenderSettings
@@ -216,7 +216,7 @@ class ColourField(Field):
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
         """(N, C) the part of the colour, 0 or more, that depends on neither direction nor light: what voxels teach."""
         found = self.harmonics(params, conditions)
-        return None if found is None else (found[0] * C0 + 0.5).clamp_min(0.0)
+        return None if found is None else lowest_band_colors(found[0])
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:

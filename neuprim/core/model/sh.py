@@ -44,6 +44,11 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
     return torch.stack(rows, -1)
 
 
+def lowest_band_colors(dc: Tensor) -> Tensor:
+    """(N, C) max(0, C0 dc + 1/2): colours without their dependence on direction."""
+    return (dc * C0 + 0.5).clamp_min(0.0)
+
+
 def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
     """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 tensors.
 
@@ -58,7 +63,7 @@ def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, de
     """
     _check_sh_inputs(means, dc, rest, origin, degree)
     if degree == 0:
-        return (dc * C0 + 0.5).clamp_min(0.0)
+        return lowest_band_colors(dc)
     assert rest is not None  # checked above
     if device.on_numba(means, dc, rest) and dc.dtype == means.dtype == torch.float32:
         from neuprim.core.model.colours_cpu import fused_harmonic_colors  # numba, loaded when first needed

@@ -37,6 +37,11 @@ def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
 
+def check_typical_light(typical: float) -> None:
+    if not 0 < typical < math.inf:
+        raise ValueError(f"typical light {typical!r}; expected a number above 0")
+
+
 def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
     """(N, C) intensity of the light over ``typical``, with ``falloff`` divided by the squared distance to the
     centres."""

@@ -14,11 +14,11 @@ from neuprim.core.compute import device
 from neuprim.core.environment import Environment, Illumination
 from neuprim.core.errors import DataError
 from neuprim.core.light_conditions import lights_from_environment
-from neuprim.core.model.colour_constants import C0
 from neuprim.core.model.fields import Conditions, Constant, LoweredDensity, Shading, read_script
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import ParameterSpec, Params
-from neuprim.core.render.light import shade_volume_by_light
+from neuprim.core.model.sh import lowest_band_colors
+from neuprim.core.render.light import check_typical_light, light_factor, shade_volume_by_light
 from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 
@@ -47,8 +47,7 @@ class ScatteringHarmonics(TimeHarmonics):
 
     def __init__(self, *settings: Any, typical: float = 1.0, **more: Any) -> None:
         super().__init__(*settings, **more)
-        if not 0 < typical < float("inf"):
-            raise ValueError(f"typical light {typical!r}; expected a number above 0")
+        check_typical_light(typical)
         self.typical = float(typical)
 
     def settings(self) -> dict[str, Any]:
@@ -64,13 +63,13 @@ class ScatteringHarmonics(TimeHarmonics):
         """None: light is in no harmonics."""
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
-        return (self.lowest_band(params, conditions) * C0 + 0.5).clamp_min(0.0)
+        return lowest_band_colors(self.lowest_band(params, conditions))
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         own = super().lower(params, geometry, camera, conditions).rgb
         if SHINES in conditions:
             own = own * device.to_device_like(conditions[SHINES], own)
-        strength = device.to_device_like(conditions["light_intensity"], own) / self.typical
+        strength = light_factor(geometry, conditions, self.typical, falloff=False)
         return Constant(params["scattered"].clamp_min(0.0) * strength, own)
 
     def shade(

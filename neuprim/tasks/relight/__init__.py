@@ -15,7 +15,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.data import Clip, Dataset, View, ViewSet
+from neuprim.core.data import Clip, Dataset, View
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import linear_to_srgb
 from neuprim.core.light_conditions import LIGHT_CONDITIONS, lights_from_environment, summarize_lights, typical_light
@@ -135,16 +135,13 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
     """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
 
-    def black(views: ViewSet, index: int) -> Tensor:
-        return torch.zeros_like(views.pixels(index).rgb)
-
     found = {}
-    for name, guess in {"black": black, **dataset_lighting(dataset).baselines}.items():
+    for name, guess in {"black": None, **dataset_lighting(dataset).baselines}.items():
         entries = []
         for i in range(len(dataset.test)):
-            image = guess(dataset.test, i)
+            truth = dataset.test.pixels(i).over(dataset.background)
+            image = torch.zeros_like(truth) if guess is None else guess(dataset.test, i)
             if image is not None:
-                truth = dataset.test.pixels(i).over(dataset.background)
                 entries.append(relight_metrics(dataset, i, image, truth, structure=False))
         if entries:
             found[name] = mean_metrics(entries)

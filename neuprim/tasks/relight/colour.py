@@ -36,7 +36,7 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 from neuprim.core.model.sh import prunable_sh_coefficients, truncate_sh_bands
-from neuprim.core.render.light import VISIBILITY, light_factor, normalize_direction, shade_by_light
+from neuprim.core.render.light import VISIBILITY, check_typical_light, light_factor, normalize_direction, shade_by_light
 from neuprim.core.settings import RenderSettings
 
 FORMS = ("additive", "multiplicative")
@@ -48,11 +48,6 @@ def check_count(value: object, low: int, high: float, name: str) -> None:
     if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
         expected = f"at least {low}" if high == math.inf else f"{low}..{high}"
         raise ValueError(f"{name} {value!r}; expected {expected}")
-
-
-def check_typical_light(typical: float) -> None:
-    if not 0 < typical < math.inf:
-        raise ValueError(f"typical light {typical!r}; expected a number above 0")
 
 
 class LightNetwork(ColourField):

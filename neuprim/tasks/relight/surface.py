@@ -27,9 +27,9 @@ from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
-from neuprim.core.render.light import light_factor, shade_by_light
+from neuprim.core.render.light import check_typical_light, light_factor, shade_by_light
 from neuprim.core.settings import RenderSettings
-from neuprim.tasks.relight.colour import check_count, check_typical_light
+from neuprim.tasks.relight.colour import check_count
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 INDIRECT = (0, 1, 4)

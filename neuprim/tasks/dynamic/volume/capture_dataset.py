@@ -80,6 +80,7 @@ class VdbFrameViews(ViewSet):
         self._images = _RecentFrames(self._decode, lambda rgba: rgba.numel() * 2, memory)
         self.frames = capture.frames[::every]
         self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
+        self._lights = [capture.frame_lights(frame) for frame in self.frames]  # drawn once: every step asks for a view
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
@@ -92,7 +93,7 @@ class VdbFrameViews(ViewSet):
     def view(self, index: int) -> View:
         camera, t = self._split_index(index)
         name = f"cam_{camera:02d}_frame_{self.frames[t].number:04d}"
-        lit = light_conditions(self.capture, self.capture.frame_lights(self.frames[t])[camera])
+        lit = light_conditions(self.capture, self._lights[t][camera])
         return View(name, self.capture.cameras[camera], {"time": self.times[t], **lit})
 
     def pixels(self, index: int) -> Pixels:

@@ -6,8 +6,8 @@
 
 writes a data set in the layout of `scene=olat`, unless it is there: meshes, cameras and lights are those of
 `lit_solids`, materials and light are not: light arrives from other surfaces too, metals reflect them. It is generated
-data, as its files say. Mitsuba's variant `scalar_rgb` needs no other libraries; 272 images of 160x160 take a quarter of
-an hour of one core. Images depend on settings, the version of Mitsuba and GENERATOR_VERSION alone.
+data, as its files say. Mitsuba's variant `scalar_rgb` needs no other libraries; 272 images of 160x160 take five
+minutes of one core. Images depend on settings, the version of Mitsuba and GENERATOR_VERSION alone.
 """
 
 from __future__ import annotations

@@ -6,6 +6,8 @@ Every function that takes a text from a file or a user escapes it, unless it say
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html
 import json
 import math
@@ -40,6 +42,13 @@ def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str
     template = Template(files("neuprim.report").joinpath("page.html").read_text(encoding="utf-8"))
     body = "\n".join(filter(None, sections))
     return template.substitute(title=escape(title), body=body, kind=kind, policy=policy, script=script)
+
+
+def inline_script(name: str) -> tuple[str, str]:
+    """Return a script of this package as HTML, and the source that the content policy must list to allow it."""
+    text = files("neuprim.report").joinpath(name).read_text(encoding="utf-8")
+    digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
+    return f"<script>{text}</script>", f"'sha256-{digest}'"
 
 
 # ---------------------------------------------------------------- elements

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from urllib.parse import quote
 
@@ -100,11 +98,8 @@ def write_sweep_page(folder: Path, runs: Sequence[SweepPageRun], words: Sequence
         section("Held-out views side by side", _views_side_by_side(runs)),
         section("Where the numbers come from", page.fact_list([("directory", folder), ("all numbers", "sweep.csv")])),
     ]
-    script = files("neuprim.report").joinpath("sweep.js").read_text(encoding="utf-8")
-    nonce = hashlib.sha256("".join([script, *sections]).encode()).hexdigest()[:32]  # no text inside can know it
-    target, policy = folder / "sweep.html", f"; script-src 'nonce-{nonce}'"
-    element = f'<script nonce="{nonce}">\n{script}\n</script>'
-    write_text(target, page.render_page(f"{name} – sweep", sections, "compared", policy, element))
+    target, (script, source) = folder / "sweep.html", page.inline_script("sweep.js")
+    write_text(target, page.render_page(f"{name} – sweep", sections, "compared", f"; script-src {source}", script))
     return target
 
 

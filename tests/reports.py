@@ -9,7 +9,7 @@ from pathlib import Path
 
 
 def offered(page: Path) -> list[list[str]]:
-    """The words of each command under "Go on", without ``neuprim`` itself."""
+    """The words of each command under "Next steps", without ``neuprim`` itself."""
     listed = re.search(r'<ul class="commands">(.*?)</ul>', page.read_text(encoding="utf-8"), re.DOTALL)
     assert listed is not None
     lines = [shlex.split(html.unescape(line)) for line in re.findall(r"<code>(.*?)</code>", listed[1])]

@@ -24,8 +24,6 @@ from neuprim.report.run_record import as_reported_number
 
 MISSING = "–"
 
-_PIXELATED_BELOW = 256  # pictures narrower than this many pixels are enlarged with hard pixel edges
-
 Tile = tuple[str, str, str]  # label, value and note of a number in large type, as HTML
 
 
@@ -101,9 +99,8 @@ def figure(source: Path | Tensor, caption: str, alternative: str, attributes: st
     shown = inline_picture(source) if isinstance(source, Tensor) or source.is_file() else None
     if shown is None:
         return f'<figure{attributes}><div class="absent">no picture</div>{under}</figure>'
-    kind = ' class="pixelated"' if shown.width < _PIXELATED_BELOW else ""
     size = f'width="{shown.width}" height="{shown.height}"'
-    return f'<figure{attributes}><img src="{shown.url}" {size} alt="{alternative}"{kind}>{under}</figure>'
+    return f'<figure{attributes}><img src="{shown.url}" {size} alt="{alternative}">{under}</figure>'
 
 
 def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> str:
@@ -127,6 +124,12 @@ def table_row(name: str, cells: Iterable[str], attributes: str = "") -> str:
     """Return a row of a table: its heading and its cells, as HTML."""
     body = "".join(cell if cell.startswith("<td") else f"<td>{cell}</td>" for cell in cells)
     return f"<tr{attributes}><th scope=row>{name}</th>{body}</tr>"
+
+
+def command_line(text: str, purpose: str = "") -> str:
+    """Return a command with a copy button, which appears where scripts run, and what the command is for."""
+    button = '<button type="button" class="copy" hidden>Copy</button>'
+    return f"<code>{escape(text)}</code>{button}" + (f"<span>{escape(purpose)}</span>" if purpose else "")
 
 
 def fact_list(pairs: Iterable[tuple[str, object]]) -> str:

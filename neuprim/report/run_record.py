@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from neuprim.core.errors import DataError
 from neuprim.core.io.json_reader import load_json
+from neuprim.core.metrics import metric_from_json
 
 
 @dataclass(frozen=True)
@@ -61,6 +62,17 @@ class ReportedRun:
         pairs = [(as_reported_number(line.get(x)), as_reported_number(line.get(y))) for line in self.log]
         known = [(a, b) for a, b in pairs if a is not None and b is not None]
         return [a for a, _ in known], [b for _, b in known]
+
+
+def median_and_worst(views: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
+    """Return the indices of the views with the median (the lower of two) and the lowest PSNR, as far as they differ.
+
+    Args:
+        views: entries of ``per_view`` in ``metrics.json``; those without a PSNR are left out.
+    """
+    known = [(value, i) for i, entry in enumerate(views) if (value := metric_from_json(entry, "psnr")) is not None]
+    order = [i for _, i in sorted(known)]
+    return tuple(dict.fromkeys([order[(len(order) - 1) // 2], order[0]])) if order else ()
 
 
 def as_reported_number(value: object) -> float | None:

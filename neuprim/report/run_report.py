@@ -1,10 +1,11 @@
-"""The report of one run: ``report.html`` with its numbers, held-out views, curves and settings."""
+"""The report of one run: ``report.html`` with its model, held-out views, measurements, curves and settings."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,6 @@ from neuprim.report import report_page as page
 from neuprim.report.charts import HELD_OUT, Chart, ChartPoints, curve_chart
 from neuprim.report.pictures import ERROR_SCALE, Region, color_bar
 from neuprim.report.report_page import (
-    MISSING,
     Tile,
     escape,
     figure,
@@ -27,10 +27,10 @@ from neuprim.report.report_page import (
     report_note,
     section,
 )
-from neuprim.report.run_record import ReportedRun, ViewFiles, read_reported_run
+from neuprim.report.run_record import ReportedRun, ViewFiles, median_and_worst, read_reported_run
 
 VIEWER_LIMIT = 4_000_000  # bytes of a report with a viewer in it; the viewer of a larger one becomes a page beside it
-_WORST_SHOWN = 12  # worst regions that are shown unfolded
+_WORST_SHOWN = 6  # worst regions that are shown unfolded
 
 _SOURCES = {"generated": "generated data: not photographs", "simulated": "simulated data: not captured"}
 """Data source -> badge; real data has none."""
@@ -51,6 +51,7 @@ def write_report(
     conditions: Sequence[ConditionSpec] = (),
     viewer: Viewer | None = None,
     regions: Sequence[tuple[Region, Path]] = (),
+    command: str = "",
 ) -> Path:
     """Write ``report.html`` into the directory of a run that has just been measured, and return its path.
 
@@ -60,32 +61,34 @@ def write_report(
         conditions: those of the run's task; the commands that the page offers animate them.
         viewer: becomes a part of the page, or ``viewer.html`` beside it where both exceed :data:`VIEWER_LIMIT`.
         regions: the worst regions with their pictures, the worst first.
+        command: that made the run; "" where no single command did.
 
     Raises:
         DataError: ``metrics.json`` is damaged.
     """
     run, beside, target = read_reported_run(run_dir), run_dir / _VIEWER_FILE, run_dir / "report.html"
-    head = [_report_head(run), page.report_banner(_report_warnings(run.metrics)), _report_headline(run)]
+    head = [_report_head(run, command), page.report_banner(_report_warnings(run.metrics))]
     body = [
+        _report_headline(run.metrics),
+        _report_curves(run),
         _report_films(run),
         _report_held_out_section(run),
         _report_worst_regions(regions),
-        _report_curves(run),
-        _report_view_table(run),
-        _report_settings_section(run.metrics),
-        _report_facts(run.metrics),
         _report_commands_section(run, conditions),
-        report_folded("Full configuration", f"<pre><code>{escape(_read_config(run_dir))}</code></pre>"),
+        _report_details(run),
     ]
+    script, source = page.inline_script("run.js")
 
-    def render(model: str, policy: str = "") -> str:
+    def render(model: str, sources: str = "") -> str:
         title = f"{run.metrics.get('task')} / {run.metrics.get('scene')}"
-        return page.render_page(title, [*head, section("The model", model), *body], policy=policy)
+        both = section("Model", f'<div class="model">{model}{_report_comparison(run)}</div>')
+        return page.render_page(title, [*head, both, *body], policy=f"; script-src {source}{sources}", script=script)
 
-    text = render("") if viewer is None else render(*_embed_viewer(viewer))
+    orbit = _report_orbit(run)
+    text = render(orbit) if viewer is None else render(*_embed_viewer(viewer))
     if viewer is not None and len(text.encode()) > VIEWER_LIMIT:
         write_text(beside, viewer.text)
-        text = render(f'<p><a href="{_VIEWER_FILE}">{_VIEWER_FILE}</a> draws it, to be turned by hand.</p>')
+        text = render(f'<div>{orbit}<p><a href="{_VIEWER_FILE}">Open the interactive model</a></p></div>')
     else:
         beside.unlink(missing_ok=True)  # of an earlier report
     write_text(target, text)
@@ -93,99 +96,90 @@ def write_report(
 
 
 def _embed_viewer(viewer: Viewer) -> tuple[str, str]:
-    """The model to turn by hand, as HTML, and what the page's content policy allows it."""
-    frame = f'<iframe title="the model, drawn by this browser" loading="lazy" srcdoc="{escape(viewer.text)}"></iframe>'
-    use = "Drag to turn, wheel to zoom, Shift and drag to move."
-    return f'\n{frame}<p class="rule">{use}</p>', f"; script-src 'nonce-{viewer.nonce}'; worker-src blob:"
-
-
-def _read_config(run_dir: Path) -> str:
-    return (run_dir / "config.yaml").read_text(encoding="utf-8")
+    """Return the interactive model as HTML, and what the page's content policy allows it."""
+    frame = f'<iframe title="Interactive model" loading="lazy" srcdoc="{escape(viewer.text)}"></iframe>'
+    use = "Drag to turn, scroll to zoom, Shift and drag to move."
+    return f"<figure>{frame}<figcaption>{use}</figcaption></figure>", f" 'nonce-{viewer.nonce}'; worker-src blob:"
 
 
 # ---------------------------------------------------------------- head
 
 
-def _report_head(run: ReportedRun) -> str:
-    """Return task and scene, and a badge unless the data is real."""
-    source, drawn = str(run.metrics.get("data_source")), run.metrics.get("rendered_from")
+def _report_head(run: ReportedRun, command: str) -> str:
+    """Return task and scene, a badge unless the data is real, the command, and where and when it was measured."""
+    metrics = run.metrics
+    source, drawn = str(metrics.get("data_source")), metrics.get("rendered_from")
     badge = "" if source == "real" else _SOURCES.get(source, source)
     if badge and drawn is not None:
         badge = f"{source} data: rendered from {drawn}"
-    return page.masthead(str(run.metrics.get("task")), str(run.metrics.get("scene")), badge)
+    file, size = run.run_dir / "metrics.json", metrics.get("image_size")
+    facts = {
+        "Date": f"{datetime.fromtimestamp(file.stat().st_mtime):%Y-%m-%d %H:%M}" if file.is_file() else None,
+        "Machine": metrics.get("device"),
+        "Data": metrics.get("dataset"),
+        "Image size": "×".join(map(str, size)) if isinstance(size, list) else None,
+    }
+    more = f'<div class="command">{page.command_line(command)}</div>' if command else ""
+    known = page.fact_list((name, value) for name, value in facts.items() if value is not None)
+    return page.masthead(str(metrics.get("task")), str(metrics.get("scene")), badge) + more + known
 
 
 def _report_warnings(metrics: Mapping[str, Any]) -> list[str]:
-    bad = metrics.get("worse_than_black_image")
-    if not bad:
-        return []
-    views = "1 view is" if len(bad) == 1 else f"{format_report_count(len(bad))} views are"
-    names = escape(", ".join(map(str, bad)))
-    return [f"<strong>{views} worse than a black image</strong>, which the mean hides: {names}."]
-
-
-def _report_headline(run: ReportedRun) -> str:
-    """Return final numbers in large type, and the orbit."""
-    tiles = page.report_tiles(_report_tiles(run))
-    caption = "camera orbit" + (f"; shown: {escape(run.shown)}" if run.shown else "")
-    orbit = figure(run.run_dir / "renders" / "orbit.webp", caption, "camera orbit around the scene")
-    rule = '<p class="rule">Metrics of the last checkpoint, not the best.</p>'
-    return f'<div class="with-orbit"><div>{tiles}{rule}</div><div class="orbit">{orbit}</div></div>'
-
-
-def _report_tiles(run: ReportedRun) -> list[Tile]:
-    metrics = run.metrics
-
-    def number(key: str, digits: int, unit: str = "") -> str:
-        return format_decimal(metric_from_json(metrics, key), digits, unit)
-
-    fps = metric_from_json(metrics, "render_fps")
-    shown = f"{len(run.view_numbers)} {escape(metrics.get('split'))} views"
-    tiles = [
-        ("PSNR, mean", number("psnr", 2, "dB"), shown),
-        ("PSNR, worst view", number("psnr_worst", 2, "dB"), escape(metrics.get("view_worst"))),
-        ("SSIM", number("ssim", 4), f"mean over views; as displayed, by 3DGS’s rule: {number('ssim_3dgs', 4)}"),
-    ]
+    found = []
+    if bad := metrics.get("worse_than_black_image"):
+        names = escape(", ".join(map(str, bad)))
+        found.append(f"<strong>Views that are worse than a black image: {len(bad)}</strong> ({names})")
     if empty := metrics.get("views_empty"):
-        tiles.append(("Empty views", format_report_count(empty), "the model is not in them"))
-    if "lpips_network" in metrics:
-        network = escape(metrics["lpips_network"])
-        tiles.append(
-            ("LPIPS", number("lpips", 4), f"{network}, mean over views; by 3DGS’s rule: {number('lpips_3dgs', 4)}")
-        )
-    else:
-        tiles.append(("LPIPS", MISSING, f"not measured: {escape((metrics.get('not_measured') or {}).get('lpips'))}"))
-    if "psnr_mask" in metrics:
-        black = number("psnr_black_image_mask", 1, "dB")
-        tiles.append(
-            ("PSNR inside the mask", number("psnr_mask", 2, "dB"), f"where anything ever is; a black image: {black}")
-        )
-    return [
-        *tiles,
-        *_report_volume_tiles(metrics),
-        ("Primitives", number("primitives", 0), ""),
-        ("Parameters", number("parameters", 0), f"{number('parameters_per_primitive', 0)} per primitive"),
-        ("Model size", page.format_report_bytes(metrics.get("model_bytes")), ""),
-        ("Training", format_report_duration(metrics.get("train_seconds")), f"{number('iterations', 0)} iterations"),
-        ("Rendering", format_decimal(fps, 1 if fps is None or fps < 100 else 0, "fps"), escape(metrics.get("backend"))),
-    ]
+        found.append(f"<strong>Views in which no primitive is visible: {format_report_count(empty)}</strong>")
+    return found
 
 
-def _report_volume_tiles(metrics: Mapping[str, Any]) -> list[Tile]:
-    """Return the largest error of each known volume over the compared frames."""
+def _report_headline(metrics: Mapping[str, Any]) -> str:
+    """Return quality, size and training time in large type, as far as they were measured."""
+    psnr, worst = (metric_from_json(metrics, key) for key in ("psnr", "psnr_worst"))
     tiles: list[Tile] = []
-    for key, frames in metrics.items():
-        if not key.endswith("_frames") or not isinstance(frames, list):
-            continue
-        errors = [e for frame in frames if (e := metric_from_json(frame, "max_error")) is not None]
-        if errors:
-            what = "extinction" if key == "sigma_frames" else escape(key.removesuffix("_frames"))
-            text = "of the frame’s largest value, on the files’ voxels"
-            tiles.append((f"Largest error of {what}", format_decimal(100 * max(errors), 0, "%"), text))
-    return tiles
+    if psnr is not None:
+        views = f"mean of {len(metrics.get('per_view') or ())} held-out views"
+        least = f"; worst {format_decimal(worst, 2, 'dB')} ({escape(metrics.get('view_worst'))})"
+        tiles.append(("PSNR", format_decimal(psnr, 2, "dB"), views + (least if worst is not None else "")))
+    if (ssim := metric_from_json(metrics, "ssim")) is not None:
+        tiles.append(("SSIM", format_decimal(ssim, 4), "mean of the same views"))
+    if (size := metrics.get("model_bytes")) is not None:
+        count = format_report_count(metrics.get("primitives"))
+        tiles.append(("Model file", page.format_report_bytes(size), f"{count} primitives"))
+    if (seconds := metrics.get("train_seconds")) is not None:
+        steps = format_report_count(metrics.get("iterations"))
+        tiles.append(("Training time", format_report_duration(seconds), f"{steps} iterations"))
+    note = report_note("Measured on the held-out views with the last checkpoint, not the best one.")
+    return page.report_tiles(tiles) + note if tiles else ""
 
 
 # ---------------------------------------------------------------- pictures
+
+
+def _report_orbit(run: ReportedRun) -> str:
+    caption = "camera orbit" + (f"; shown: {escape(run.shown)}" if run.shown else "")
+    return figure(run.run_dir / "renders" / "orbit.webp", caption, "camera orbit around the scene")
+
+
+def _report_comparison(run: ReportedRun) -> str:
+    """Return the frame in which ``run.js`` shows ground truth and render of a view, with a divider between them."""
+    pictured = {view.index for view in run.views}
+    chosen = zip(median_and_worst(run.view_numbers), ("Median view", "Worst view"), strict=False)
+    buttons = "".join(_view_button(index, text) for index, text in chosen if index in pictured)
+    if not buttons:
+        return ""
+    divider = '<input type="range" value="50" aria-label="Divider between ground truth and render">'
+    return (
+        f'<figure class="compare" hidden><div class="choose" role="group" aria-label="View">{buttons}</div>'
+        f'<div class="slide"></div><label class="choose">ground truth {divider} render</label>'
+        '<figcaption aria-live="polite"></figcaption></figure>'
+    )
+
+
+def _view_button(index: int, text: str) -> str:
+    """Return a button that compares a view's pictures; ``run.js`` shows it."""
+    return f'<button type="button" data-view="view-{index}" hidden>{text}</button>'
 
 
 def _report_films(run: ReportedRun) -> str:
@@ -203,33 +197,32 @@ def _report_shown_channels(run: ReportedRun) -> str:
 
 
 def _report_held_out_section(run: ReportedRun) -> str:
-    """Return each view: render, truth and error map with its numbers; the colour bar once."""
-    ticks = "".join(f"<span>{'≥ ' if i == 4 else ''}{ERROR_SCALE * i / 4:g}</span>" for i in range(5))
-    bar = (
-        f'<div class="scale"><p>Error: mean absolute difference over {"all " if run.shown else ""}channels</p>'
-        f'<div class="bar" style="background: {color_bar()}"></div><div class="ticks">{ticks}</div></div>'
-    )
-    rows = "".join(_report_view_row(run, view) for view in run.views)
-    exact = report_note("Large pictures are compressed on this page; the PNG files in renders/ are exact.")
-    return section("Held-out views", f"{_report_shown_channels(run)}{bar}{rows}{exact}" if rows else "")
+    """Return ground truth, render and error map of each pictured view with its numbers, and their scale once."""
+    bar = f'0<span class="bar" style="background: {color_bar()}"></span>{ERROR_SCALE:g} or more'
+    scale = report_note(f"Error: mean absolute difference over {'all ' if run.shown else ''}channels, {bar}.")
+    orders = (("0", "view"), ("1", "PSNR, lowest first"), ("-1", "PSNR, highest first"))
+    options = "".join(f'<option value="{sign}">{text}</option>' for sign, text in orders)
+    order = f'<p class="choose" hidden><label for="order">Sort by</label><select id="order">{options}</select></p>'
+    views = f'<div class="gallery">{"".join(_report_view(run, view) for view in run.views)}</div>'
+    exact = report_note("Large pictures are compressed on this page. The PNG files in renders/ are exact.")
+    body = f"{_report_shown_channels(run)}{scale}{order}{views}{exact}"
+    return section("Held-out views", body if run.views else "")
 
 
-def _report_view_row(run: ReportedRun, view: ViewFiles) -> str:
+def _report_view(run: ReportedRun, view: ViewFiles) -> str:
     entry = run.numbers_of(view)
-    name = escape(entry.get("name") or view.stem)
-    numbers = [
-        (format_decimal(metric_from_json(entry, "psnr"), 2), "dB PSNR"),
-        (format_decimal(metric_from_json(entry, "ssim"), 4), "SSIM"),
-        (format_decimal(metric_from_json(entry, "seconds"), 3), "s to render"),
-    ]
+    name, psnr = escape(entry.get("name") or view.stem), metric_from_json(entry, "psnr")
+    numbers = [(format_decimal(psnr, 2), "dB PSNR"), (format_decimal(metric_from_json(entry, "ssim"), 4), "SSIM")]
     line = "".join(f"<span><b>{value}</b> {what}</span>" for value, what in numbers)
-    pictures = ((view.render, "render"), (view.truth, "ground truth"), (view.error, "error"))
+    pictures = ((view.truth, "ground truth"), (view.render, "render"), (view.error, "error"))
     figures = "".join(figure(path, caption, f"{caption} of view {name}") for path, caption in pictures)
-    return f'<article class="view"><header><h3>{name}</h3><p>{line}</p></header>{figures}</article>'
+    head = f"<header><h3>{name}</h3><p>{line}</p>{_view_button(view.index, 'Compare')}</header>"
+    value = "" if psnr is None else repr(psnr).replace("inf", "Infinity")
+    return f'<article class="view" id="view-{view.index}" data-psnr="{value}">{head}{figures}</article>'
 
 
 def _report_worst_regions(regions: Sequence[tuple[Region, Path]]) -> str:
-    """Return the square of every held-out view with the largest error, worst first, folded after the first dozen."""
+    """Return the square of every held-out view with the largest error, worst first, folded after the first six."""
     figures = []
     for region, path in regions:
         name, place = escape(region.view), f"{region.side}×{region.side} at ({region.x}, {region.y})"
@@ -237,9 +230,7 @@ def _report_worst_regions(regions: Sequence[tuple[Region, Path]]) -> str:
         figures.append(figure(path, caption, f"worst region of view {name}: ground truth, render, error"))
     if not figures:
         return ""
-    text = (
-        "Of every view the square of a quarter of its shorter side with the largest error: ground truth, render, error."
-    )
+    text = "The square with the largest error in each view: ground truth, render, error."
     first, rest = ("".join(part) for part in (figures[:_WORST_SHOWN], figures[_WORST_SHOWN:]))
     body = f'{report_note(text)}<div class="regions">{first}</div>'
     if rest:
@@ -251,29 +242,18 @@ def _report_worst_regions(regions: Sequence[tuple[Region, Path]]) -> str:
 
 
 def _report_curves(run: ReportedRun) -> str:
-    def curve(x: str, key: str, what: str) -> Chart:
-        lines = [ChartPoints(*run.series(x, key), band=True)]
+    def curve(key: str, what: str) -> Chart:
+        lines = [ChartPoints(*run.series("seconds", key), band=True)]
         if key == "psnr":
-            lines.append(ChartPoints(*run.series(x, "eval_psnr"), HELD_OUT))
-        title = f"{what} over {'time' if x == 'seconds' else 'steps'}"
-        return curve_chart(title, "steps" if x == "step" else x, lines, log=key == "loss")
+            lines.append(ChartPoints(*run.series("seconds", "eval_psnr"), HELD_OUT))
+        return curve_chart(f"{what} over time", "seconds", lines, log=key == "loss")
 
-    def held_out(title: str, unit: str, entries: Sequence[Mapping[str, Any]], joined: bool) -> Chart:
-        known = [
-            (i, value) for i, entry in enumerate(entries) if (value := metric_from_json(entry, "psnr")) is not None
-        ]
-        points = ChartPoints([i for i, _ in known], [value for _, value in known], HELD_OUT, joined)
-        return curve_chart(title, unit, [points])
-
-    charts = [
-        curve("seconds", "psnr", "PSNR"),
-        curve("seconds", "loss", "Loss"),
-        curve("seconds", "primitives", "Primitives"),
-        curve("step", "psnr", "PSNR"),
-        curve("step", "loss", "Loss"),
-        held_out("PSNR per view", "view", run.view_numbers, False),
-        held_out("PSNR over frames", "frame", run.metrics.get("per_frame") or (), True),
-    ]
+    frames = run.metrics.get("per_frame")
+    psnrs = [metric_from_json(entry, "psnr") for entry in frames or run.view_numbers]
+    known = {i: value for i, value in enumerate(psnrs) if value is not None}
+    points = ChartPoints(list(known), list(known.values()), HELD_OUT, joined=bool(frames))
+    title, unit = ("PSNR over frames", "frame") if frames else ("PSNR per view", "view")
+    charts = [curve("psnr", "PSNR"), curve("loss", "Loss"), curve_chart(title, unit, [points])]
     body = page.chart_panels(
         (f"{chart.title}, dB" if "PSNR" in chart.title else chart.title, chart) for chart in charts
     )
@@ -281,49 +261,90 @@ def _report_curves(run: ReportedRun) -> str:
     return section("Curves", key + body) if body else ""
 
 
-# ---------------------------------------------------------------- tables
+# ---------------------------------------------------------------- commands and details
 
 
-def _report_view_table(run: ReportedRun) -> str:
+def _report_commands_section(run: ReportedRun, conditions: Sequence[ConditionSpec]) -> str:
+    """Return commands for this run, among them an animation of each condition of the task that has one."""
+    folder = shlex.quote(str(run.run_dir))
+    orbit = f"neuprim render {folder} --camera orbit"
+    lines = [(f"neuprim view {folder}", "open the model in the viewer"), (orbit, "render a camera orbit")]
+    for spec in conditions:
+        if spec.sweep:
+            command = f"{orbit} {condition_flag(spec.name)} {shlex.quote(spec.sweep)}"
+            lines.append((command, f"render a camera orbit while the {spec.name.replace('_', ' ')} changes"))
+    lines.append((f"neuprim compress {folder}", "write a smaller model file"))
+    lines.append((f"neuprim eval {folder}", "measure the held-out views again"))
+    items = "".join(f'<li class="command">{page.command_line(line, what)}</li>' for line, what in lines)
+    return section("Next steps", f'<ul class="commands">{items}</ul>')
+
+
+def _report_details(run: ReportedRun) -> str:
+    """Return, folded, all measurements, settings and versions."""
+    views, file = _report_view_table(run.view_numbers), run.run_dir / "config.yaml"
+    parts = {
+        "All measurements": page.fact_list(_report_measurements(run.metrics)),
+        f"All {format_report_count(len(run.view_numbers))} held-out views": views,
+        "Settings changed from their defaults": _report_settings(run.metrics),
+        "Data and versions": page.fact_list(_report_facts(run.metrics)),
+        "Full configuration": f"<pre><code>{escape(file.read_text(encoding='utf-8'))}</code></pre>",
+    }
+    return section("Details", "".join(report_folded(title, body) for title, body in parts.items()))
+
+
+def _report_measurements(metrics: Mapping[str, Any]) -> list[tuple[str, object]]:
+    """Return name and value of what the tiles leave out, as far as it was measured."""
+    rows: list[tuple[str, str, int, str]] = [
+        ("PSNR of sRGB images", "psnr_srgb", 2, "dB"),
+        ("PSNR of displayed images", "psnr_display", 2, "dB"),
+        ("PSNR inside the mask", "psnr_mask", 2, "dB"),
+        ("PSNR inside the mask, black image", "psnr_black_image_mask", 2, "dB"),
+        ("SSIM by the rule of 3DGS", "ssim_3dgs", 4, ""),
+        (f"LPIPS ({metrics.get('lpips_network')})", "lpips", 4, ""),
+        ("LPIPS by the rule of 3DGS", "lpips_3dgs", 4, ""),
+        ("Parameters", "parameters", 0, ""),
+        ("Parameters per primitive", "parameters_per_primitive", 0, ""),
+        (f"Rendering speed ({metrics.get('backend')})", "render_fps", 1, "fps"),
+    ]
+    found: list[tuple[str, object]] = [
+        (name, format_decimal(value, digits, unit))
+        for name, key, digits, unit in rows
+        if (value := metric_from_json(metrics, key)) is not None
+    ]
+    found += [(name.upper(), f"not measured: {why}") for name, why in (metrics.get("not_measured") or {}).items()]
+    for key, frames in metrics.items():  # of each known volume, over the compared frames
+        if key.endswith("_frames") and isinstance(frames, list):
+            errors = [e for frame in frames if (e := metric_from_json(frame, "max_error")) is not None]
+            what = "extinction" if key == "sigma_frames" else key.removesuffix("_frames")
+            text = f"{format_decimal(100 * max(errors, default=0.0), 0, '%')} of the frame’s maximum"
+            found += [(f"Largest error of {what}", text)] if errors else []
+    return found
+
+
+def _report_view_table(entries: Sequence[Mapping[str, Any]]) -> str:
     digits = {"psnr": 3, "ssim": 5, "seconds": 3}
     rows = [
         page.table_row(
             escape(entry.get("name")), [format_decimal(metric_from_json(entry, key), n) for key, n in digits.items()]
         )
-        for entry in run.view_numbers
+        for entry in entries
     ]
-    table = page.number_table(("view", "PSNR, dB", "SSIM", "render, s"), rows)
-    return report_folded(f"All {format_report_count(len(rows))} held-out views", table)
+    return page.number_table(("view", "PSNR, dB", "SSIM", "render, s"), rows)
 
 
-def _report_settings_section(metrics: Mapping[str, Any]) -> str:
+def _report_settings(metrics: Mapping[str, Any]) -> str:
     rows = []
     for key, pair in (metrics.get("non_default") or {}).items():
         default, value = (f"<code>{escape(page.format_report_setting(v))}</code>" for v in pair)
         rows.append(page.table_row(escape(key), (f'<td class="default">{default}</td>', value)))
     table = page.number_table(("setting", "default", "this run"), rows, "")
-    body = table if rows else report_note("All settings are at their defaults.")
-    return section("Settings changed from their defaults", body)
+    return table if rows else report_note("All settings are at their defaults.")
 
 
-def _report_facts(metrics: Mapping[str, Any]) -> str:
-    keys = ("split", "data_source", "color_space", "downsampling", "background", "seed", "iterations")
-    pairs = [(key.replace("_", " "), metrics.get(key)) for key in (*keys, "checkpoint", "backend", "device")]
+def _report_facts(metrics: Mapping[str, Any]) -> list[tuple[str, object]]:
+    keys = ("split", "train_views", "data_source", "color_space", "downsampling", "background", "seed", "backend")
+    pairs: list[tuple[str, object]] = [(key.replace("_", " "), metrics.get(key)) for key in keys]
     pairs.append(("channels", ", ".join(map(str, metrics.get("channels") or ()))))
     pairs += (metrics.get("versions") or {}).items()
     made_by = metrics.get("made_by") or {}
-    pairs += [(f"{kind} made by", made_by[kind]) for kind in ("task", "scene", "loss") if kind in made_by]
-    return section("Run", page.fact_list(pairs))
-
-
-def _report_commands_section(run: ReportedRun, conditions: Sequence[ConditionSpec]) -> str:
-    """Return the commands that go on from here, among them an animation of each condition of the task that has one."""
-    folder = shlex.quote(str(run.run_dir))
-    orbit = f"neuprim render {folder} --camera orbit"
-    lines = [(f"neuprim eval {folder}", "measure again"), (orbit, "fly around the scene")]
-    for spec in conditions:
-        if spec.sweep:
-            command = f"{orbit} {condition_flag(spec.name)} {shlex.quote(spec.sweep)}"
-            lines.append((command, f"fly around it while the {spec.name.replace('_', ' ')} changes"))
-    items = "".join(f"<li><code>{escape(line)}</code><span>{escape(what)}</span></li>" for line, what in lines)
-    return section("Go on", f'<ul class="commands">{items}</ul>')
+    return pairs + [(f"{kind} made by", made_by[kind]) for kind in ("task", "scene", "loss") if kind in made_by]

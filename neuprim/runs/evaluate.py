@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.plugins.attribution import call_task_clips, call_task_orbit
 from neuprim.report.pictures import WorstRegions, error_map
+from neuprim.report.run_record import median_and_worst
 from neuprim.report.run_report import Viewer, write_report
 from neuprim.runs.fit import Fitted
 from neuprim.runs.measure import measure_views, render_image, summarize_run_metrics
@@ -29,17 +31,21 @@ from neuprim.webpage.model_page import (
     webpage_subtitle,
 )
 
-_SHOWN_VIEWS = 8  # held-out views in renders/ and the report
+_SHOWN_VIEWS = 8  # held-out views in renders/ and the report, the median and the worst among them
 _ORBIT_FRAMES = 36
 
 
-def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
-    """Write ``metrics.json``, ``renders/`` and the report of a model saved in ``directory``; returns the metrics."""
+def evaluate_fitted(fitted: Fitted, directory: Path, command: str = "") -> dict[str, Any]:
+    """Write ``metrics.json``, ``renders/`` and the report of a model saved in ``directory``; returns the metrics.
+
+    ``command`` made the run, for the report; "" where no single command did.
+    """
     task, dataset, model, settings = fitted.task, fitted.dataset, fitted.model, fitted.config.renderer
     display = fitted.channels.display
     fitted.unlock_bands()
     count = len(dataset.test)
-    shown = {round(i * (count - 1) / max(min(count, _SHOWN_VIEWS) - 1, 1)) for i in range(min(count, _SHOWN_VIEWS))}
+    spread = count if count <= _SHOWN_VIEWS else _SHOWN_VIEWS - 2
+    shown = {round(i * (count - 1) / max(spread - 1, 1)) for i in range(spread)}
     folder = directory / "renders"
     folder.mkdir(exist_ok=True)
 
@@ -57,16 +63,19 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
             spool = None
 
     def write_view(index: int, view: View, rendered: Tensor, truth: Tensor) -> None:
+        stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
+        images.write_png(folder / f"{stem}.png", display(rendered))
+        images.write_png(folder / f"{stem}_truth.png", display(truth))
+        images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
+
+    def add_view(index: int, view: View, rendered: Tensor, truth: Tensor) -> None:
         regions.add_view(view.name, rendered, truth)
         if index in clip_of_view:
             add_frame(clip_of_view[index], index, rendered, truth)
         if index in shown:
-            stem = f"test_{index:03d}_" + "".join(c if c.isalnum() or c in "-_" else "_" for c in view.name)
-            images.write_png(folder / f"{stem}.png", display(rendered))
-            images.write_png(folder / f"{stem}_truth.png", display(truth))
-            images.write_png(folder / f"{stem}_error.png", torch.from_numpy(error_map(rendered, truth)))
+            write_view(index, view, rendered, truth)
 
-    views = measure_views(model, task, dataset, settings, fitted.lpips, write_view)
+    views = measure_views(model, task, dataset, settings, fitted.lpips, add_view)
     for clip in clips:
         if clip.source is not None:  # the frames of others are test views, written above
             for i in clip.views:
@@ -75,10 +84,17 @@ def evaluate_fitted(fitted: Fitted, directory: Path) -> dict[str, Any]:
     size = (directory / "model.safetensors").stat().st_size
     metrics = summarize_run_metrics(fitted, dataset, model, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
+    for i in set(median_and_worst(metrics["per_view"])) - shown:
+        view, pixels = dataset.test.view(i), dataset.test.pixels(i)
+        truth, rendered = pixels.over(dataset.background), render_image(model, view, settings, dataset.background)
+        if pixels.mask is not None:
+            rendered = torch.where(pixels.mask[..., None], rendered, truth)
+        write_view(i, view, rendered, truth)
     orbit = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [display(render_image(model, view, settings, dataset.background)) for view in orbit]
     write_animation(folder / "orbit.webp", frames, fps=12.0)
-    write_report(directory, task.conditions, _make_run_viewer_page(fitted, directory), regions.write(folder))
+    viewer = _make_run_viewer_page(fitted, directory)
+    write_report(directory, task.conditions, viewer, regions.write(folder), command)
     return metrics
 
 
@@ -92,7 +108,8 @@ def _make_run_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
     def render_frame(model: Primitives, camera: Camera, conditions: Conditions) -> Tensor:
         return render_image(model, View("", camera, conditions), settings, dataset.background)
 
-    views = held_out_webpage_views(dataset, channels, _SHOWN_VIEWS)
+    # without images: the report shows them beside the model
+    views = [replace(view, truth="") for view in held_out_webpage_views(dataset, channels, _SHOWN_VIEWS)]
     scene = PageScene(
         webpage_subtitle(task.name, dataset.data_source),
         dataset.background.tolist(),

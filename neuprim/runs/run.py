@@ -6,6 +6,7 @@ budget. ``chunks.json`` records what became of each chunk, so that nothing is do
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Mapping
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -87,7 +88,8 @@ def run(
         if first:
             preview.finish(fitted)
             events(Finishing("measuring held-out views"))
-            events(Note(format_metrics(evaluate_fitted(fitted, directory))))
+            command = shlex.join(["neuprim", "run", *drop_output_overrides(config.overrides)])
+            events(Note(format_metrics(evaluate_fitted(fitted, directory, command))))
     if interrupted:
         raise KeyboardInterrupt
     return directory

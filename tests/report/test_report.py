@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import html.parser
 import json
 import math
@@ -19,6 +21,7 @@ from neuprim.core.metrics import metric_to_json, psnr, ssim
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.report.pictures import WorstRegions, error_map
 from neuprim.report.run_report import write_report
+from tests.browsers import browser
 from tests.reports import offered
 
 NAMES = ("r_0", "r_25", "night-view", "r_75")
@@ -105,7 +108,7 @@ def page_of(run: Path) -> str:
 class Structure(html.parser.HTMLParser):
     """Collects elements, and asserts that every element that opens also closes in order."""
 
-    VOID = frozenset({"meta", "link", "img"})
+    VOID = frozenset({"meta", "link", "img", "input"})
 
     def __init__(self, page: str) -> None:
         super().__init__()
@@ -128,7 +131,7 @@ class Structure(html.parser.HTMLParser):
         assert self.open.pop() == tag
 
     def handle_data(self, data: str) -> None:
-        if "style" not in self.open:
+        if not {"style", "script"} & set(self.open):
             self.words.append(data)
 
     @property
@@ -142,14 +145,14 @@ def test_a_finished_run_shows_what_it_measured(finished: Path) -> None:
     text = Structure(page).text
     assert "<title>static / chequered-ball – neuprim</title>" in page
     for expected in (
-        "generated data: not photographs", "Metrics of the last checkpoint, not the best.",
-        f"PSNR, mean {metrics['psnr']:.2f} dB 4 test views",
-        f"PSNR, worst view {metrics['psnr_worst']:.2f} dB r_75", f"SSIM {metrics['ssim']:.4f}", "Primitives 10,000",
-        "670,000 67 per primitive",
-        "2.68 MB", "11 min 04 s 4,000 iterations", "41.4 fps cpu", "16-core CPU", "2.13.0+cpu",
+        "generated data: not photographs", "with the last checkpoint, not the best one",
+        f"PSNR {metrics['psnr']:.2f} dB mean of 4 held-out views; worst {metrics['psnr_worst']:.2f} dB (r_75)",
+        f"SSIM {metrics['ssim']:.4f}", "Model file 2.68 MB 10,000 primitives",
+        "Training time 11 min 04 s 4,000 iterations", "Machine 16-core CPU",
+        "Parameters 670,000", "Parameters per primitive 67", "Rendering speed (cpu) 41.4 fps", "2.13.0+cpu",
         "200x200 from 800x800 by area",
         "train.iterations 30000 4000", 'model.growth null {"until": 3000}', "train.ssim true false", "neurons: 8",
-        "≥ 0.2", "night-view",
+        "0.2 or more", "night-view",
         "mean absolute difference",
     ):  # fmt: skip
         assert expected in text, expected
@@ -157,15 +160,39 @@ def test_a_finished_run_shows_what_it_measured(finished: Path) -> None:
         assert f"{entry['name']} {entry['psnr']:.2f} dB PSNR {entry['ssim']:.4f} SSIM" in text
     assert f"neuprim eval '{finished}'" in text
     assert f"neuprim render '{finished}' --camera orbit" in text
+    sections = ["Model", "Curves", "Held-out views", "Next steps", "Details"]
+    assert re.findall("<h2>(.*?)</h2>", page) == sections
+
+
+def test_the_head_names_command_date_machine_data_and_image_size(quick: Path) -> None:
+    change(quick, dataset="chair", image_size=[800, 600])
+    command = "neuprim run task=static 'scene.path=<my> \"data\"'"
+    page = write_report(quick, command=command).read_text(encoding="utf-8")
+    text = Structure(page).text
+    assert f"{command} Copy Date 20" in text and page.index("neuprim run") < page.index("<h2>Model")
+    assert re.search(r"Date \d{4}-\d\d-\d\d \d\d:\d\d Machine 16-core CPU Data chair Image size 800×600 Model", text)
+    assert "neuprim run" not in page_of(quick), "no single command made this run"
+
+
+def test_a_tile_exists_only_for_what_was_measured(quick: Path) -> None:
+    def tiles() -> list[str]:
+        return re.findall(r'<div class="tile"><dt>(.*?)</dt>', page_of(quick))
+
+    assert tiles() == ["PSNR", "SSIM", "Model file", "Training time"]
+    change(quick, ssim=None, train_seconds=None)
+    assert tiles() == ["PSNR", "Model file"]
+    change(quick, psnr=None, model_bytes=None)
+    assert tiles() == [] and "last checkpoint" not in page_of(quick)
 
 
 def test_the_commands_offered_are_those_of_the_task(quick: Path) -> None:
     shutil.copy(quick / "renders" / "orbit.webp", quick / "renders" / "clip_a.webp")
-    eval_it, fly = ["eval", str(quick)], ["render", str(quick), "--camera", "orbit"]
-    assert offered(write_report(quick)) == [eval_it, fly], "films alone promise no condition"
+    fly = ["render", str(quick), "--camera", "orbit"]
+    view, compress, measure = ([name, str(quick)] for name in ("view", "compress", "eval"))
+    assert offered(write_report(quick)) == [view, fly, compress, measure], "films alone promise no condition"
     light = ConditionSpec("light_position", (3,), "m", (-1.0, 1.0), lambda text: [], sweep="orbit:2 3")
     page = write_report(quick, (ConditionSpec("gain", (), "1", (0.0, 1.0), lambda text: []), light))
-    assert offered(page) == [eval_it, fly, [*fly, "--light-position", "orbit:2 3"]]
+    assert offered(page) == [view, fly, [*fly, "--light-position", "orbit:2 3"], compress, measure]
     assert "while the light position changes" in Structure(page.read_text(encoding="utf-8")).text
 
 
@@ -173,25 +200,24 @@ def test_pictures_and_charts_are_all_there(finished: Path) -> None:
     elements = Structure((finished / "report.html").read_text(encoding="utf-8")).elements
     images = [attributes for tag, attributes in elements if tag == "img"]
     assert len(images) == 3 * len(NAMES) + 1
-    assert all(
-        i["alt"] and i["width"] == "64" and i["height"] == "48" and i.get("class") == "pixelated" for i in images
-    )
+    assert all(i["alt"] and i["width"] == "64" and i["height"] == "48" for i in images)
+    kinds = [str(image["alt"]).partition(" of view ")[0] for image in images[1:]]
+    assert kinds == ["ground truth", "render", "error"] * len(NAMES)
     assert sum(str(i["src"]).startswith("data:image/webp;base64,") for i in images) == 1
     labels = [attributes["aria-label"] for tag, attributes in elements if tag == "svg"]
-    lines = ["PSNR over time", "Loss over time", "Primitives over time", "PSNR over steps", "Loss over steps"]
-    assert labels == [*lines, "PSNR per view"]
+    assert labels == ["PSNR over time", "Loss over time", "PSNR per view"]
 
 
 def test_the_page_stands_alone(finished: Path) -> None:
     page = (finished / "report.html").read_text(encoding="utf-8")
     assert "http://" not in page and "https://" not in page
-    assert "@import" not in page and "<script" not in page
+    assert "@import" not in page and "pixelated" not in page, "pictures are scaled smoothly"
     assert "default-src 'none'; img-src data:; style-src 'unsafe-inline'" in page
     assert "prefers-color-scheme: dark" in page and 'name="viewport"' in page
     assert all(address.startswith("#") for address in re.findall(r"url\((.*?)\)", page))
     ids = []
     for tag, attributes in Structure(page).elements:
-        assert tag not in {"script", "iframe", "object", "embed", "base", "form"}
+        assert tag not in {"iframe", "object", "embed", "base", "form"} and (tag != "script" or not attributes)
         for key, value in attributes.items():
             assert not key.startswith("on") and key != "srcset"
             if key in {"src", "href", "xlink:href"}:
@@ -199,6 +225,9 @@ def test_the_page_stands_alone(finished: Path) -> None:
         if "id" in attributes:
             ids.append(attributes["id"])
     assert len(ids) == len(set(ids))
+    scripts = re.findall("<script>(.*?)</script>", page, re.DOTALL)
+    digests = [base64.b64encode(hashlib.sha256(script.encode()).digest()).decode() for script in scripts]
+    assert len(scripts) == 1 and f"; script-src 'sha256-{digests[0]}'\">" in page, "no other script may run"
     references = set(re.findall(r'(?:href="|url\()#([^")]+)', page))
     assert references and references <= set(ids)
 
@@ -230,7 +259,8 @@ def test_everything_from_outside_is_escaped(tmp_path: Path) -> None:
     (run / "config.yaml").write_text("x: '</code></pre><script>bad</script>'\n", encoding="utf-8")
     page = page_of(run)
     structure = Structure(page)
-    assert not {"script", "i"} & {tag for tag, _ in structure.elements}
+    tags = [tag for tag, _ in structure.elements]
+    assert "i" not in tags and tags.count("script") == 1, "the page's own"
     assert structure.text.count("<script>alert(1)</script>\"'&$x^2$<i>") >= len(strings)
     assert "</code></pre><script>bad</script>" in structure.text
 
@@ -239,7 +269,7 @@ def test_infinite_psnr(quick: Path) -> None:
     views = [{"name": "a", **metric_to_json("psnr", math.inf), "ssim": 1.0}, {"name": "b", "psnr": 30.0, "ssim": 0.9}]
     change(quick, per_view=views, **metric_to_json("psnr", math.inf), psnr_worst=30.0, view_worst="b")
     text = Structure(page_of(quick)).text
-    assert "PSNR, mean ∞ dB" in text and "a ∞ dB PSNR 1.0000 SSIM" in text and "PSNR, worst view 30.00 dB b" in text
+    assert "PSNR ∞ dB mean of 2 held-out views; worst 30.00 dB (b)" in text and "a ∞ dB PSNR 1.0000 SSIM" in text
 
 
 def test_views_worse_than_nothing_and_not_measured_numbers_say_so(quick: Path) -> None:
@@ -247,12 +277,11 @@ def test_views_worse_than_nothing_and_not_measured_numbers_say_so(quick: Path) -
     change(quick, psnr_mask=20.0, psnr_black_image_mask=9.0, sigma_frames=[{"max_error": 0.25}, {"max_error": None}])
     text = Structure(page_of(quick)).text
     for expected in (
-        *(
-            "1 view is worse than a black image , which the mean hides: <a>.",
-            "Empty views 2",
-            "not measured: no weights",
-        ),
-        *("20.00 dB where anything ever is; a black image: 9.0 dB", "Largest error of extinction 25 %"),
+        "Views that are worse than a black image: 1 (<a>)",
+        "Views in which no primitive is visible: 2",
+        "LPIPS not measured: no weights",
+        "PSNR inside the mask 20.00 dB PSNR inside the mask, black image 9.00 dB",
+        "Largest error of extinction 25 % of the frame’s maximum",
     ):
         assert expected in text, expected
 
@@ -265,6 +294,45 @@ def test_the_worst_regions_come_first_and_the_rest_is_folded(quick: Path) -> Non
         rendered[8:18, 8:18] += 0.1 + 0.02 * i
         regions.add_view(f"<i>{i}", rendered, truth)
     page = write_report(quick, regions=regions.write(quick / "renders")).read_text(encoding="utf-8")
-    assert "8 more" in page and "&lt;i&gt;19" in page and "<i>" not in page
+    assert "14 more" in page and "&lt;i&gt;19" in page and "<i>" not in page
     assert page.count("worst region of view") == 20
     assert page.index("worst region of view &lt;i&gt;19") < page.index("worst region of view &lt;i&gt;18")
+
+
+def test_a_browser_compares_sorts_and_copies(tmp_path: Path) -> None:
+    report = write_report(make_run(tmp_path / "run"), command="neuprim run task=static")
+    with browser() as found:
+        page, faults = found.new_page(viewport={"width": 390, "height": 800}), []
+        page.on("console", lambda message: faults.append(message.text))
+        page.on("pageerror", lambda error: faults.append(str(error)))
+        page.on("request", lambda request: faults.append(request.url) if request.url.startswith("http") else None)
+        page.goto(report.as_uri())
+        assert page.evaluate("document.documentElement.scrollWidth") == 390, "nothing is wider than a telephone"
+
+        def shown() -> tuple[str, list[str]]:
+            pictures = page.eval_on_selector_all(".slide img", "found => found.map(x => x.alt)")
+            return str(page.inner_text(".compare figcaption")).partition(" ")[0], [str(x) for x in pictures]
+
+        def order() -> list[str]:
+            return [str(x) for x in page.eval_on_selector_all(".view h3", "found => found.map(x => x.textContent)")]
+
+        assert shown() == ("night-view", ["ground truth of view night-view", "render of view night-view"]), "median"
+        page.get_by_role("button", name="Worst view").click()
+        assert shown()[0] == "r_75" and page.get_attribute("button[aria-pressed=true]", "data-view") == "view-3"
+        slider = page.get_by_role("slider", name="Divider between ground truth and render")
+        slider.press("ArrowRight")
+        assert slider.get_attribute("aria-valuetext") == "51 % ground truth"
+        box = page.locator(".slide").bounding_box()
+        page.mouse.click(box["x"] + 0.25 * box["width"], box["y"] + 0.5 * box["height"])
+        assert slider.input_value() == "25" and page.locator(".slide").get_attribute("style") == "--at: 25%;"
+        assert order() == list(NAMES)
+        page.select_option("#order", label="PSNR, lowest first")
+        assert order() == [*reversed(NAMES)]
+        page.select_option("#order", label="PSNR, highest first")
+        assert order() == list(NAMES)
+        page.get_by_role("button", name="Compare").nth(1).click()
+        assert shown()[0] == "r_25"
+        page.locator(".copy").first.click()
+        page.get_by_role("button", name="Copied").wait_for()
+        assert page.evaluate("getSelection().toString()") == "neuprim run task=static"
+        assert faults == []

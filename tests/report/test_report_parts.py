@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from neuprim.core.errors import DataError, NonFiniteError
+from neuprim.core.metrics import metric_to_json
 from neuprim.report.charts import HELD_OUT, TRAINING, ChartPoints, Dot, curve_chart, draw_svg, front_chart
 from neuprim.report.pictures import ERROR_SCALE, MAX_REGIONS, WorstRegions, error_map, inline_picture, worst_region
 from neuprim.report.report_page import (
@@ -22,7 +23,7 @@ from neuprim.report.report_page import (
     format_report_count,
     format_report_duration,
 )
-from neuprim.report.run_record import read_reported_run
+from neuprim.report.run_record import median_and_worst, read_reported_run
 
 
 @pytest.mark.parametrize("text", [b"{", b"[]", b"\xff\xfe\x00", b"[" * 100_000])
@@ -42,6 +43,17 @@ def test_views_are_told_apart_by_index(tmp_path: Path) -> None:
     assert [(v.index, v.stem) for v in views] == [(2, "x_truth"), (10, "a"), (1000, "b")]
     assert views[0].truth == folder / "test_002_x_truth_truth.png"
     assert views[0].error == folder / "test_002_x_truth_error.png"
+
+
+@pytest.mark.parametrize(
+    ("psnrs", "expected"),
+    [
+        ([], ()), ([None], ()), ([3.0], (0,)), ([4.0, 3.0], (1,)), ([5.0, 3.0, 4.0], (2, 1)),
+        ([5.0, None, 3.0, 4.0, math.inf], (3, 2)), ([7.0, 7.0, 7.0], (1, 0)),
+    ],
+)  # fmt: skip
+def test_the_median_and_the_worst_view(psnrs: list[float | None], expected: tuple[int, ...]) -> None:
+    assert median_and_worst([metric_to_json("psnr", x) if x else {"psnr": None} for x in psnrs]) == expected
 
 
 def test_large_pictures_are_compressed(tmp_path: Path) -> None:

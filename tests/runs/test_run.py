@@ -89,6 +89,20 @@ def test_contents(whole: Path) -> None:
     assert "<html" in (whole / "report.html").read_text(encoding="utf-8")
 
 
+def test_the_report_shows_the_median_and_the_worst_view(tmp_path: Path) -> None:
+    """Of many held-out views, these are among the pictures."""
+    typed = "task=static scene=solids scene.size=16 scene.supersampling=1 model.primitives=20 train.iterations=3"
+    out = run(compose([*typed.split(), f"output_dir={tmp_path / 'run'}"]))
+    views = read_metrics(out)["per_view"]
+    order = sorted(range(len(views)), key=lambda i: views[i]["psnr"])
+    pictured = {int(path.name[5:8]) for path in (out / "renders").glob("test_*_error.png")}
+    assert len(views) == 20 and {order[0], order[9]} <= pictured and 6 <= len(pictured) <= 8
+    text = (out / "report.html").read_text()
+    for name, view in (("Median", order[9]), ("Worst", order[0])):
+        assert f'data-view="view-{view}" hidden>{name} view</button>' in text and f'id="view-{view}"' in text
+    assert f"<code>neuprim run {typed}</code>" in text
+
+
 def test_metrics(whole: Path) -> None:
     metrics = read_metrics(whole)
     expected = {
@@ -111,7 +125,7 @@ def test_lpips_is_measured_where_there_are_weights(whole: Path, scene: Path, tmp
     metrics = read_metrics(whole)
     assert metrics["lpips"] is None and "no weights were given" in metrics["not_measured"]["lpips"]
     assert all("lpips" not in view for view in metrics["per_view"])
-    assert "not measured: no weights were given" in (whole / "report.html").read_text()
+    assert "LPIPS</dt><dd>not measured: no weights were given" in (whole / "report.html").read_text()
     for name in ("vgg", "alex"):
         (tmp_path / name).mkdir()
     vgg, alex = (written(tmp_path / name, weights(name)) for name in ("vgg", "alex"))
@@ -126,7 +140,7 @@ def test_lpips_is_measured_where_there_are_weights(whole: Path, scene: Path, tmp
     assert not (tmp_path / "early").exists()
     out = fit(words(scene, tmp_path / "with", 10, f"metrics.lpips={vgg}"))
     assert read_metrics(out)["lpips"] == evaluate_run(out)["lpips"] > 0
-    assert "vgg, mean over views" in (out / "report.html").read_text()
+    assert "<dt>LPIPS (vgg)</dt>" in (out / "report.html").read_text()
 
 
 def test_curve(whole: Path) -> None:

@@ -49,8 +49,10 @@ def test_the_report_offers_commands_that_work(finished: Path, tmp_path: Path) ->
     assert ["render", str(finished), "--camera", "orbit", "--light", "orbit"] in commands
     assert not any("--time" in words for words in commands), "a scene under lights has no time"
     for i, words in enumerate(commands):
-        small = ["--size", "6x5", "--frames", "2", "--out", str(tmp_path / str(i))] if words[0] == "render" else []
-        assert main([*words, *small]) == 0, words
+        out = ["--out", str(tmp_path / str(i))]
+        small = {"render": ["--size", "6x5", "--frames", "2", *out], "compress": ["--steps", "0", *out]}
+        if words[0] != "view":  # serves a page until it is stopped
+            assert main([*words, *small.get(words[0], [])]) == 0, words
 
 
 def test_a_missing_condition_is_asked_for_by_its_flag(

@@ -18,8 +18,9 @@ from neuprim.cli.command import (
     parse_seconds,
     parse_whole,
     print_columns,
-    refuse_argument,
+    take_condition_arguments,
 )
+from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import ExportReport
@@ -30,14 +31,10 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- export and import
 
 
-_EXPORT_USAGE = (
-    "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
-)
 _HELP_WIDTH = 100
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.usage = _EXPORT_USAGE
     formats = "which format; all of them, those of plugins too, are listed below"
     parser.add_argument("--format", required=True, metavar="NAME", help=formats)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
@@ -45,30 +42,14 @@ def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _take_export_options(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Keep options and conditions for the exporter; refuse flags that are no condition of the run's task."""
-    arguments.run = arguments.run_dir
-    if any(word.startswith("-") for word in rest):
-        from neuprim.core.conditions import split_conditions
-        from neuprim.runs.open import load_run
-
-        arguments.run = load_run(arguments.run_dir)
-        task = arguments.run.task
-        _, others = split_conditions(rest, task.conditions, bare=False)
-        for word in others:
-            if word.startswith("-"):
-                raise refuse_argument(word, parser, task)
-    arguments.options = rest
-    return []
-
-
 def _export_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
+    from neuprim.core.conditions import condition_flag
     from neuprim.runs.export import export_run
 
-    out, options = arguments.out, arguments.options
+    words = [*(f"{condition_flag(k)}={text}" for k, text in arguments.conditions.items()), *arguments.overrides]
     with DrawProgress() as progress:
-        report = export_run(arguments.run, arguments.format, out, options, arguments.force, progress.show)
+        report = export_run(arguments.run, arguments.format, arguments.out, words, arguments.force, progress.show)
     print_export_report(report, arguments.json)
     return 0
 
@@ -87,8 +68,6 @@ def _list_export_formats() -> Iterator[str]:
     yield "formats:"
     for info in EXPORTERS.list_plugins():
         yield f"  {info.name}  ({info.origin})"
-    yield ""
-    yield "KEY=VALUE is an option of the format: `neuprim export --format NAME --help` lists them with their defaults."
 
 
 def _describe_export_format(name: str) -> Iterator[str]:
@@ -104,7 +83,7 @@ def _describe_export_format(name: str) -> Iterator[str]:
     for first, second in rows:
         yield textwrap.fill(f"  {first:{indent - 4}}  {second}", _HELP_WIDTH, subsequent_indent=" " * indent)
     if exporter.conditions:
-        yield "conditions of the run's task: --NAME TEXT or NAME=TEXT, as --time 0.5 or light=1,2,3"
+        yield "conditions of the run's task are flags after RUN_DIR, as --time 0.5 or --light 1,2,3"
 
 
 def _format_option_default(value: Any) -> str:
@@ -146,7 +125,8 @@ EXPORT_COMMAND = Command(
     _export_command,
     _add_export_arguments,
     _export_help,
-    _take_export_options,
+    "options of the format, which `neuprim export --format NAME --help` lists",
+    take_condition_arguments,
     opens_run=True,
 )
 IMPORT_COMMAND = Command(
@@ -165,14 +145,12 @@ def _add_compress_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--tolerance", type=parse_decibels, metavar="DB", help=tolerance)
     level = "so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little"
     parser.add_argument("--level", type=parse_count, metavar="1-5", help=level)
-    bits = "bits of a parameter, or of all others, over a level's (3 unless given): means=16 sh_rest=6,5 others=8"
-    parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=bits)
     seconds = "of training for few bits; 0 for none (default: 30)"
     parser.add_argument("--seconds", type=parse_seconds, default=30.0, metavar="S", help=seconds)
     steps = "of training instead, for the same file on every machine"
     parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
     out = "where to write (default: RUN_DIR/model.neuprim)"
-    parser.add_argument("--out", "--output", type=Path, metavar="FILE", help=out)
+    parser.add_argument("--out", type=Path, metavar="FILE", help=out)
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
 
@@ -180,8 +158,12 @@ def _compress_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.compress import CompressRequest, compress_run
 
+    for word in args.overrides:
+        if not word.startswith("bits."):
+            raise ConfigError(f"{word}: no setting of `neuprim compress`; expected bits.NAME=BITS, as bits.means=16")
+    bits = [word.removeprefix("bits.") for word in args.overrides]
     request = CompressRequest(
-        args.run_dir, args.level, args.bits, args.out, args.force, args.seconds, args.steps, args.tolerance
+        args.run_dir, args.level, bits, args.out, args.force, args.seconds, args.steps, args.tolerance
     )
     with DrawProgress() as progress:
         made = compress_run(request, progress.show)
@@ -213,6 +195,9 @@ COMPRESS_COMMAND = Command(
     "write a run's model in few bits, as one file that every command reads",
     _compress_command,
     _add_compress_arguments,
+    settings="""\
+  bits.NAME=BITS             bits of a parameter, over those of --level (default: 3): bits.means=16 bits.sh_rest=6,5
+  bits.others=BITS           bits of all other parameters""",
     opens_run=True,
 )
 

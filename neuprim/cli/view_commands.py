@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import (
-    RENDER_OVERRIDES_HELP,
+    RENDER_SETTINGS_HELP,
     Command,
     parse_count,
     parse_number,
@@ -21,7 +21,6 @@ from neuprim.cli.command import (
     parse_whole,
     plain_console,
     take_condition_arguments,
-    take_render_override_arguments,
 )
 from neuprim.core.errors import ConfigError, DataError
 
@@ -37,9 +36,7 @@ if TYPE_CHECKING:
 
 _RENDER_CONDITIONS = """\
 Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a
-list or a range, --time 0.2,0.8 or --time 0:1:20, one frame each.
-
-"""
+list or a range, --time 0.2,0.8 or --time 0:1:20, one frame each."""
 
 
 def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
@@ -72,10 +69,6 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     group.add_argument("--environment-unseen", choices=("keep", "drop"), help=unseen)
 
 
-def _take_render_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    return take_condition_arguments(arguments, take_render_override_arguments(arguments, rest, parser), parser)
-
-
 def _render_command(arguments: argparse.Namespace) -> int:
     camera = arguments.camera
     if camera not in ("orbit", "test") and not any(Path(n).exists() for n in (camera, camera.partition("#")[0])):
@@ -87,7 +80,7 @@ def _render_command(arguments: argparse.Namespace) -> int:
     names = ("size", "format", "out", "frames", "conditions", "fps", "space", "layers", "datatype")
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
-        camera, environment=environment, overrides=arguments.words, overwrite=arguments.force, **given
+        camera, environment=environment, overrides=arguments.overrides, overwrite=arguments.force, **given
     )
     with DrawProgress() as progress:
         paths = render_run(arguments.run, request, notify=progress.print_note, progress=progress.show)
@@ -125,8 +118,9 @@ RENDER_COMMAND = Command(
     "draw images of a run",
     _render_command,
     _add_render_arguments,
-    _RENDER_CONDITIONS + RENDER_OVERRIDES_HELP,
-    _take_render_words,
+    _RENDER_CONDITIONS,
+    RENDER_SETTINGS_HELP,
+    take_condition_arguments,
     opens_run=True,
 )
 
@@ -142,8 +136,6 @@ Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or 
 def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
     shown = "volume, isosurface, slices, primitives, primitive, difference, ..."
     parser.add_argument("--show", default="", metavar="NAME,...", help=shown)
-    ellipsoids = "the ellipsoids in their own colours; as --show primitives"
-    parser.add_argument("--primitives", action="store_true", help=ellipsoids)
     one = "look into this one; as --show primitive"
     parser.add_argument("--primitive", type=parse_whole, metavar="INDEX", help=one)
     parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
@@ -166,7 +158,7 @@ def _inspect_command(arguments: argparse.Namespace) -> int:
     from neuprim.runs.inspect import InspectRequest, inspect_run
 
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
-    names += ["primitives"] * arguments.primitives + ["primitive"] * (arguments.primitive is not None)
+    names += ["primitive"] * (arguments.primitive is not None)
     request = InspectRequest(
         arguments.run,
         names or ["volume"],
@@ -191,7 +183,7 @@ INSPECT_COMMAND = Command(
     _inspect_command,
     _add_inspect_arguments,
     _INSPECT_CONDITIONS,
-    take_condition_arguments,
+    take_rest=take_condition_arguments,
     opens_run=True,
 )
 

@@ -123,19 +123,25 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
     """Return the target and its budget in seconds, None where neither is asked for, and the other overrides."""
-    budget, _, rest = take_settings(overrides, "budget", _Budget)
+    budget, rest = take_budget_override(overrides)
     whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
         return None, others
     if whole is not None:
         raise ConfigError(f"target={format_setting_value(whole)}: expected one of {_TARGETS}")
-    asked = "target" if budget is None else f"budget={format_setting_value(budget)}"
+    asked = "target" if budget is None else f"budget={budget}"
     if not target.given_settings():
         raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
     if budget is None:
         expected = "a budget beside it, the time for search and training together, such as budget=10m"
         raise ConfigError(f"{target}: expected {expected}")
-    return (target, parse_duration_setting(budget if isinstance(budget, str) else "", asked)), others
+    return (target, parse_duration_setting(budget, asked)), others
+
+
+def take_budget_override(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return the text of ``budget=TIME``, None where it is not given, and the other overrides."""
+    budget, _, others = take_settings(overrides, "budget", _Budget)
+    return (None if budget is None else str(budget)), others
 
 
 @dataclass(frozen=True)

@@ -239,6 +239,6 @@ def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher:
     if failed:
         raise ChunksMissing(
             f"{'; '.join(failed)}; {count - len(failed)} of {count} chunks are done, and resume=true with "
-            f"output_dir={folder} makes the others"
+            f"--out {folder} makes the others"
         )
     return record

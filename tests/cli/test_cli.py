@@ -10,14 +10,16 @@ import pytest
 import torch
 
 import neuprim
-from neuprim.cli import main
+from neuprim.cli import COMMANDS, main
 from neuprim.cli.model_commands import print_export_report
 from neuprim.config import Job, RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.extensions import ExportReport
+from neuprim.plugins.registry import TASKS, list_scene_names
 from neuprim.runs.fit import Events
 from neuprim.runs.render_images import RenderRequest
+from tests.plugins.extras import add
 from tests.plugins.fakes import site, toy
 
 __all__ = ["site", "toy"]
@@ -67,10 +69,10 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
 # ---------------------------------------------------------------- run
 
 
-def test_cfg_prints_and_stops(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_config_prints_and_stops(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     Path("full").mkdir()
     Path("full/x").touch()
-    assert main(["run", "--cfg", "task=toy", "output_dir=full"]) == 0
+    assert main(["run", "--print-config", "task=toy", "--out", "full"]) == 0
     Path("config.yaml").write_text(capsys.readouterr().out)
     assert RunConfig.from_yaml("config.yaml").train.iterations == 7
     assert calls == []
@@ -105,7 +107,18 @@ def test_a_failing_combination_does_not_lose_the_others(
     [
         (["rn"], "rn: no such command; did you mean 'run'"),
         (["--versoin"], "--help"),
-        (["run", "--cfgg"], "--cfgg: no such argument of `neuprim run`; did you mean '--cfg'"),
+        (["run", "--confg", "x"], "--confg: no such argument of `neuprim run`; did you mean '--config'"),
+        (["run", "task=toy", "output_dir=x"], "output_dir=x: no setting of `neuprim run`; expected --out DIR"),
+        (["truth", "output_dir=x"], "output_dir=x: no setting of `neuprim truth`; expected no output_dir"),
+        (["run", "toy"], "toy: expected KEY=VALUE; did you mean: neuprim run task=toy?"),
+        (["run", "bal"], "bal: expected KEY=VALUE (see neuprim run --help)"),
+        (["run", "ball", "seed=2"], "ball: expected KEY=VALUE; did you mean: neuprim run task=toy scene=ball seed=2?"),
+        (
+            ["run", "static", "-m", "solids"],
+            "static solids: expected KEY=VALUE; did you mean: neuprim run task=static scene=solids?",
+        ),
+        (["truth", "smoke_fire", "task=dynamic"], "did you mean: neuprim truth scene=smoke_fire task=dynamic?"),
+        (["run", "smoke_fire", "task=static"], "smoke_fire: expected KEY=VALUE (see neuprim run --help)"),
         (["run", "task=toi"], "did you mean 'toy'"),
         (["run", "task=toy", "train.iterations=x"], "expected a whole number"),
         (["run", "task=toy", "seed=1,2"], "add -m"),
@@ -176,15 +189,14 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
 
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
     nasty = "it's a=b, $c"
-    quoted = "output_dir='it\\'s a=b, $c'"
     for words, where, said in (
         (
             ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "task.options.gain=2.5"],
             "outputs/toy-ball",
             "outputs/toy-ball has the run up to here",
         ),
-        (["task=toy", "seed=4", quoted], nasty, f"{nasty} has no checkpoint yet"),
-        (["task=toy", "seed=3", "resume=false", "output_dir=o"], "o", "o has the run up to here"),
+        (["--out", nasty, "task=toy", "seed=4"], nasty, f"{nasty} has no checkpoint yet"),
+        (["task=toy", "seed=3", "resume=false", "--out=o"], "o", "o has the run up to here"),
         (
             ["-m", "task=toy", "seed=3,4", "model.primitives=2,3"],
             "outputs/toy-ball-sweep/seed-3_model.primitives-2",
@@ -210,8 +222,8 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
 def test_a_target_prints_what_came_of_it(
     calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["run", "task=toy", "target.ssim=0.9", "target.megabytes=2", "budget=5m", "output_dir=out"]
-    assert main([*words, "--cfg"]) == 0
+    words = ["run", "task=toy", "target.ssim=0.9", "target.megabytes=2", "budget=5m", "--out", "out"]
+    assert main([*words, "--print-config"]) == 0
     first = "# target.ssim=0.9 target.megabytes=2 budget=300s; the search starts from\ntask:\n"
     assert capsys.readouterr().out.startswith(first)
     achieved: dict[str, Any] = {"predicted": {"psnr": (30.0, 0.5)}, "run_dir": "out", "file": "model.neuprim"}
@@ -249,7 +261,7 @@ def test_export_reports_numbers(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    main(["run", "task=toy", "output_dir=r"])
+    main(["run", "task=toy", "--out", "r"])
     capsys.readouterr()
     assert main(["render", "r", "--camera", "test"]) == 0
     assert calls[-1] == (Path("r"), RenderRequest("test", overrides=[]))
@@ -259,7 +271,7 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", "r", *flags.split()]) == 0
     conditions = {"time": "0:1", "light_pos": "-1,0,2"}
     assert calls[-1][1] == RenderRequest("cams.json", (640, 480), "exr", Path("o"), 3, conditions, 12.0, overrides=[])
-    for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["light-pos=-1,0,2"], ["--light_pos=-1,0,2"]):
+    for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["--light_pos=-1,0,2"]):
         assert main(["render", "r", "--camera", "orbit", *words]) == 0
         assert calls[-1][1].conditions == {"light_pos": "-1,0,2"}
     capsys.readouterr()
@@ -282,9 +294,35 @@ def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None
     capsys.readouterr()
     assert main(["run", "--help"]) == 0
     out = capsys.readouterr().out
-    assert "train.iterations=N" in out
-    assert "toy  (neuprim-toy 0.3)" in out
+    assert "train.iterations=N" in out and "effort=N" in out and len(out.splitlines()) <= 60
+    assert "  static   blender, colmap, mesh, nerfstudio, room, solids\n" in out
+    assert "  toy      ball, files  (neuprim-toy 0.3)\n" in out
     assert "neuprim run task=static scene=solids" in out
+
+
+def test_scenes_are_listed_without_importing_their_task(site: Path) -> None:
+    """The files of a task in ``conf``, and the scenes that other packages register."""
+    add(site, "scene")
+    for info in TASKS.list_plugins():
+        added = ["extra"] if info.name == "static" else []
+        assert list_scene_names(info) == sorted([*(scene.name for scene in TASKS.load(info.name).scenes), *added])
+
+
+def test_settings_are_anywhere_on_the_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a=b").mkdir()
+    settings = ["renderer.samples=2", "resolution=0.5"]
+    for words in (["a=b", *settings], [settings[0], "a=b", settings[1]], [*settings, "--lpips", "x=y", "a=b"]):
+        arguments = COMMANDS["eval"].parse(words)
+        assert (arguments.overrides, arguments.run_dir) == (settings, Path("a=b"))
+    assert arguments.lpips == Path("x=y"), "the value of a flag is no setting"
+    assert COMMANDS["run"].parse(["a=b", "-m", "c=d", "--out", "e=f"]).overrides == ["a=b", "c=d"]
+    assert COMMANDS["tradeoff"].parse(["--views", "3", "task=static"]).run_dir is None
+
+
+def test_every_command_that_writes_has_the_same_option() -> None:
+    writing = {name for name, command in COMMANDS.items() if "--out" in command.build_parser()._option_string_actions}
+    assert writing == {*"run render tradeoff export compress prune import inspect new-task bench".split()}
 
 
 def test_help_is_light_and_the_module_runs() -> None:

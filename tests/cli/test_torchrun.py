@@ -21,7 +21,7 @@ from neuprim.config import compose
 from neuprim.runs.fit import Event, Step
 from neuprim.runs.run import run
 from tests.core import tiny
-from tests.short_runs import fit, words
+from tests.short_runs import command_line, fit, words
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="torchrun's processes are found in /proc")
 STEPS = 200
@@ -38,7 +38,7 @@ def torchrun(overrides: list[str], ranks: int = 2, **more: Any) -> subprocess.Po
         "-m",
         "neuprim",
         "run",
-        *overrides,
+        *command_line(overrides),
     ]
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(Path(neuprim.__file__).parents[1])}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, **more)

@@ -38,7 +38,7 @@ from neuprim.runs.training import add_run_curve_line, cut_run_curve
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.lpips_weights import weights, written
-from tests.short_runs import STEPS, fit, words
+from tests.short_runs import STEPS, command_line, fit, words
 from tests.systems import posix
 
 
@@ -268,7 +268,7 @@ def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) ->
 def test_ctrl_c_leaves_a_checkpoint_that_goes_on(scene: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped"
     overrides = words(scene, out, STEPS, "train.checkpoint_every_seconds=0")
-    command = [sys.executable, "-m", "neuprim", "run", *overrides]
+    command = [sys.executable, "-m", "neuprim", "run", *command_line(overrides)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_for_step(process, out, 30)

@@ -85,7 +85,7 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
         "--repeats",
         "1",
         "--knobs",
-        "resolution",
+        "resolution,sort",
         "renderer.alpha_min=0.01",
     ]
     assert main(words) == 0
@@ -98,7 +98,10 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
     assert json.loads((run_dir / "tradeoff" / "tradeoff.json").read_text())["same"]["reference"] == [
         "renderer.alpha_min=0.01"
     ]
-    for more, text in ((["--knobs", "alpha"], "no such knob"), (["--budget", "x"], "--budget x")):
+    for more, text in (
+        (["--knobs", "alpha"], "--knobs alpha: no such setting of this run"),
+        (["budget=x"], "budget=x: expected"),
+    ):
         assert main(["tradeoff", str(run_dir), *more]) == 2
         assert text in capsys.readouterr().err
 

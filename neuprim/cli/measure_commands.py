@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import statistics
+import sys
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -31,22 +33,33 @@ if TYPE_CHECKING:
 
 
 def _add_eval_arguments(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--all", action="store_true", help="print every metric, not only the most important ones")
     text = "measure LPIPS with these weights of your own, a file or a folder"
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=text)
 
 
+_MAIN_METRICS = ("psnr", "ssim", "lpips", "psnr_worst", "model_bytes", "render_fps")
+
+
 def _eval_command(arguments: argparse.Namespace) -> int:
-    from neuprim.core.metrics.image import format_metrics
+    from neuprim.core.metrics.image import format_failed_views
     from neuprim.runs.measure import evaluate_run
 
     metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.overrides)
-    rows = _list_printed_metrics(metrics)
+    chosen = {name: value for name in _MAIN_METRICS if (value := _find_metric(metrics, name)) is not None}
+    rows = _list_printed_metrics(metrics if arguments.all else chosen)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"{name:{width}}  {value}")
-    if "worse_than_black_image" in metrics:
-        print(format_metrics(metrics))
+    if failed := format_failed_views(metrics):
+        print(f"neuprim: warning: {failed}", file=sys.stderr)
     return 0
+
+
+def _find_metric(metrics: Mapping[str, Any], name: str) -> float | None:
+    """The number under a name in metrics.json, where infinity is null; None where it was not measured."""
+    value: float | None = math.inf if metrics.get(f"{name}_infinite") else metrics.get(name)
+    return value
 
 
 def _list_printed_metrics(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:

@@ -100,7 +100,7 @@ def _refuse_bare_words(arguments: argparse.Namespace, rest: list[str], parser: a
 
 
 def _run_command(args: argparse.Namespace) -> int:
-    from neuprim.cli.progress import run_command_here
+    from neuprim.cli.progress import print_run_summary, run_command_here
     from neuprim.config import compose, compose_all, read_stored_config
     from neuprim.config.command_settings import (
         LauncherSettings,
@@ -145,15 +145,15 @@ def _run_command(args: argparse.Namespace) -> int:
         refuse_chunks(configs[0], "viewer=true shows one training")
     if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
         return run_command_with_launcher(configs, overrides, launcher, typed)
-    print(run_command_here(configs[0], typed, viewer, launcher))
+    print_run_summary(run_command_here(configs[0], typed, viewer, launcher))
     return 0
 
 
 def _run_command_with_target(
     config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: CommandLine
 ) -> int:
-    """Search for a model that reaches a target; print what was achieved and the run's directory."""
-    from neuprim.cli.progress import RunProgress
+    """Search for a model that reaches a target; print what was achieved."""
+    from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.search.target import run_target
 
     try:
@@ -164,7 +164,7 @@ def _run_command_with_target(
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
     for line in _list_printed_target_lines(record):
         events.console.print(line)
-    print(record.achieved["run_dir"])
+    print_run_summary(Path(record.achieved["run_dir"]))
     return 0
 
 
@@ -206,7 +206,7 @@ def run_command_with_launcher(
         overrides: what the sweep was asked for.
         typed: all that was typed, for the command that continues.
     """
-    from neuprim.cli.progress import RunLaunchProgress
+    from neuprim.cli.progress import RunLaunchProgress, print_run_summary
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
     from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
     from neuprim.runs.sweep import make_run_job, run_sweep
@@ -220,6 +220,8 @@ def run_command_with_launcher(
     status = _report_launched_runs(configs, results, progress.live, typed)
     if len(configs) > 1:
         print(configs[0].output_dir.parent / "sweep.html")
+    elif status == 0:
+        print_run_summary(configs[0].output_dir)
     return status
 
 
@@ -233,7 +235,7 @@ def _report_launched_runs(
         if result is None or result.state == "interrupted":
             left.append(config.output_dir)
         elif result.state == "done":
-            if live:
+            if live and len(configs) > 1:
                 print(config.output_dir)
         else:
             if result.trace:
@@ -398,7 +400,7 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 
 def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
     """Train, and show it on rank 0."""
-    from neuprim.cli.progress import RunProgress
+    from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.fit import ignore_run_event
     from neuprim.runs.run import run
@@ -412,7 +414,8 @@ def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: 
                 run(config, ignore_run_event, group=group)
             return
         with RunProgress(f"{config.task}/{config.scene_name}, {group.size} ranks") as events:
-            print(run(config, events, group=group))
+            run_dir = run(config, events, group=group)
+        print_run_summary(run_dir)
     except RankError as error:
         command = f"torchrun {ranks} -m {typed.resume_command(config.output_dir)}"
         raise RankError(f"{error}; to go on: {command}", error.reported) from error

@@ -18,7 +18,7 @@ from neuprim.config.overrides import drop_output_overrides, quote_override
 from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.metrics.image import format_metrics
+from neuprim.core.metrics.image import format_failed_views
 from neuprim.core.task import Chunks, Loss
 from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
@@ -87,7 +87,8 @@ def run(
         if first:
             preview.finish(fitted)
             events(Finishing("measuring held-out views"))
-            events(Note(format_metrics(evaluate_fitted(fitted, directory))))
+            if failed := format_failed_views(evaluate_fitted(fitted, directory)):
+                events(Note(failed))
     if interrupted:
         raise KeyboardInterrupt
     return directory

@@ -1,5 +1,6 @@
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -25,6 +26,21 @@ from tests.plugins.fakes import site, toy
 __all__ = ["site", "toy"]
 
 
+METRICS: dict[str, Any] = {
+    "task": "toy",
+    "psnr": None,
+    "psnr_infinite": True,
+    "ssim": 0.97654,
+    "lpips": None,
+    "psnr_worst": 27.0,
+    "worse_than_black_image": ["r_3"],
+    "per_view": [{"psnr": 27.0}, {"psnr": None, "psnr_infinite": True}],
+    "primitives": 12,
+    "model_bytes": 225_400,
+    "render_fps": 12.5,
+}
+
+
 @pytest.fixture
 def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
     """Replace the functions that do the work by ones that record what they were given."""
@@ -34,11 +50,12 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append(config)
         config.output_dir.mkdir(parents=True)
         (config.output_dir / "config.yaml").write_text(config.to_yaml())
+        (config.output_dir / "metrics.json").write_text(json.dumps(METRICS))
         return config.output_dir
 
     def evaluate_run(run_dir: Path, lpips: Path | None = None, words: Any = ()) -> dict[str, Any]:
         made.append((run_dir, *words) if words else run_dir)
-        return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
+        return METRICS
 
     def load_run(run_dir: Path) -> Any:
         """A run without a model."""
@@ -76,6 +93,17 @@ def test_print_config_prints_and_stops(calls: list[Any], capsys: pytest.CaptureF
     Path("config.yaml").write_text(capsys.readouterr().out)
     assert RunConfig.from_yaml("config.yaml").train.iterations == 7
     assert calls == []
+
+
+def test_a_run_ends_with_what_it_reached_and_what_to_do_next(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for installed, words in ((object(), "view 'a b'"), (None, "render 'c d' --camera orbit")):
+        monkeypatch.setattr("neuprim.cli.progress.find_spec", lambda name, found=installed: found)
+        folder = words.split("'")[1]
+        assert main(["run", "task=toy", "--out", folder]) == 0
+        reached = f"PSNR 27.00 dB, SSIM 0.977 (2 held-out views, 1 exact), 225 kB, report: {folder}/report.html"
+        assert capsys.readouterr().out == f"{reached}\nnext: neuprim {words}\n"
 
 
 def test_sweep_with_the_flag_anywhere(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -231,9 +259,11 @@ def test_a_target_prints_what_came_of_it(
     achieved |= dict.fromkeys(("primitives", "packed_bytes", "model_bytes", "seconds", "fps"), 1234)
     record = SimpleNamespace(achieved=achieved, asked={"budget": 300.0}, why=["enough"], warning="psnr is missed")
     monkeypatch.setattr("neuprim.search.target.run_target", lambda *args, **options: record)
-    assert main(words) == 0
+    Path("out").mkdir()
+    Path("out/metrics.json").write_text(json.dumps(METRICS))
+    assert main([*words, "resume=true"]) == 0
     out, err = capsys.readouterr()
-    assert out == "out\n"
+    assert out.startswith("PSNR 27.00 dB, SSIM 0.977") and out.splitlines()[1].startswith("next: neuprim ")
     for text in ("predicted psnr ", "model.neuprim 1,234 bytes", "s of 300 s used", "ended: enough", "psnr is missed"):
         assert text in err
 
@@ -241,6 +271,7 @@ def test_a_target_prints_what_came_of_it(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("neuprim.search.target.run_target", interrupt)
+    shutil.rmtree("out")
     assert main(words) == 130
     first, second = capsys.readouterr().err.splitlines()
     assert first == "neuprim: interrupted; out has the trials up to here; to go on:"
@@ -248,6 +279,30 @@ def test_a_target_prints_what_came_of_it(
 
 
 # ---------------------------------------------------------------- eval, render, export
+
+
+def test_eval_prints_six_metrics_unless_all_are_asked_for(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("r").mkdir()
+    assert main(["eval", "r", "resolution=0.5"]) == 0 and calls == [(Path("r"), "resolution=0.5")]
+    out, err = capsys.readouterr()
+    rows = [
+        "psnr         inf",
+        "ssim         0.9765",
+        "psnr_worst   27.0000",
+        "model_bytes  225400",
+        "render_fps   12.5000",
+    ]
+    assert out.splitlines() == rows
+    assert err == "neuprim: warning: 1 of 2 held-out views are worse than a black image: r_3\n"
+    measured = {**METRICS, "lpips": 0.25, "psnr": 30.0, "psnr_infinite": False}
+    monkeypatch.setattr("neuprim.runs.measure.evaluate_run", lambda *args: measured)
+    assert main(["eval", "r"]) == 0
+    assert capsys.readouterr().out.splitlines()[:3] == ["psnr         30.0000", rows[1], "lpips        0.2500"]
+    assert main(["eval", "r", "--all"]) == 0
+    out = capsys.readouterr().out
+    assert "primitives " in out and "task " in out and "per_view " in out and len(out.splitlines()) == len(METRICS)
 
 
 def test_export_reports_numbers(capsys: pytest.CaptureFixture[str]) -> None:

@@ -85,7 +85,7 @@ def run(
         else:
             fitted, interrupted = train_in_directory(config, events, between=preview, group=group)
         if first:
-            preview.finish(fitted)
+            preview.write(fitted)
             events(Finishing("measuring held-out views"))
             if failed := format_failed_views(evaluate_fitted(fitted, directory)):
                 events(Note(failed))

@@ -118,7 +118,8 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
     printed, said = launched.communicate(timeout=200)
     assert launched.returncode == 0, said
     assert (
-        printed.split() == [str(out)]
+        printed.startswith("PSNR ")
+        and "\nnext: neuprim " in printed
         and said.count(f"resumed at step {step + 20}") == 1
         and said.count("measuring held-out views") == 1
     )

@@ -92,7 +92,7 @@ class Command:
         epilog = self.epilog if isinstance(self.epilog, str) else self.epilog(words)
         parser = Parser(prog=f"neuprim {self.name}", description=self.summary, epilog=epilog)
         if self.opens_run:
-            parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+            parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="directory of a run")
             add_trust_flag(parser)
         self.add_arguments(parser)
         if self.settings:
@@ -103,7 +103,7 @@ class Command:
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
     """Add ``--trust``, which lets a stored configuration reach outside its run (:mod:`neuprim.config.stored_run`)."""
-    text = "use addresses, and write to folders outside of it, that a stored config.yaml names"
+    text = "allow what a stored config.yaml names: network addresses, and folders outside of the run to write to"
     parser.add_argument(FLAG, action="store_true", help=text)
 
 

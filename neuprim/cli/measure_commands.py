@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 def _add_eval_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--all", action="store_true", help="print every metric, not only the most important ones")
-    text = "measure LPIPS with these weights of your own, a file or a folder"
+    text = "weights to measure LPIPS with, a file or a folder"
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=text)
 
 
@@ -96,16 +96,17 @@ _PAPER_MEASURES = ("PSNR", "SSIM", "LPIPS")
 
 
 def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("what", choices=["paper"], help="which tables")
-    numbers = "numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)"
+    parser.add_argument("what", choices=["paper"], help="print or run the paper's tables")
+    numbers = "tables to use, e.g. 3-5 or 6,7 (default: 3-7)"
     parser.add_argument("--tables", default="3-7", metavar="N", help=numbers)
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
-    scenes = "some of them, e.g. chair,lego"
+    data = "holds a folder per scene; without --data the tables are printed"
+    parser.add_argument("--data", type=Path, metavar="DIR", help=data)
+    scenes = "scenes to run, e.g. chair,lego (default: all)"
     parser.add_argument("--scenes", metavar="NAME", help=scenes)
-    parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
-    seeds = "runs of each, with seeds from 0 (default: 1)"
+    parser.add_argument("--rows", metavar="NAME", help="rows to run: 200, 5k, nolimit, real (default: all)")
+    seeds = "runs of each row, with seeds from 0 (default: 1)"
     parser.add_argument("--seeds", type=parse_count, default=1, metavar="N", help=seeds)
-    out = "gets a run directory each"
+    out = "where to write a directory for each run (default: outputs/paper)"
     parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help=out)
 
 
@@ -216,7 +217,7 @@ def _format_seconds(seconds: float) -> str:
 
 BENCH_COMMAND = Command(
     "bench",
-    "the paper's tables, and runs of their protocol on data that you have",
+    "print the paper's tables, and run their protocol on your data",
     _bench_command,
     _add_bench_arguments,
     settings="""\
@@ -239,12 +240,12 @@ _TRADEOFF_FILES = ("tradeoff.json", "tradeoff.html", "front.png")
 def _add_tradeoff_arguments(parser: argparse.ArgumentParser) -> None:
     add_trust_flag(parser)
     parser.add_argument("run_dir", nargs="?", type=Path, metavar="RUN_DIR", help="a finished run")
-    views = "test views, evenly spread (default: 5)"
+    views = "test views to measure, evenly spaced (default: 5)"
     parser.add_argument("--views", type=parse_count, default=5, metavar="N", help=views)
     parser.add_argument("--repeats", type=parse_count, default=15, metavar="N", help="rounds of timing (default: 15)")
-    knobs = "change these settings only, e.g. alpha_min,sort (default: all)"
-    parser.add_argument("--knobs", default="", metavar="NAME,...", help=knobs)
-    lpips = "measure LPIPS with these weights of your own, a file or a folder"
+    vary = "settings to vary, e.g. alpha_min,sort (default: all)"
+    parser.add_argument("--vary", default="", metavar="NAME,...", help=vary)
+    lpips = "weights to measure LPIPS with, a file or a folder"
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=lpips)
     out = "where to write (default: RUN_DIR/tradeoff, outputs/tradeoff-TASK-SCENE)"
     parser.add_argument("--out", type=Path, metavar="DIR", help=out)
@@ -261,7 +262,7 @@ def _tradeoff_command(args: argparse.Namespace) -> int:
         check_run_dir_argument(args.run_dir)
     budget, settings = take_budget_override(args.overrides)
     seconds = parse_duration_setting(budget or ("20m" if trained else "5m"), f"budget={budget}")
-    knobs = [name.strip() for name in args.knobs.split(",") if name.strip()]
+    knobs = [name.strip() for name in args.vary.split(",") if name.strip()]
     request = TradeoffRequest(settings, seconds, args.views, args.repeats, knobs, args.lpips, args.out)
     return _train_tradeoff_command(request) if trained else _render_tradeoff_command(args.run_dir, request)
 
@@ -338,7 +339,7 @@ def _format_printed_point(point: TradeoffPoint) -> tuple[str, ...]:
 
 TRADEOFF_COMMAND = Command(
     "tradeoff",
-    "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
+    "measure speed and size against accuracy, for settings of rendering or of training",
     _tradeoff_command,
     _add_tradeoff_arguments,
     _TRADEOFF_HELP,

@@ -35,7 +35,7 @@ _HELP_WIDTH = 100
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    formats = "which format; all of them, those of plugins too, are listed below"
+    formats = "name of the format; see the list below"
     parser.add_argument("--format", required=True, metavar="NAME", help=formats)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
@@ -108,8 +108,8 @@ def print_export_report(report: ExportReport, as_json: bool) -> None:
 
 
 def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a .ply, .npz or .neuprim file")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="where to write, a new directory")
 
 
 def _import_command(arguments: argparse.Namespace) -> int:
@@ -131,7 +131,7 @@ EXPORT_COMMAND = Command(
 )
 IMPORT_COMMAND = Command(
     "import",
-    "make a run directory of an exported .ply or .npz, or of a .neuprim",
+    "make a run directory from an exported .ply or .npz, or from a .neuprim file",
     _import_command,
     _add_import_arguments,
 )
@@ -141,13 +141,13 @@ IMPORT_COMMAND = Command(
 
 
 def _add_compress_arguments(parser: argparse.ArgumentParser) -> None:
-    tolerance = "how much worse it may get (default: 0.1dB)"
+    tolerance = "largest loss of PSNR on training views (default: 0.1dB)"
     parser.add_argument("--tolerance", type=parse_decibels, metavar="DB", help=tolerance)
-    level = "so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little"
+    level = "fixed precision instead: 1 is nearly lossless, 5 is the smallest"
     parser.add_argument("--level", type=parse_count, metavar="1-5", help=level)
-    seconds = "of training for few bits; 0 for none (default: 30)"
+    seconds = "time to fine-tune the quantised model, e.g. 90s; 0 for none (default: 30s)"
     parser.add_argument("--seconds", type=parse_seconds, default=30.0, metavar="S", help=seconds)
-    steps = "of training instead, for the same file on every machine"
+    steps = "fine-tune for N steps instead, which gives the same file on every machine"
     parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
     out = "where to write (default: RUN_DIR/model.neuprim)"
     parser.add_argument("--out", type=Path, metavar="FILE", help=out)
@@ -192,7 +192,7 @@ def _print_compression(made: Compression) -> None:
 
 COMPRESS_COMMAND = Command(
     "compress",
-    "write a run's model in few bits, as one file that every command reads",
+    "write a run's model as one small quantised file, which every command reads",
     _compress_command,
     _add_compress_arguments,
     settings="""\
@@ -206,13 +206,13 @@ COMPRESS_COMMAND = Command(
 
 
 def _add_prune_arguments(parser: argparse.ArgumentParser) -> None:
-    tolerance = "how much worse it may get (default: 0.1dB)"
+    tolerance = "largest loss of PSNR on training views (default: 0.1dB)"
     parser.add_argument("--tolerance", type=parse_decibels, default=0.1, metavar="DB", help=tolerance)
-    seconds = "of fine-tuning; 0 for none (default: 60)"
+    seconds = "time to fine-tune, e.g. 90s; 0 for none (default: 60s)"
     parser.add_argument("--seconds", type=parse_seconds, default=60.0, metavar="S", help=seconds)
-    steps = "of fine-tuning instead, for the same model on every machine"
+    steps = "fine-tune for N steps instead, which gives the same model on every machine"
     parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="directory of the new run (default: RUN_DIR-pruned)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
@@ -245,7 +245,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
         loss = f"{stage.cut - before:+.3f} dB at once, {stage.trained - before:+.3f} dB after training"
         print(f"{what}; training views {loss}; {'kept' if stage.kept else 'taken back'}")
     if made.run_dir is None:
-        print(f"nothing can go within {tolerance:g} dB; nothing was written")
+        print(f"nothing can be removed within {tolerance:g} dB; nothing was written")
         return
     print(made.run_dir)
     rows = [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _PRUNING_ROWS]
@@ -260,7 +260,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
 
 PRUNE_COMMAND = Command(
     "prune",
-    "remove what a run's scene does not require, and write the rest as a run",
+    "remove primitives and parameters that a run does not need, and write the rest as a new run",
     _prune_command,
     _add_prune_arguments,
     opens_run=True,

@@ -236,13 +236,9 @@ def run_command_here(
 
 def print_run_summary(run_dir: Path) -> None:
     """Print what a finished run reached, where its report is, and a command to go on with."""
-    from neuprim.core.metrics.image import format_metrics
-    from neuprim.report.report_page import format_report_bytes
-    from neuprim.runs.open import read_metrics
+    from neuprim.runs.run import summarize_run
 
-    metrics = read_metrics(run_dir)
-    size = format_report_bytes(metrics["model_bytes"])
-    print(f"{format_metrics(metrics)}, {size}, report: {run_dir / 'report.html'}")
+    print(summarize_run(run_dir))
     words = ["view", str(run_dir)] if find_spec("viser") is not None else ["render", str(run_dir), "--camera", "orbit"]
     print(f"next: {shlex.join(['neuprim', *words])}", flush=True)
 

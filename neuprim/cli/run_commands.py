@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 _RUN_SETTINGS = """\
 in Hydra's grammar, anywhere on the line; these are the most common
-  task=NAME scene=NAME                 what to fit; all are listed below
+  task=NAME scene=NAME                 what to fit (all are listed below)
   preset=NAME                          settings to start from (`neuprim tasks` lists them)
   effort=N                             1 (fast) to 9 (good): sets training steps and number of primitives to values
                                        measured for the task; 1 takes about a tenth of the time of preset=quick, 9
@@ -257,15 +257,14 @@ def _report_launched_runs(
 
 
 _TRUTH_HELP = """\
-Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by
-side:
+Prints the folder of the frames. Existing frames are kept, and a run with the same scene reads them. A launcher renders
+frames in parallel:
   neuprim truth task=dynamic scene=vdb scene.vdb=DIR launcher=processes
-  neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm
-Prints where they are."""
+  neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm"""
 
 
 def _add_truth_arguments(parser: argparse.ArgumentParser) -> None:
-    every = "of every combination of values separated by commas"
+    every = "render for every combination of values separated by commas"
     parser.add_argument("-m", "--multirun", action="store_true", help=every)
 
 

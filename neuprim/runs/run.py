@@ -18,11 +18,12 @@ from neuprim.config.overrides import drop_output_overrides, quote_override
 from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.metrics.image import format_failed_views
+from neuprim.core.metrics.image import format_failed_views, format_metrics
 from neuprim.core.task import Chunks, Loss
 from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
+from neuprim.report.report_page import format_report_bytes
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_run_event, is_chunked, refuse_chunks
 from neuprim.runs.ground_truth import render_ground_truth_before_run
@@ -92,6 +93,13 @@ def run(
     if interrupted:
         raise KeyboardInterrupt
     return directory
+
+
+def summarize_run(run_dir: Path) -> str:
+    """Return one line with quality and size of a finished run's model, and the path of its report."""
+    metrics = read_metrics(run_dir)
+    size = format_report_bytes(metrics["model_bytes"])
+    return f"{format_metrics(metrics)}, {size}, report: {run_dir / 'report.html'}"
 
 
 def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:

@@ -339,4 +339,4 @@ def check_knobs(request: TradeoffRequest, known: Iterable[str], owner: str) -> N
     """Refuse a knob that a run, or a task's models, do not have."""
     for name in request.knobs:
         if name not in (names := list(known)):
-            raise ConfigError(f"--knobs {name}: no such setting of {owner}{nearest(name, names)}")
+            raise ConfigError(f"--vary {name}: no such setting of {owner}{nearest(name, names)}")

@@ -158,7 +158,7 @@ def test_folders_that_hold_something_else_are_refused(
 
 def test_the_command(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     typed = command_line(words(scene, tmp_path / "set", 20))
-    flags = ["--views", "1", "--repeats", "1", "--knobs", "train.iterations"]
+    flags = ["--views", "1", "--repeats", "1", "--vary", "train.iterations"]
     assert main(["tradeoff", *typed, "budget=60s", *flags]) == 0
     out = capsys.readouterr().out
     assert "Every model trains for the same time" in out and "front of size" in out and "neuprim run" in out

@@ -84,7 +84,7 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
         "1",
         "--repeats",
         "1",
-        "--knobs",
+        "--vary",
         "resolution,sort",
         "renderer.alpha_min=0.01",
     ]
@@ -99,7 +99,7 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
         "renderer.alpha_min=0.01"
     ]
     for more, text in (
-        (["--knobs", "alpha"], "--knobs alpha: no such setting of this run"),
+        (["--vary", "alpha"], "--vary alpha: no such setting of this run"),
         (["budget=x"], "budget=x: expected"),
     ):
         assert main(["tradeoff", str(run_dir), *more]) == 2

@@ -46,7 +46,7 @@ def _eval_command(arguments: argparse.Namespace) -> int:
     from neuprim.runs.measure import evaluate_run
 
     metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.overrides)
-    chosen = {name: value for name in _MAIN_METRICS if (value := _find_metric(metrics, name)) is not None}
+    chosen = {name: number for name in _MAIN_METRICS if (number := _find_metric(metrics, name)) is not None}
     rows = _list_printed_metrics(metrics if arguments.all else chosen)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:

@@ -183,7 +183,8 @@ class RunPreview:
     """
 
     def __init__(self, events: Events, between: BetweenSteps) -> None:
-        self._events, self._between, self._due = events, between, _PREVIEW_PROGRESS
+        self._events, self._between = events, between
+        self._due: tuple[float, ...] = _PREVIEW_PROGRESS
 
     def __call__(self, fitted: Fitted, stop: threading.Event) -> None:
         self._between(fitted, stop)

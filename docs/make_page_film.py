@@ -1,8 +1,8 @@
 """The moving picture of the README, taken from web pages of models while they are turned, played and lit.
 
-    neuprim run task=static  scene=solids scene.size=256 model.primitives=5000 train.iterations=6000 output_dir=SOLIDS
-    neuprim run task=dynamic scene=smoke_fire output_dir=SMOKE
-    neuprim run task=relight scene=lit_solids model.primitives=5000 train.iterations=6000 output_dir=LIT
+    neuprim run task=static  scene=solids scene.size=256 model.primitives=5000 train.iterations=6000 --out SOLIDS
+    neuprim run task=dynamic scene=smoke_fire --out SMOKE
+    neuprim run task=relight scene=lit_solids model.primitives=5000 train.iterations=6000 --out LIT
     neuprim export SOLIDS --format html --out docs/pages/solids.html level=2 views=3          # and SMOKE, LIT
     python docs/make_page_film.py docs/pages/solids.html docs/pages/smoke_fire.html docs/pages/lit_solids.html
     docs/pictures/pages.webp

@@ -1,6 +1,6 @@
 """Pictures of README and site from finished runs: held-out views, truth above, render below.
 
-    neuprim run task=static scene=solids output_dir=RUN_DIR
+    neuprim run task=static scene=solids --out RUN_DIR
     python docs/make_pictures.py RUN_DIR docs/pictures/solids.png 4 256
     python docs/make_pictures.py RUN_DIR docs/pictures/smoke_fire.png 6 192
 

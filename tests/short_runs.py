@@ -23,5 +23,11 @@ def words(scene: Path, out: Path, iterations: int = STEPS, *more: str) -> list[s
     ]  # fmt: skip
 
 
+def command_line(overrides: list[str]) -> list[str]:
+    """The words of ``neuprim run`` for overrides of a configuration: there the directory is a flag."""
+    places = [word.partition("=")[2].strip("'") for word in overrides if word.startswith("output_dir=")]
+    return [*(word for word in overrides if not word.startswith("output_dir=")), *(f"--out={p}" for p in places)]
+
+
 def fit(overrides: list[str]) -> Path:
     return running.run(compose(overrides))

@@ -57,7 +57,8 @@ def make(checkout: Path, folder: Path) -> None:
     """Write all results of ``checkout`` into ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     for task, overrides in RUNS.items():
-        _run(checkout, folder, f"run task={task} {overrides} renderer.threads=1 output_dir={task}")
+        _run(checkout, folder, f"run task={task} {overrides} renderer.threads=1")
+        next((folder / "outputs").glob(f"{task}-*")).rename(folder / task)
     for command, run, options, name in EXPORTS:
         _run(checkout, folder, f"{command} {run} {options} --out {name}")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import os
 import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -25,16 +26,12 @@ if TYPE_CHECKING:
 
 TakeRest = Callable[[argparse.Namespace, list[str], argparse.ArgumentParser], list[str]]
 
-RENDER_OVERRIDES_HELP = """\
-KEY=VALUE overrides how the run is drawn:
+RENDER_SETTINGS_HELP = """\
+how the run is drawn; `neuprim tradeoff RUN_DIR` measures cost and gain of each
   renderer.KEY=VALUE         any setting of the renderer
   resolution=0.5             render at half the width and height, and upsample
   density.NAME=N colour.NAME=N
-                             a smaller field, e.g. colour.degree=1 (bands of spherical harmonics) density.neurons=4
-`neuprim tradeoff RUN_DIR` measures their cost and gain."""
-
-RENDER_OVERRIDE_HEADS = ("renderer", "resolution", "density", "colour")
-"""A copy of neuprim.runs.render_config.HEADS, as importing that module loads torch."""
+                             a smaller field, e.g. colour.degree=1 (bands of spherical harmonics) density.neurons=4"""
 
 
 class Parser(argparse.ArgumentParser):
@@ -57,6 +54,8 @@ class Command:
         call: runs the command with the parsed arguments and returns the exit status.
         add_arguments: adds the command's own arguments to its parser.
         epilog: text below the arguments in ``neuprim NAME --help``, or a function that makes it from the typed words.
+        settings: what ``KEY=VALUE`` sets, for the help; empty where a command has no settings. They may be anywhere on
+            the line, and become ``arguments.overrides``.
         take_rest: gets the arguments, the words that argparse did not know and the parser; stores those that the
             command accepts and returns the others, which are refused.
         opens_run: whether the first argument is an existing run directory, ``RUN_DIR``; adds it and ``--trust``.
@@ -67,6 +66,7 @@ class Command:
     call: Callable[[argparse.Namespace], int]
     add_arguments: Callable[[argparse.ArgumentParser], None] = lambda parser: None
     epilog: str | Callable[[Sequence[str]], str] = ""
+    settings: str = ""
     take_rest: TakeRest = lambda arguments, rest, parser: rest
     opens_run: bool = False
 
@@ -77,12 +77,14 @@ class Command:
             ConfigError: an argument is missing, unknown or has an impossible value, or there is no such run directory.
         """
         parser = self.build_parser(words)
-        arguments, rest = parser.parse_known_args(words)
+        overrides, others = split_settings(words, parser) if self.settings else ([], list(words))
+        arguments, rest = parser.parse_known_args(others)
+        arguments.overrides = overrides
         if self.opens_run:
             check_run_dir_argument(arguments.run_dir)
         rest = self.take_rest(arguments, rest, parser)
         if rest:
-            raise refuse_argument(rest[0], parser)
+            raise refuse_argument(next((word for word in rest if word.startswith("-")), rest[0]), parser)
         return arguments
 
     def build_parser(self, words: Sequence[str] = ()) -> Parser:
@@ -90,15 +92,18 @@ class Command:
         epilog = self.epilog if isinstance(self.epilog, str) else self.epilog(words)
         parser = Parser(prog=f"neuprim {self.name}", description=self.summary, epilog=epilog)
         if self.opens_run:
-            parser.add_argument("run_dir", type=Path, metavar="RUN_DIR")
+            parser.add_argument("run_dir", type=Path, metavar="RUN_DIR", help="directory of a run")
             add_trust_flag(parser)
         self.add_arguments(parser)
+        if self.settings:
+            parser.add_argument_group("KEY=VALUE", self.settings)
+            parser.usage = f"{parser.format_usage().removeprefix('usage: ').rstrip()} [KEY=VALUE ...]"
         return parser
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
     """Add ``--trust``, which lets a stored configuration reach outside its run (:mod:`neuprim.config.stored_run`)."""
-    text = "use addresses, and write to folders outside of it, that a stored config.yaml names"
+    text = "allow what a stored config.yaml names: network addresses, and folders outside of the run to write to"
     parser.add_argument(FLAG, action="store_true", help=text)
 
 
@@ -113,26 +118,26 @@ def check_run_dir_argument(path: Path) -> None:
 # ---------------------------------------------------------------- words that argparse does not know
 
 
-def take_override_arguments(
-    arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
-) -> list[str]:
-    """Add the words that are no flags to ``arguments.overrides``: argparse gives up on them after the first flag."""
-    arguments.overrides += [word for word in rest if not word.startswith("-")]
-    return [word for word in rest if word.startswith("-")]
+def split_settings(words: Sequence[str], parser: argparse.ArgumentParser) -> tuple[list[str], list[str]]:
+    """Split words into settings, ``KEY=VALUE``, and others: flags with their values, and a run directory that exists.
 
-
-def take_render_override_arguments(
-    arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
-) -> list[str]:
-    """Set ``arguments.words`` to the render overrides."""
-    arguments.words, rest = split_override_arguments(rest)
-    return rest
-
-
-def split_override_arguments(words: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split words into render overrides, as ``renderer.samples=2``, and others; ``--`` may stand between."""
-    found = [word for word in words if "=" in word and re.split(r"[.=]", word)[0] in RENDER_OVERRIDE_HEADS]
-    return found, [word for word in words if word not in found and word != "--"]
+    Raises:
+        ConfigError: ``output_dir=DIR``, which is no setting of a command but its flag ``--out DIR``.
+    """
+    settings: list[str] = []
+    others: list[str] = []
+    flags, value_follows = parser._option_string_actions, False
+    opens_run = any(action.dest == "run_dir" for action in parser._actions)
+    for word in words:
+        if "=" not in word or word.startswith("-") or value_follows or (opens_run and os.path.isdir(word)):
+            others.append(word)
+        elif word.lstrip("+").startswith("output_dir="):
+            expected = f"expected {'--out DIR' if '--out' in flags else 'no output_dir'}"
+            raise ConfigError(f"{word}: no setting of `{parser.prog}`; {expected}")
+        else:
+            settings.append(word)
+        value_follows = word in flags and flags[word].nargs != 0
+    return settings, others
 
 
 def take_condition_arguments(

@@ -103,9 +103,9 @@ def _tasks_command(arguments: argparse.Namespace) -> int:
 
 
 def _add_new_task_arguments(parser: argparse.ArgumentParser) -> None:
-    name = "what users will type after task=: lower-case letters, digits and _"
+    name = "name of the task, typed after task=: lower-case letters, digits and _"
     parser.add_argument("name", metavar="NAME", help=name)
-    out = "a folder that does not exist yet (default: neuprim-NAME)"
+    out = "where to write, a new folder (default: neuprim-NAME)"
     parser.add_argument("--out", type=Path, metavar="DIR", help=out)
 
 
@@ -121,7 +121,7 @@ TASKS_COMMAND = Command(
 )
 NEW_TASK_COMMAND = Command(
     "new-task",
-    "write a small working package with a task of your own: see docs/plugins.md",
+    "create a small working package with a task of your own (guide: docs/plugins.md)",
     _new_task_command,
     _add_new_task_arguments,
 )

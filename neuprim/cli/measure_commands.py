@@ -3,27 +3,29 @@
 from __future__ import annotations
 
 import argparse
+import math
 import re
 import statistics
+import sys
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import (
-    RENDER_OVERRIDES_HELP,
+    RENDER_SETTINGS_HELP,
     Command,
     add_trust_flag,
     check_run_dir_argument,
     parse_count,
     plain_console,
     print_columns,
-    take_override_arguments,
-    take_render_override_arguments,
 )
 from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.runs.paper import PlannedRun
+    from neuprim.search.tradeoff_measuring import TradeoffRequest
     from neuprim.search.tradeoff_record import TradeoffPoint, TradeoffRecord
 
 
@@ -31,22 +33,33 @@ if TYPE_CHECKING:
 
 
 def _add_eval_arguments(parser: argparse.ArgumentParser) -> None:
-    text = "measure LPIPS with these weights of your own, a file or a folder"
+    parser.add_argument("--all", action="store_true", help="print every metric, not only the most important ones")
+    text = "weights to measure LPIPS with, a file or a folder"
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=text)
 
 
+_MAIN_METRICS = ("psnr", "ssim", "lpips", "psnr_worst", "model_bytes", "render_fps")
+
+
 def _eval_command(arguments: argparse.Namespace) -> int:
-    from neuprim.core.metrics.image import format_metrics
+    from neuprim.core.metrics.image import format_failed_views
     from neuprim.runs.measure import evaluate_run
 
-    metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.words)
-    rows = _list_printed_metrics(metrics)
+    metrics = evaluate_run(arguments.run_dir, arguments.lpips, arguments.overrides)
+    chosen = {name: number for name in _MAIN_METRICS if (number := _find_metric(metrics, name)) is not None}
+    rows = _list_printed_metrics(metrics if arguments.all else chosen)
     width = max((len(name) for name, _ in rows), default=0)
     for name, value in rows:
         print(f"{name:{width}}  {value}")
-    if "worse_than_black_image" in metrics:
-        print(format_metrics(metrics))
+    if failed := format_failed_views(metrics):
+        print(f"neuprim: warning: {failed}", file=sys.stderr)
     return 0
+
+
+def _find_metric(metrics: Mapping[str, Any], name: str) -> float | None:
+    """The number under a name in metrics.json, where infinity is null; None where it was not measured."""
+    value: float | None = math.inf if metrics.get(f"{name}_infinite") else metrics.get(name)
+    return value
 
 
 def _list_printed_metrics(metrics: Mapping[str, Any], where: str = "") -> list[tuple[str, str]]:
@@ -67,8 +80,7 @@ EVAL_COMMAND = Command(
     "measure a run on its test views",
     _eval_command,
     _add_eval_arguments,
-    RENDER_OVERRIDES_HELP,
-    take_render_override_arguments,
+    settings=RENDER_SETTINGS_HELP,
     opens_run=True,
 )
 
@@ -84,26 +96,24 @@ _PAPER_MEASURES = ("PSNR", "SSIM", "LPIPS")
 
 
 def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("what", choices=["paper"], help="which tables")
-    settings = "settings over the protocol's, e.g. scene.downsample=4"
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=settings)
-    numbers = "numbers of the paper's tables, e.g. 3-5 or 6,7 (default: 3-7)"
+    parser.add_argument("what", choices=["paper"], help="print or run the paper's tables")
+    numbers = "tables to use, e.g. 3-5 or 6,7 (default: 3-7)"
     parser.add_argument("--tables", default="3-7", metavar="N", help=numbers)
-    parser.add_argument("--data", type=Path, metavar="DIR", help="a folder per scene; without it the tables are listed")
-    scenes = "some of them, e.g. chair,lego"
+    data = "holds a folder per scene; without --data the tables are printed"
+    parser.add_argument("--data", type=Path, metavar="DIR", help=data)
+    scenes = "scenes to run, e.g. chair,lego (default: all)"
     parser.add_argument("--scenes", metavar="NAME", help=scenes)
-    parser.add_argument("--rows", metavar="NAME", help="some of the rows: 200, 5k, nolimit, real")
-    budget = "training time of a run, e.g. 10m; full: 100,000 steps (default)"
-    parser.add_argument("--budget", default="full", metavar="TIME", help=budget)
-    seeds = "runs of each, with seeds from 0 (default: 1)"
+    parser.add_argument("--rows", metavar="NAME", help="rows to run: 200, 5k, nolimit, real (default: all)")
+    seeds = "runs of each row, with seeds from 0 (default: 1)"
     parser.add_argument("--seeds", type=parse_count, default=1, metavar="N", help=seeds)
-    out = "gets a run directory each"
+    out = "where to write a directory for each run (default: outputs/paper)"
     parser.add_argument("--out", type=Path, default=Path("outputs/paper"), metavar="DIR", help=out)
 
 
 def _bench_command(args: argparse.Namespace) -> int:
     """List the tables, or run what stands for their rows."""
     from neuprim.cli.progress import run_command_here
+    from neuprim.config.command_settings import take_budget_override
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.open import read_metrics
     from neuprim.runs.paper import load_paper_run_tables, plan_paper_runs
@@ -115,7 +125,8 @@ def _bench_command(args: argparse.Namespace) -> int:
         return 0
     scenes = args.scenes.lower().split(",") if args.scenes else []
     rows = args.rows.split(",") if args.rows else []
-    planned = plan_paper_runs(args.data, chosen, scenes, rows, args.budget, args.seeds, args.out, args.overrides)
+    budget, settings = take_budget_override(args.overrides)
+    planned = plan_paper_runs(args.data, chosen, scenes, rows, budget, args.seeds, args.out, settings)
     results = []
     for number, one in enumerate(planned, 1):
         print(f"[{number}/{len(planned)}] {one.config.output_dir}", flush=True)
@@ -206,74 +217,62 @@ def _format_seconds(seconds: float) -> str:
 
 BENCH_COMMAND = Command(
     "bench",
-    "the paper's tables, and runs of their protocol on data that you have",
+    "print the paper's tables, and run their protocol on your data",
     _bench_command,
     _add_bench_arguments,
-    take_rest=take_override_arguments,
+    settings="""\
+any setting of `neuprim run`, over the protocol's, e.g. scene.downsample=4
+  budget=TIME                training time of each run, e.g. 10m (default: 100,000 steps)""",
 )
 
 
 # ---------------------------------------------------------------- tradeoff
 
 
-_TRADEOFF_USAGE = """\
-neuprim tradeoff RUN_DIR | KEY=VALUE ... [KEY=VALUE ...] [--views N] [--repeats N] [--knobs NAME ...] [--budget TIME]
-                       [--lpips FILE]"""
-_TRADEOFF_FORMS = """\
+_TRADEOFF_HELP = """\
 neuprim tradeoff RUN_DIR measures the settings of rendering on a finished run.
-neuprim tradeoff task=NAME scene=NAME budget=20m [KEY=VALUE ...] [output_dir=DIR]
-  trains a designed set of models around the one of these overrides of `neuprim run`, and measures them together.
-
-After RUN_DIR, """
+neuprim tradeoff task=NAME scene=NAME [KEY=VALUE ...] trains a designed set of models around the one of these settings
+of `neuprim run`, and measures them together."""
 
 _TRADEOFF_FILES = ("tradeoff.json", "tradeoff.html", "front.png")
 
 
-def is_override_argument(first: str) -> bool:
-    """Return whether the first argument is an override of ``neuprim run`` and not a run directory."""
-    return "=" in first and not Path(first).exists()
-
-
 def _add_tradeoff_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.usage = _TRADEOFF_USAGE
     add_trust_flag(parser)
-    parser.add_argument("run_dir", metavar="RUN_DIR|KEY=VALUE", help="a finished run, or overrides of `neuprim run`")
-    views = "test views, evenly spread (default: 5)"
+    parser.add_argument("run_dir", nargs="?", type=Path, metavar="RUN_DIR", help="a finished run")
+    views = "test views to measure, evenly spaced (default: 5)"
     parser.add_argument("--views", type=parse_count, default=5, metavar="N", help=views)
     parser.add_argument("--repeats", type=parse_count, default=15, metavar="N", help="rounds of timing (default: 15)")
-    knobs = "some of them, e.g. alpha_min sort (default: all)"
-    parser.add_argument("--knobs", nargs="+", default=[], metavar="NAME", help=knobs)
-    budget = "about how long, e.g. 90s or 10m; what does not fit is left out (default: 5m, 20m of trainings)"
-    parser.add_argument("--budget", metavar="TIME", help=budget)
-    lpips = "measure LPIPS with these weights of your own, a file or a folder"
+    vary = "settings to vary, e.g. alpha_min,sort (default: all)"
+    parser.add_argument("--vary", default="", metavar="NAME,...", help=vary)
+    lpips = "weights to measure LPIPS with, a file or a folder"
     parser.add_argument("--lpips", type=Path, metavar="FILE", help=lpips)
-
-
-def _take_tradeoff_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    if is_override_argument(arguments.run_dir):
-        arguments.words = [word for word in rest if not word.startswith("-")]
-        return [word for word in rest if word.startswith("-") and word != "--"]
-    return take_render_override_arguments(arguments, rest, parser)
+    out = "where to write (default: RUN_DIR/tradeoff, outputs/tradeoff-TASK-SCENE)"
+    parser.add_argument("--out", type=Path, metavar="DIR", help=out)
 
 
 def _tradeoff_command(args: argparse.Namespace) -> int:
-    args.words += [word for word in args.knobs if "=" in word]  # overrides after --knobs look like names
-    args.knobs = [word for word in args.knobs if "=" not in word]
-    return _train_tradeoff_command(args) if is_override_argument(args.run_dir) else _render_tradeoff_command(args)
-
-
-def _render_tradeoff_command(args: argparse.Namespace) -> int:
-    from neuprim.cli.progress import DrawProgress
-    from neuprim.config.command_settings import parse_duration_setting
-    from neuprim.search.render_tradeoff import format_tradeoff_render_command, measure_tradeoff
+    from neuprim.config.command_settings import parse_duration_setting, take_budget_override
     from neuprim.search.tradeoff_measuring import TradeoffRequest
+
+    trained = args.run_dir is None
+    if trained and not args.overrides:
+        raise ConfigError("neuprim tradeoff: expected RUN_DIR, or task=NAME scene=NAME (see neuprim tradeoff --help)")
+    if not trained:
+        check_run_dir_argument(args.run_dir)
+    budget, settings = take_budget_override(args.overrides)
+    seconds = parse_duration_setting(budget or ("20m" if trained else "5m"), f"budget={budget}")
+    knobs = [name.strip() for name in args.vary.split(",") if name.strip()]
+    request = TradeoffRequest(settings, seconds, args.views, args.repeats, knobs, args.lpips, args.out)
+    return _train_tradeoff_command(request) if trained else _render_tradeoff_command(args.run_dir, request)
+
+
+def _render_tradeoff_command(run_dir: Path, request: TradeoffRequest) -> int:
+    from neuprim.cli.progress import DrawProgress
+    from neuprim.search.render_tradeoff import format_tradeoff_render_command, measure_tradeoff
     from neuprim.search.tradeoff_record import TRADEOFF_FOLDER
 
-    run_dir = Path(args.run_dir)
-    check_run_dir_argument(run_dir)
-    budget = parse_duration_setting(args.budget or "5m", f"--budget {args.budget}")
-    request = TradeoffRequest(args.words, budget, args.views, args.repeats, args.knobs, args.lpips)
-    folder = run_dir / TRADEOFF_FOLDER
+    folder = request.out or run_dir / TRADEOFF_FOLDER
     try:
         with DrawProgress() as progress:
             record = measure_tradeoff(run_dir, request, progress.print_note, progress.show)
@@ -287,22 +286,15 @@ def _render_tradeoff_command(args: argparse.Namespace) -> int:
     return 0
 
 
-def _train_tradeoff_command(args: argparse.Namespace) -> int:
+def _train_tradeoff_command(request: TradeoffRequest) -> int:
     from neuprim.cli.progress import DrawProgress
-    from neuprim.config.command_settings import parse_duration_setting, take_launcher_overrides
-    from neuprim.config.overrides import parse_overrides
+    from neuprim.config.command_settings import take_launcher_overrides
     from neuprim.search.ablation import format_ablation_run_command, run_ablation
-    from neuprim.search.tradeoff_measuring import TradeoffRequest
 
-    launcher, words = take_launcher_overrides([args.run_dir, *args.words])
-    said = [str(a.value) for a in parse_overrides(words) if a.key == "budget"]
-    if said and args.budget is not None:
-        raise ConfigError(f"budget={said[-1]} and --budget {args.budget}: expected one of them")
-    asked = f"budget={said[-1]}" if said else f"--budget {args.budget}"
-    budget = parse_duration_setting(said[-1] if said else args.budget or "20m", asked)
-    request = TradeoffRequest(words, budget, args.views, args.repeats, args.knobs, args.lpips)
+    launcher, settings = take_launcher_overrides(request.words)
     try:
         with DrawProgress() as progress:
+            request = replace(request, words=settings)
             folder, record = run_ablation(request, launcher, progress.print_note, progress.show)
     except KeyboardInterrupt:
         raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
@@ -347,9 +339,11 @@ def _format_printed_point(point: TradeoffPoint) -> tuple[str, ...]:
 
 TRADEOFF_COMMAND = Command(
     "tradeoff",
-    "measure what speed and size cost in accuracy: how a run is drawn, or what is trained",
+    "measure speed and size against accuracy, for settings of rendering or of training",
     _tradeoff_command,
     _add_tradeoff_arguments,
-    _TRADEOFF_FORMS + RENDER_OVERRIDES_HELP,
-    _take_tradeoff_words,
+    _TRADEOFF_HELP,
+    f"""{RENDER_SETTINGS_HELP}
+  budget=TIME                about how long, e.g. 90s or 10m (default: 5m for RUN_DIR, 20m to train models)
+without RUN_DIR, any setting of `neuprim run`, and budget=TIME""",
 )

@@ -18,8 +18,9 @@ from neuprim.cli.command import (
     parse_seconds,
     parse_whole,
     print_columns,
-    refuse_argument,
+    take_condition_arguments,
 )
+from neuprim.core.errors import ConfigError
 
 if TYPE_CHECKING:
     from neuprim.core.extensions import ExportReport
@@ -30,45 +31,25 @@ if TYPE_CHECKING:
 # ---------------------------------------------------------------- export and import
 
 
-_EXPORT_USAGE = (
-    "neuprim export RUN_DIR --format NAME [KEY=VALUE ...] [--CONDITION TEXT ...] [--out PATH] [--force] [--json]"
-)
 _HELP_WIDTH = 100
 
 
 def _add_export_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.usage = _EXPORT_USAGE
-    formats = "which format; all of them, those of plugins too, are listed below"
+    formats = "name of the format; see the list below"
     parser.add_argument("--format", required=True, metavar="NAME", help=formats)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR/export)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def _take_export_options(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Keep options and conditions for the exporter; refuse flags that are no condition of the run's task."""
-    arguments.run = arguments.run_dir
-    if any(word.startswith("-") for word in rest):
-        from neuprim.core.conditions import split_conditions
-        from neuprim.runs.open import load_run
-
-        arguments.run = load_run(arguments.run_dir)
-        task = arguments.run.task
-        _, others = split_conditions(rest, task.conditions, bare=False)
-        for word in others:
-            if word.startswith("-"):
-                raise refuse_argument(word, parser, task)
-    arguments.options = rest
-    return []
-
-
 def _export_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
+    from neuprim.core.conditions import condition_flag
     from neuprim.runs.export import export_run
 
-    out, options = arguments.out, arguments.options
+    words = [*(f"{condition_flag(k)}={text}" for k, text in arguments.conditions.items()), *arguments.overrides]
     with DrawProgress() as progress:
-        report = export_run(arguments.run, arguments.format, out, options, arguments.force, progress.show)
+        report = export_run(arguments.run, arguments.format, arguments.out, words, arguments.force, progress.show)
     print_export_report(report, arguments.json)
     return 0
 
@@ -87,8 +68,6 @@ def _list_export_formats() -> Iterator[str]:
     yield "formats:"
     for info in EXPORTERS.list_plugins():
         yield f"  {info.name}  ({info.origin})"
-    yield ""
-    yield "KEY=VALUE is an option of the format: `neuprim export --format NAME --help` lists them with their defaults."
 
 
 def _describe_export_format(name: str) -> Iterator[str]:
@@ -104,7 +83,7 @@ def _describe_export_format(name: str) -> Iterator[str]:
     for first, second in rows:
         yield textwrap.fill(f"  {first:{indent - 4}}  {second}", _HELP_WIDTH, subsequent_indent=" " * indent)
     if exporter.conditions:
-        yield "conditions of the run's task: --NAME TEXT or NAME=TEXT, as --time 0.5 or light=1,2,3"
+        yield "conditions of the run's task are flags after RUN_DIR, as --time 0.5 or --light 1,2,3"
 
 
 def _format_option_default(value: Any) -> str:
@@ -129,8 +108,8 @@ def print_export_report(report: ExportReport, as_json: bool) -> None:
 
 
 def _add_import_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("file", type=Path, metavar="FILE")
-    parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="new directory")
+    parser.add_argument("file", type=Path, metavar="FILE", help="a .ply, .npz or .neuprim file")
+    parser.add_argument("--out", type=Path, required=True, metavar="RUN_DIR", help="where to write, a new directory")
 
 
 def _import_command(arguments: argparse.Namespace) -> int:
@@ -146,12 +125,13 @@ EXPORT_COMMAND = Command(
     _export_command,
     _add_export_arguments,
     _export_help,
-    _take_export_options,
+    "options of the format, which `neuprim export --format NAME --help` lists",
+    take_condition_arguments,
     opens_run=True,
 )
 IMPORT_COMMAND = Command(
     "import",
-    "make a run directory of an exported .ply or .npz, or of a .neuprim",
+    "make a run directory from an exported .ply or .npz, or from a .neuprim file",
     _import_command,
     _add_import_arguments,
 )
@@ -161,18 +141,16 @@ IMPORT_COMMAND = Command(
 
 
 def _add_compress_arguments(parser: argparse.ArgumentParser) -> None:
-    tolerance = "how much worse it may get (default: 0.1dB)"
+    tolerance = "largest loss of PSNR on training views (default: 0.1dB)"
     parser.add_argument("--tolerance", type=parse_decibels, metavar="DB", help=tolerance)
-    level = "so many bits instead, whatever that costs: 1 keeps nearly everything, 5 very little"
+    level = "fixed precision instead: 1 is nearly lossless, 5 is the smallest"
     parser.add_argument("--level", type=parse_count, metavar="1-5", help=level)
-    bits = "bits of a parameter, or of all others, over a level's (3 unless given): means=16 sh_rest=6,5 others=8"
-    parser.add_argument("--bits", nargs="+", default=[], metavar="NAME=BITS", help=bits)
-    seconds = "of training for few bits; 0 for none (default: 30)"
+    seconds = "time to fine-tune the quantised model, e.g. 90s; 0 for none (default: 30s)"
     parser.add_argument("--seconds", type=parse_seconds, default=30.0, metavar="S", help=seconds)
-    steps = "of training instead, for the same file on every machine"
+    steps = "fine-tune for N steps instead, which gives the same file on every machine"
     parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
     out = "where to write (default: RUN_DIR/model.neuprim)"
-    parser.add_argument("--out", "--output", type=Path, metavar="FILE", help=out)
+    parser.add_argument("--out", type=Path, metavar="FILE", help=out)
     parser.add_argument("--force", action="store_true", help="replace a file that exists")
 
 
@@ -180,8 +158,12 @@ def _compress_command(args: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.search.compress import CompressRequest, compress_run
 
+    for word in args.overrides:
+        if not word.startswith("bits."):
+            raise ConfigError(f"{word}: no setting of `neuprim compress`; expected bits.NAME=BITS, as bits.means=16")
+    bits = [word.removeprefix("bits.") for word in args.overrides]
     request = CompressRequest(
-        args.run_dir, args.level, args.bits, args.out, args.force, args.seconds, args.steps, args.tolerance
+        args.run_dir, args.level, bits, args.out, args.force, args.seconds, args.steps, args.tolerance
     )
     with DrawProgress() as progress:
         made = compress_run(request, progress.show)
@@ -210,9 +192,12 @@ def _print_compression(made: Compression) -> None:
 
 COMPRESS_COMMAND = Command(
     "compress",
-    "write a run's model in few bits, as one file that every command reads",
+    "write a run's model as one small quantised file, which every command reads",
     _compress_command,
     _add_compress_arguments,
+    settings="""\
+  bits.NAME=BITS             bits of a parameter, over those of --level (default: 3): bits.means=16 bits.sh_rest=6,5
+  bits.others=BITS           bits of all other parameters""",
     opens_run=True,
 )
 
@@ -221,13 +206,13 @@ COMPRESS_COMMAND = Command(
 
 
 def _add_prune_arguments(parser: argparse.ArgumentParser) -> None:
-    tolerance = "how much worse it may get (default: 0.1dB)"
+    tolerance = "largest loss of PSNR on training views (default: 0.1dB)"
     parser.add_argument("--tolerance", type=parse_decibels, default=0.1, metavar="DB", help=tolerance)
-    seconds = "of fine-tuning; 0 for none (default: 60)"
+    seconds = "time to fine-tune, e.g. 90s; 0 for none (default: 60s)"
     parser.add_argument("--seconds", type=parse_seconds, default=60.0, metavar="S", help=seconds)
-    steps = "of fine-tuning instead, for the same model on every machine"
+    steps = "fine-tune for N steps instead, which gives the same model on every machine"
     parser.add_argument("--steps", type=parse_whole, metavar="N", help=steps)
-    parser.add_argument("--out", type=Path, metavar="DIR", help="the new run's directory (default: RUN_DIR-pruned)")
+    parser.add_argument("--out", type=Path, metavar="DIR", help="directory of the new run (default: RUN_DIR-pruned)")
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
 
@@ -260,7 +245,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
         loss = f"{stage.cut - before:+.3f} dB at once, {stage.trained - before:+.3f} dB after training"
         print(f"{what}; training views {loss}; {'kept' if stage.kept else 'taken back'}")
     if made.run_dir is None:
-        print(f"nothing can go within {tolerance:g} dB; nothing was written")
+        print(f"nothing can be removed within {tolerance:g} dB; nothing was written")
         return
     print(made.run_dir)
     rows = [(name, form.format(made.before[key]), form.format(made.after[key])) for key, name, form in _PRUNING_ROWS]
@@ -275,7 +260,7 @@ def _print_pruning(made: Pruning, tolerance: float) -> None:
 
 PRUNE_COMMAND = Command(
     "prune",
-    "remove what a run's scene does not require, and write the rest as a run",
+    "remove primitives and parameters that a run does not need, and write the rest as a new run",
     _prune_command,
     _add_prune_arguments,
     opens_run=True,

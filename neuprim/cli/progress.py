@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
 import sys
 import time
 from collections import Counter
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Self
 
@@ -175,7 +177,7 @@ class RunLaunchProgress:
         directory, many = self._directories[number], len(self._directories)
         if many > 1 and before.state == "waiting" and status.state == "starting" and not status.attempt:
             print(f"[{number + 1}/{many}] {directory}", flush=True)
-        elif status.state == "done":
+        elif status.state == "done" and many > 1:
             print(directory, flush=True)
         elif status.state == "failed":
             print(f"neuprim: error: {directory}: {status.text}", file=sys.stderr, flush=True)
@@ -230,6 +232,15 @@ def run_command_here(
             return run(config, events, launcher=launcher or LauncherSettings())
     except KeyboardInterrupt:
         raise KeyboardInterrupt(describe_interrupted_command(config.output_dir, typed)) from None
+
+
+def print_run_summary(run_dir: Path) -> None:
+    """Print what a finished run reached, where its report is, and a command to go on with."""
+    from neuprim.runs.run import summarize_run
+
+    print(summarize_run(run_dir))
+    words = ["view", str(run_dir)] if find_spec("viser") is not None else ["render", str(run_dir), "--camera", "orbit"]
+    print(f"next: {shlex.join(['neuprim', *words])}", flush=True)
 
 
 def _run_with_viewer(config: RunConfig, events: RunProgress, settings: ViewerSettings) -> Path:

@@ -13,7 +13,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING
 
-from neuprim.cli.command import Command, add_trust_flag, describe_interrupted_command, take_override_arguments
+from neuprim.cli.command import Command, add_trust_flag, describe_interrupted_command
 from neuprim.core.errors import BackendUnavailable, ConfigError, RankError, one_line
 
 if TYPE_CHECKING:
@@ -25,33 +25,33 @@ if TYPE_CHECKING:
     from neuprim.search.target_record import TargetRecord
 
 
-_COMMON_KEYS = """\
-commonest keys:
-  task=NAME scene=NAME preset=NAME     what to fit, and how (`neuprim tasks` lists them)
-  effort=N                             1 (fast) to 9 (good): a size and length that the task has measured
+_RUN_SETTINGS = """\
+in Hydra's grammar, anywhere on the line; these are the most common
+  task=NAME scene=NAME                 what to fit (all are listed below)
+  preset=NAME                          settings to start from (`neuprim tasks` lists them)
+  effort=N                             1 (fast) to 9 (good): sets training steps and number of primitives to values
+                                       measured for the task; 1 takes about a tenth of the time of preset=quick, 9
+                                       about four times as long
   scene.path=DIR                       data of a scene that reads files
-  output_dir=DIR resume=true           where to write; continue an interrupted run
+  resume=true                          continue an interrupted run
   train.iterations=N train.max_seconds=S
   model.primitives=N model.neurons=K model.sh_degree=D
   train.rates.NAME=R                   learning rate of one parameter; train.rate_units.NAME=absolute|extent|pixel
   renderer.backend=auto|NAME           `neuprim doctor` lists them
   renderer.sort=center|entry           renderer.samples=N (rays per pixel side) renderer.threads=N
   seed=N
-  viewer=true viewer.port=N            look at the model in the browser while it is trained; pause, step, save, stop
+  viewer=true viewer.port=N            show the model in the browser during training; pause, step, save, stop
   target.psnr=DB budget=10m            the smallest model that reaches it, found in that time; also target.ssim=S,
                                        target.megabytes=M and target.fps=F as limits, or these alone
-  launcher=inline|processes|ray|slurm  where runs work; launcher.workers=N launcher.threads=N launcher.retries=N
-                                       launcher.address=... launcher.options.KEY=VALUE (docs/launching.md)
-  scene.cache=DIR|URL                  volumes: where their ground truth is kept (`neuprim truth` makes it before)
-`neuprim run task=NAME scene=NAME --cfg` shows every key with its value. A value that contains , = or brackets is quoted
-twice, for the shell and for the grammar: "scene.path='a=b, c'"."""
+  launcher=inline|processes|ray|slurm  where runs work; also launcher.workers=N launcher.threads=N launcher.retries=N
+  scene.cache=DIR|URL                  volumes: folder of their ground truth (`neuprim truth` renders it before a run)
+--print-config shows all. Quote a value that contains , = or brackets twice: "scene.path='a=b, c'\""""
 
 _EXAMPLES = """\
 examples:
-  neuprim run task=dynamic scene=smoke_fire
-  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
   neuprim run task=static scene=solids
-  neuprim run task=static scene=blender scene.path=DIR preset=paper
+  neuprim run task=static scene=blender scene.path=DIR preset=paper --out RUN_DIR
+  neuprim run task=dynamic scene=vdb scene.vdb=DIR scene.frames=0:100:2
   neuprim run -m model.primitives=200,1000 train.max_seconds=60 launcher=processes
   neuprim run --config RUN_DIR/config.yaml seed=1
   torchrun --nproc-per-node 2 -m neuprim run task=static scene=solids      (one scene by two processes)"""
@@ -61,24 +61,46 @@ def _run_help(words: Sequence[str]) -> str:
     """Return the text below the arguments, with the installed tasks."""
     if not {"-h", "--help"} & set(words):
         return ""
-    from neuprim.plugins.registry import TASKS
+    from neuprim.plugins.registry import TASKS, list_scene_names
 
-    tasks = [f"  {TASKS.shortest_name(info)}  ({info.origin})" for info in TASKS.list_plugins()]
-    return "\n\n".join([_COMMON_KEYS, "\n".join(["tasks:", *tasks]), _EXAMPLES])
+    lines = ["tasks, and their scenes (`neuprim tasks` describes them):"]
+    for info in TASKS.list_plugins():
+        origin = "" if info.built_in else f"  ({info.origin})"
+        lines.append(f"  {TASKS.shortest_name(info):8} {', '.join(list_scene_names(info))}{origin}")
+    return "\n".join([*lines, "", _EXAMPLES])
 
 
 def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help="settings, in Hydra's grammar")
+    parser.add_argument("--out", metavar="DIR", help="where to write (default: outputs/TASK-SCENE)")
     sweep = "run every combination of values separated by commas"
     parser.add_argument("-m", "--multirun", action="store_true", help=sweep)
-    stored = "start with the settings of RUN_DIR/config.yaml; words beside it come first"
+    stored = "start from the settings of RUN_DIR/config.yaml; those typed replace them"
     parser.add_argument("--config", type=Path, metavar="FILE", help=stored)
-    parser.add_argument("--cfg", action="store_true", help="print the resolved configuration and stop")
+    parser.add_argument("--print-config", action="store_true", help="print every setting with its value, and stop")
     add_trust_flag(parser)
 
 
+def _refuse_bare_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
+    """Refuse words that are neither settings nor flags, with the settings that names of tasks and scenes stand for."""
+    if not rest or any(word.startswith("-") for word in rest):
+        return rest
+    from neuprim.plugins.registry import TASKS, list_scene_names
+
+    scenes = {TASKS.shortest_name(info): list_scene_names(info) for info in TASKS.list_plugins()}
+    chosen = [word.partition("=")[2] for word in arguments.overrides if word.startswith("task=")]
+    chosen += [word for word in rest if word in scenes]
+    meant: list[str] = []
+    for word in rest:
+        owner = next((task for task in chosen or scenes if word in scenes.get(task, ())), None)
+        if word not in scenes and owner is None:
+            raise ConfigError(f"{word}: expected KEY=VALUE (see {parser.prog} --help)")
+        meant += [f"task={word}"] if word in scenes else [*([] if chosen else [f"task={owner}"]), f"scene={word}"]
+    command = shlex.join([*parser.prog.split(), *dict.fromkeys(meant), *arguments.overrides])
+    raise ConfigError(f"{' '.join(rest)}: expected KEY=VALUE; did you mean: {command}?")
+
+
 def _run_command(args: argparse.Namespace) -> int:
-    from neuprim.cli.progress import run_command_here
+    from neuprim.cli.progress import print_run_summary, run_command_here
     from neuprim.config import compose, compose_all, read_stored_config
     from neuprim.config.command_settings import (
         LauncherSettings,
@@ -86,15 +108,16 @@ def _run_command(args: argparse.Namespace) -> int:
         take_target_overrides,
         take_viewer_overrides,
     )
-    from neuprim.config.overrides import CommandLine, drop_output_overrides
+    from neuprim.config.overrides import CommandLine, drop_output_overrides, quote_override
     from neuprim.core.train.process_group import read_torchrun_rank
     from neuprim.runs.fit import is_chunked, refuse_chunks
 
+    asked = [*args.overrides, *([] if args.out is None else [quote_override("output_dir", args.out)])]
     place = read_torchrun_rank()
     if place is not None:
-        return run_command_as_rank(place, args.overrides, args.multirun or args.cfg or args.config is not None)
-    typed = CommandLine(args.overrides, args.config)
-    viewer, overrides = take_viewer_overrides(args.overrides)
+        return run_command_as_rank(place, asked, args.multirun or args.print_config or args.config is not None)
+    typed = CommandLine(asked, args.config)
+    viewer, overrides = take_viewer_overrides(asked)
     launcher, overrides = take_launcher_overrides(overrides)
     wanted, overrides = take_target_overrides(overrides)
     launched = launcher != LauncherSettings()
@@ -107,11 +130,11 @@ def _run_command(args: argparse.Namespace) -> int:
         from neuprim.runs.sweep import read_sweep_overrides
 
         overrides = read_sweep_overrides(overrides)
-        typed = CommandLine([*overrides, *args.overrides], args.config)  # what goes on with it says all of it
+        typed = CommandLine([*overrides, *asked], args.config)  # what goes on with it says all of it
     stored = None if args.config is None else read_stored_config(args.config)
-    check = not args.cfg
+    check = not args.print_config
     configs = compose_all(overrides, check, stored) if args.multirun else [compose(overrides, check, stored)]
-    if args.cfg:
+    if args.print_config:
         if wanted is not None:
             print(f"# {wanted[0]} budget={wanted[1]:g}s; the search starts from")
         print("---\n".join(config.to_yaml() for config in configs), end="")
@@ -122,15 +145,15 @@ def _run_command(args: argparse.Namespace) -> int:
         refuse_chunks(configs[0], "viewer=true shows one training")
     if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
         return run_command_with_launcher(configs, overrides, launcher, typed)
-    print(run_command_here(configs[0], typed, viewer, launcher))
+    print_run_summary(run_command_here(configs[0], typed, viewer, launcher))
     return 0
 
 
 def _run_command_with_target(
     config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: CommandLine
 ) -> int:
-    """Search for a model that reaches a target; print what was achieved and the run's directory."""
-    from neuprim.cli.progress import RunProgress
+    """Search for a model that reaches a target; print what was achieved."""
+    from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.search.target import run_target
 
     try:
@@ -141,7 +164,7 @@ def _run_command_with_target(
         raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
     for line in _list_printed_target_lines(record):
         events.console.print(line)
-    print(record.achieved["run_dir"])
+    print_run_summary(Path(record.achieved["run_dir"]))
     return 0
 
 
@@ -166,7 +189,9 @@ def _list_printed_target_lines(record: TargetRecord) -> list[str]:
     return [*lines, f"everything that was tried: {TARGET_FILE}"]
 
 
-RUN_COMMAND = Command("run", "fit a scene", _run_command, _add_run_arguments, _run_help, take_override_arguments)
+RUN_COMMAND = Command(
+    "run", "fit a scene", _run_command, _add_run_arguments, _run_help, _RUN_SETTINGS, _refuse_bare_words
+)
 
 
 # ---------------------------------------------------------------- sweeps and launchers
@@ -181,7 +206,7 @@ def run_command_with_launcher(
         overrides: what the sweep was asked for.
         typed: all that was typed, for the command that continues.
     """
-    from neuprim.cli.progress import RunLaunchProgress
+    from neuprim.cli.progress import RunLaunchProgress, print_run_summary
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
     from neuprim.runs.launch.launcher import LAUNCH_FOLDER, launch_jobs
     from neuprim.runs.sweep import make_run_job, run_sweep
@@ -195,6 +220,8 @@ def run_command_with_launcher(
     status = _report_launched_runs(configs, results, progress.live, typed)
     if len(configs) > 1:
         print(configs[0].output_dir.parent / "sweep.html")
+    elif status == 0:
+        print_run_summary(configs[0].output_dir)
     return status
 
 
@@ -208,7 +235,7 @@ def _report_launched_runs(
         if result is None or result.state == "interrupted":
             left.append(config.output_dir)
         elif result.state == "done":
-            if live:
+            if live and len(configs) > 1:
                 print(config.output_dir)
         else:
             if result.trace:
@@ -230,17 +257,14 @@ def _report_launched_runs(
 
 
 _TRUTH_HELP = """\
-Frames that are there are not made again; a run with the same scene reads them. With a launcher they are made side by
-side:
+Prints the folder of the frames. Existing frames are kept, and a run with the same scene reads them. A launcher renders
+frames in parallel:
   neuprim truth task=dynamic scene=vdb scene.vdb=DIR launcher=processes
-  neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm
-Prints where they are."""
+  neuprim truth task=dynamic scene=vdb scene.vdb=DIR scene.cache=DIR launcher=slurm"""
 
 
 def _add_truth_arguments(parser: argparse.ArgumentParser) -> None:
-    settings = "settings of the scene and of the launcher, as of neuprim run"
-    parser.add_argument("overrides", nargs="*", metavar="KEY=VALUE", help=settings)
-    every = "of every combination of values separated by commas"
+    every = "render for every combination of values separated by commas"
     parser.add_argument("-m", "--multirun", action="store_true", help=every)
 
 
@@ -273,7 +297,8 @@ TRUTH_COMMAND = Command(
     _truth_command,
     _add_truth_arguments,
     _TRUTH_HELP,
-    take_override_arguments,
+    "settings of the scene and of the launcher, as of `neuprim run`",
+    _refuse_bare_words,
 )
 
 
@@ -339,8 +364,8 @@ def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -
     )
     if group.is_first and more:
         raise ConfigError(
-            f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, --cfg, "
-            "a target, a launcher, nor a viewer"
+            f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, "
+            "--print-config, a target, a launcher, nor a viewer"
         )
     config = compose(words) if group.is_first else None
     directory = group.gather(None if config is None else str(config.output_dir))[0]
@@ -374,7 +399,7 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 
 def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
     """Train, and show it on rank 0."""
-    from neuprim.cli.progress import RunProgress
+    from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.fit import ignore_run_event
     from neuprim.runs.run import run
@@ -388,7 +413,8 @@ def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: 
                 run(config, ignore_run_event, group=group)
             return
         with RunProgress(f"{config.task}/{config.scene_name}, {group.size} ranks") as events:
-            print(run(config, events, group=group))
+            run_dir = run(config, events, group=group)
+        print_run_summary(run_dir)
     except RankError as error:
         command = f"torchrun {ranks} -m {typed.resume_command(config.output_dir)}"
         raise RankError(f"{error}; to go on: {command}", error.reported) from error

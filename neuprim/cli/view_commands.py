@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from neuprim.cli.command import (
-    RENDER_OVERRIDES_HELP,
+    RENDER_SETTINGS_HELP,
     Command,
     parse_count,
     parse_number,
@@ -21,7 +21,6 @@ from neuprim.cli.command import (
     parse_whole,
     plain_console,
     take_condition_arguments,
-    take_render_override_arguments,
 )
 from neuprim.core.errors import ConfigError, DataError
 
@@ -37,43 +36,41 @@ if TYPE_CHECKING:
 
 _RENDER_CONDITIONS = """\
 Each condition of the run's task (time, light, ...) is a flag, given after RUN_DIR: --time 0.5; a number may also be a
-list or a range, --time 0.2,0.8 or --time 0:1:20, one frame each.
-
-"""
+list or a range, --time 0.2,0.8 or --time 0:1:20, one frame each."""
 
 
 def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
-    cameras = "a file is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or a COLMAP model's folder"
+    cameras = (
+        "FILE is JSON (frames, or a path of nerfstudio's viewer), USD (FILE#/PRIM) or the folder of a COLMAP model"
+    )
     parser.add_argument("--camera", required=True, metavar="orbit|test|FILE", help=cameras)
-    space = "coordinates of cameras, lights and .exr files: the run's data (default), or the model (volumes: unit box)"
+    space = "coordinates of cameras, lights and .exr files: of the run's data (default), or of the model"
     parser.add_argument("--space", choices=("world", "scene"), help=space)
-    parser.add_argument("--size", type=parse_size_argument, metavar="WxH", help="pixels (default: the data set's)")
+    parser.add_argument(
+        "--size", type=parse_size_argument, metavar="WxH", help="image size in pixels (default: that of the data)"
+    )
     formats = ("png", "exr", "npy", "webp", "gif", "mp4")
     parser.add_argument("--format", choices=formats, help="default: png, or webp for an animation")
-    layers = "of an .exr: beauty, alpha, depth, density, and the task's own (an unknown name lists them); default: all"
+    layers = "layers of an .exr: beauty, alpha, depth, density, and those of the task (default: all)"
     parser.add_argument("--layers", metavar="NAME,...", help=layers)
-    datatype = "light and alpha of an .exr in 16 or 32 bits (default: float); other numbers are always float"
+    datatype = "precision of colour and alpha in an .exr (default: float); other layers are always float"
     parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
-    rate = "frames per second of an animation (default: about four seconds in all)"
+    rate = "frames per second of an animation (default: it lasts about four seconds)"
     parser.add_argument("--fps", type=parse_rate, metavar="F", help=rate)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     parser.add_argument("--frames", type=parse_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
-    parser.add_argument("--force", action="store_true", help="replace pictures of the run's report")
-    group = parser.add_argument_group("light from all around, for tasks with a light")
-    image = "radiance by latitude and longitude, twice as wide as high"
+    parser.add_argument("--force", action="store_true", help="replace existing pictures of the run's report")
+    group = parser.add_argument_group("environment light, for tasks with a light")
+    image = "equirectangular radiance, twice as wide as high"
     group.add_argument("--environment", type=Path, metavar="FILE.exr", help=image)
-    lights = "lights that stand for it (default: 64)"
+    lights = "number of lights that approximate it (default: 64)"
     group.add_argument("--environment-samples", type=_parse_light_count_argument, metavar="N", help=lights)
-    rotation = "anticlockwise about up, seen from above (default: 0)"
+    rotation = "counter-clockwise about the up axis, seen from above (default: 0)"
     group.add_argument("--environment-rotation", type=_parse_degrees, metavar="DEG", help=rotation)
     scale = "multiplies its radiance (default: 1)"
     group.add_argument("--environment-scale", type=_parse_factor, metavar="X", help=scale)
-    unseen = "light from where the model never saw any: draw what it guesses, or leave it out (default: keep)"
+    unseen = "light from directions that the training data lack: keep the model's guess, or drop it (default: keep)"
     group.add_argument("--environment-unseen", choices=("keep", "drop"), help=unseen)
-
-
-def _take_render_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    return take_condition_arguments(arguments, take_render_override_arguments(arguments, rest, parser), parser)
 
 
 def _render_command(arguments: argparse.Namespace) -> int:
@@ -87,7 +84,7 @@ def _render_command(arguments: argparse.Namespace) -> int:
     names = ("size", "format", "out", "frames", "conditions", "fps", "space", "layers", "datatype")
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
-        camera, environment=environment, overrides=arguments.words, overwrite=arguments.force, **given
+        camera, environment=environment, overrides=arguments.overrides, overwrite=arguments.force, **given
     )
     with DrawProgress() as progress:
         paths = render_run(arguments.run, request, notify=progress.print_note, progress=progress.show)
@@ -122,11 +119,12 @@ def _parse_factor(text: str) -> float:
 
 RENDER_COMMAND = Command(
     "render",
-    "draw images of a run",
+    "render images of a run",
     _render_command,
     _add_render_arguments,
-    _RENDER_CONDITIONS + RENDER_OVERRIDES_HELP,
-    _take_render_words,
+    _RENDER_CONDITIONS,
+    RENDER_SETTINGS_HELP,
+    take_condition_arguments,
     opens_run=True,
 )
 
@@ -140,22 +138,22 @@ Each condition of the run's task is a flag, given after RUN_DIR: --time 0.5, or 
 
 
 def _add_inspect_arguments(parser: argparse.ArgumentParser) -> None:
-    shown = "volume, isosurface, slices, primitives, primitive, difference, ..."
+    shown = "layers: volume, isosurface, slices, primitives, primitive, difference, ..."
     parser.add_argument("--show", default="", metavar="NAME,...", help=shown)
-    ellipsoids = "the ellipsoids in their own colours; as --show primitives"
-    parser.add_argument("--primitives", action="store_true", help=ellipsoids)
-    one = "look into this one; as --show primitive"
+    one = "show this primitive alone"
     parser.add_argument("--primitive", type=parse_whole, metavar="INDEX", help=one)
     parser.add_argument("--against", metavar="FILE.vdb|DIR|scene", help="ground truth to compare with")
-    grid = "points along the box's longest side (default: 128)"
+    grid = "points along the longest side of the box (default: 128)"
     parser.add_argument("--grid", type=parse_count, default=128, metavar="N", help=grid)
-    box = "two corners, in the coordinates of the run's data, as --box=-1,-1,-1,1,1,1 (default: around all matter)"
+    box = "two corners in the coordinates of the run's data, as --box=-1,-1,-1,1,1,1 (default: around the model)"
     parser.add_argument("--box", type=parse_numbers, metavar="X,Y,Z,X,Y,Z", help=box)
-    levels = "extinctions of isosurfaces, 1/scene unit"
+    levels = "extinctions of the isosurfaces, in 1/scene unit"
     parser.add_argument("--level", type=parse_numbers, default=[], metavar="S,...", help=levels)
     parser.add_argument("--up", choices=("x", "y", "z"), help="the upward axis (default: the scene's, or z)")
-    parser.add_argument("--size", type=parse_size_argument, metavar="WxH", help="pixels of the picture or window")
-    out = ".png, .webp, .gif, .mp4, .html or .vdb (default: a window)"
+    parser.add_argument(
+        "--size", type=parse_size_argument, metavar="WxH", help="size of the picture or window in pixels"
+    )
+    out = "where to write: .png, .webp, .gif, .mp4, .html or .vdb (default: show a window)"
     parser.add_argument("--out", type=Path, metavar="FILE", help=out)
     parser.add_argument("--force", action="store_true", help="replace files that exist")
 
@@ -166,7 +164,7 @@ def _inspect_command(arguments: argparse.Namespace) -> int:
     from neuprim.runs.inspect import InspectRequest, inspect_run
 
     names = [name.strip() for name in arguments.show.split(",") if name.strip()]
-    names += ["primitives"] * arguments.primitives + ["primitive"] * (arguments.primitive is not None)
+    names += ["primitive"] * (arguments.primitive is not None)
     request = InspectRequest(
         arguments.run,
         names or ["volume"],
@@ -191,7 +189,7 @@ INSPECT_COMMAND = Command(
     _inspect_command,
     _add_inspect_arguments,
     _INSPECT_CONDITIONS,
-    take_condition_arguments,
+    take_rest=take_condition_arguments,
     opens_run=True,
 )
 
@@ -200,9 +198,9 @@ INSPECT_COMMAND = Command(
 
 
 def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
-    port = "of the page's address; 0 for any (default: 8080)"
+    port = "port of the page; 0 for any that is free (default: 8080)"
     parser.add_argument("--port", type=_parse_port, default=8080, metavar="N", help=port)
-    host = "to listen on (default: 127.0.0.1, which this machine alone reaches)"
+    host = "address to listen on (default: 127.0.0.1, which only this machine can reach)"
     parser.add_argument("--host", metavar="ADDRESS", help=host)
 
 
@@ -245,7 +243,7 @@ VIEW_COMMAND = Command(
 
 
 def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("action", choices=("info",), metavar="info", help="what to do")
+    parser.add_argument("action", choices=("info",), metavar="info", help="list the grids")
     parser.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -369,7 +367,7 @@ def _printable(text: str) -> str:
 
 VDB_COMMAND = Command(
     "vdb",
-    "look into OpenVDB files",
+    "print what OpenVDB files contain",
     _vdb_info_command,
     _add_vdb_arguments,
     "`info` lists grids: type, transform, bounds, active voxels, values, memory.",

@@ -24,12 +24,15 @@ class LauncherSettings:
     """Where runs work, and how many at once: ``launcher=NAME launcher.KEY=VALUE``.
 
     Attributes:
-        workers: runs at once; None: as many as there are, and as the cores of this machine or the cluster allow.
-        threads: of each run; None shares the cores.
+        name: "inline" (this process, one after the other), "processes" (on this machine), "ray" or "slurm".
+        workers: runs at the same time; null: as many as there are, and as the cores of this machine or the cluster
+            allow.
+        threads: threads of each run; null shares the cores.
         retries: how often a run continues from its checkpoint after its worker died.
-        address: of Ray, as ``ray.init`` takes it; of Slurm, submitit's executor ("slurm" or "local"). None: the Ray of
-            ``RAY_ADDRESS``, else one on this machine; Slurm.
-        options: for the engine: Ray's options of a task, such as ``num_gpus``; submitit's, such as ``slurm_partition``.
+        address: address of Ray, as ``ray.init`` takes it; for Slurm the executor of submitit, "slurm" or "local". null:
+            the Ray of ``RAY_ADDRESS``, else one on this machine; Slurm.
+        options: options of the engine: of a Ray task, such as ``num_gpus``, or of submitit, such as
+            ``slurm_partition``.
     """
 
     name: LauncherName = "inline"
@@ -50,11 +53,11 @@ class LauncherSettings:
 
 @dataclass(frozen=True)
 class ViewerSettings:
-    """Where the live viewer of a training listens: ``viewer=true viewer.port=8080``.
+    """Show a training in the browser: ``viewer=true viewer.port=8080``; a host or port alone does so, too.
 
     Attributes:
-        host: an address of this machine; the default is reached from this machine alone.
-        port: 0 for any that is free.
+        host: address of this machine to listen on; only this machine can reach the default.
+        port: port of the page; 0 for any that is free.
     """
 
     host: Annotated[str, nonempty_text("an address of this machine")] = LOOPBACK
@@ -68,13 +71,14 @@ class ViewerSettings:
 class SearchTarget:
     """What a model is to reach: ``target.psnr=30``.
 
-    With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and ``megabytes`` and ``fps`` are
-    limits; without, the best model within the limits is.
+    With ``psnr`` or ``ssim``, or both, the result is the smallest model that reaches them, and ``megabytes`` and
+    ``fps`` are limits; without, it is the best model within the limits.
 
     Attributes:
-        psnr, ssim: means over views; dB.
-        megabytes: at most; millions of bytes of the compressed model, ``model.neuprim``.
-        fps: at least; frames per second on this machine, at the size of the views.
+        psnr: PSNR to reach, mean over views, dB.
+        ssim: SSIM to reach, mean over views.
+        megabytes: largest size of the compressed model, ``model.neuprim``, in millions of bytes.
+        fps: smallest number of frames per second on this machine, at the size of the views.
     """
 
     psnr: Annotated[float, Range(above=0, at_most=100, says="decibels, above 0 and at most 100")] | None = None
@@ -123,19 +127,25 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
     """Return the target and its budget in seconds, None where neither is asked for, and the other overrides."""
-    budget, _, rest = take_settings(overrides, "budget", _Budget)
+    budget, rest = take_budget_override(overrides)
     whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
         return None, others
     if whole is not None:
         raise ConfigError(f"target={format_setting_value(whole)}: expected one of {_TARGETS}")
-    asked = "target" if budget is None else f"budget={format_setting_value(budget)}"
+    asked = "target" if budget is None else f"budget={budget}"
     if not target.given_settings():
         raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
     if budget is None:
         expected = "a budget beside it, the time for search and training together, such as budget=10m"
         raise ConfigError(f"{target}: expected {expected}")
-    return (target, parse_duration_setting(budget if isinstance(budget, str) else "", asked)), others
+    return (target, parse_duration_setting(budget, asked)), others
+
+
+def take_budget_override(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
+    """Return the text of ``budget=TIME``, None where it is not given, and the other overrides."""
+    budget, _, others = take_settings(overrides, "budget", _Budget)
+    return (None if budget is None else str(budget)), others
 
 
 @dataclass(frozen=True)

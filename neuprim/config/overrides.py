@@ -49,8 +49,7 @@ class CommandLine:
         if not overrides and self.file is None and not (directory / "config.yaml").is_file():
             overrides = ["task=static"]  # the default, which a bare resume=true does not begin
         flags = [*(["-m"] if sweep else []), *([] if self.file is None else ["--config", str(self.file)])]
-        place = str(directory.parent if sweep else directory)
-        last = [quote_override("output_dir", place), "resume=true"]
+        last = ["--out", str(directory.parent if sweep else directory), "resume=true"]
         return shlex.join(["neuprim", "run", *flags, *overrides, *last])
 
 

@@ -31,7 +31,14 @@ _MAX_BYTES = 1_000_000
 
 @dataclass
 class RunSettings:
-    """The part of the configuration that is the same for every task; defaults are a run's defaults."""
+    """The part of the configuration that is the same for every task; defaults are a run's defaults.
+
+    Attributes:
+        model, train, renderer, metrics: groups of settings.
+        output_dir: directory of the run, on the command line ``--out DIR``; null for a new one in ``outputs``.
+        seed: seed of every random number of the run.
+        resume: continue the run in its directory from the checkpoint.
+    """
 
     model: ModelSettings = field(default_factory=ModelSettings)
     train: TrainSettings = field(default_factory=TrainSettings)

@@ -145,8 +145,7 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
     if bare:
         hint = ", or -m for the sweep there" if (directory / _SWEEP).is_file() else ""
         raise ConfigError(
-            f"output_dir={directory} resume=true: no run was begun there (no config.yaml); "
-            f"expected a run's directory{hint}"
+            f"--out {directory} resume=true: no run was begun there (no config.yaml); expected a run's directory{hint}"
         )
     return None
 
@@ -167,7 +166,7 @@ def _resumed_config_error(begun: RunConfig, key: str, typed: Any, was: Any) -> C
     return ConfigError(
         f"{key}={format_setting_value(typed)}: the run to resume was begun with "
         f"{key}={format_setting_value(was)} ({begun.source}); "
-        f"expected that, no {key}, or another output_dir"
+        f"expected that, no {key}, or another --out DIR"
     )
 
 
@@ -259,22 +258,22 @@ def config_output_directory(asked: str | None, name: str, resume: bool, check: b
         number = max(_config_output_numbers(name), default=0) + (not resume)
         return ROOT / (name if number <= 1 else f"{name}-{number}")
     if not asked.strip():
-        raise ConfigError("output_dir='': expected a directory")
+        raise ConfigError("--out '': expected a directory")
     path = Path(asked).expanduser()
     if not check:
         return path
     try:
         if not resume and path.is_dir() and any(path.iterdir()):
             raise ConfigError(
-                f"output_dir={path}: exists and is not empty; choose another, or continue its run with resume=true"
+                f"--out {path}: exists and is not empty; choose another, or continue its run with resume=true"
             )
         there = next(p for p in (path.absolute(), *path.absolute().parents) if p.exists())
         if not there.is_dir():
-            raise ConfigError(f"output_dir={path}: {there} is a file; expected a directory")
+            raise ConfigError(f"--out {path}: {there} is a file; expected a directory")
         if not os.access(there, os.W_OK | os.X_OK):
-            raise ConfigError(f"output_dir={path}: {there} cannot be written to")
+            raise ConfigError(f"--out {path}: {there} cannot be written to")
     except (OSError, ValueError) as error:
-        raise ConfigError(f"output_dir={path}: {error}") from error
+        raise ConfigError(f"--out {path}: {error}") from error
     return path
 
 

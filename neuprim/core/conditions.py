@@ -1,6 +1,6 @@
 """Read the conditions of a task from text: one grammar for every command and exporter, and the check of their ranges.
 
-A condition is given as ``--NAME TEXT``, ``--NAME=TEXT`` or ``NAME=TEXT``, with ``-`` or ``_`` inside its name. For a
+A condition is given as ``--NAME TEXT`` or ``--NAME=TEXT``, with ``-`` or ``_`` inside its name. For a
 condition that is one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``,
 one frame each; :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The text of any
 other condition is the task's altogether, as ``x,y,z`` or ``orbit`` for a light.
@@ -46,26 +46,19 @@ def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
-def split_conditions(
-    words: Sequence[str], specs: Sequence[ConditionSpec], bare: bool = True
-) -> tuple[dict[str, str], list[str]]:
-    """Return condition name -> text out of the words of a command, and the other words in their order.
-
-    Args:
-        bare: whether ``NAME=TEXT`` counts too, beside ``--NAME TEXT`` and ``--NAME=TEXT``.
-    """
+def split_conditions(words: Sequence[str], specs: Sequence[ConditionSpec]) -> tuple[dict[str, str], list[str]]:
+    """Return condition name -> text out of the words of a command, and the other words in their order."""
     found: dict[str, str] = {}
     rest: list[str] = []
     queue = list(words)
     while queue:
         word = queue.pop(0)
         key, equals, text = word.partition("=")
-        is_flag = key.startswith("--")
-        name = named(key.removeprefix("--"), specs) if is_flag or (bare and equals) else None
+        name = named(key.removeprefix("--"), specs) if key.startswith("--") else None
         if name is None:
             rest.append(word)
             continue
-        if is_flag and not equals:
+        if not equals:
             if not queue or queue[0].startswith("--"):
                 raise ConfigError(f"{word}: expected a value after it")
             text = queue.pop(0)

@@ -137,7 +137,7 @@ def validate_settings(cls: type[T], values: object, where: str = "") -> T:
     for field in dataclasses.fields(cls):  # type: ignore[arg-type]
         if field.name not in values and field.default is field.default_factory is dataclasses.MISSING:
             name = join_setting_key(where, field.name)
-            raise ConfigError(f"{name}: required and not given; expected {_describe_expected(hints[field.name], name)}")
+            raise ConfigError(f"{name}: required and not given; expected {describe_expected(hints[field.name], name)}")
     return cls(
         **{
             name: validate_value(values[name], hint, join_setting_key(where, name))
@@ -162,7 +162,7 @@ def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str,
         if made != value or (isinstance(made, int) and isinstance(value, float)):
             # "1e-3" for a number, 3 for text, 4.0 for a whole number: the field gets the value itself
             raise _UnfitValue(
-                join_setting_key(where, key), value, _describe_expected(hint, join_setting_key(where, key))
+                join_setting_key(where, key), value, describe_expected(hint, join_setting_key(where, key))
             )
 
 
@@ -250,7 +250,7 @@ def _setting_reads_as_number(value: str) -> bool:
     return True
 
 
-def _describe_expected(hint: Any, where: str) -> str:
+def describe_expected(hint: Any, where: str) -> str:
     """What a field expects."""
     plain, notes = _split_validation_type(hint)
     says = next((note.says for note in notes if isinstance(note, Accepts)), "")
@@ -258,14 +258,14 @@ def _describe_expected(hint: Any, where: str) -> str:
         return says
     origin, args = get_origin(plain), get_args(plain)
     if origin in (Union, types.UnionType):
-        return ", or ".join("null" if a is type(None) else _describe_expected(a, where) for a in args)
+        return ", or ".join("null" if a is type(None) else describe_expected(a, where) for a in args)
     if origin is Literal:
         return _join_choices(args)
     if origin in (tuple, list):
         return (
-            f"a list, each {_describe_expected(args[0], where)}"
+            f"a list, each {describe_expected(args[0], where)}"
             if origin is list or args[-1] is ...
-            else f"a list of {', '.join(_describe_expected(a, where) for a in args)}"
+            else f"a list of {', '.join(describe_expected(a, where) for a in args)}"
         )
     if plain is str:
         return f"text (quote it: {where}='...')"
@@ -339,7 +339,7 @@ def _validate_plain_value(value: Any, kind: Any, notes: tuple[Any, ...], where: 
     elif (made := _validate_scalar(value, kind)) is not None:
         return made
     hint = Annotated[kind, *notes] if notes else kind
-    raise _UnfitValue(where, value, _describe_expected(hint, where))
+    raise _UnfitValue(where, value, describe_expected(hint, where))
 
 
 def _validate_entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: str) -> dict[str, Any]:

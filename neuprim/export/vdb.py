@@ -43,7 +43,7 @@ OPTIONS = {
     "units": ("auto", "source, world or scene; auto: source where the model was fitted to .vdb files, else world"),
     "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
     "half": (False, "16-bit floats"),
-    "name": ("density", "of the grid"),
+    "name": ("density", "name of the grid"),
 }
 _SLAB_BYTES = 64 * 2**20
 _MOST_VOXELS = 2**34

@@ -9,10 +9,11 @@ whoever else registers it.
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from importlib import metadata
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
 from packaging.utils import canonicalize_name
@@ -261,6 +262,22 @@ PLUGIN_GROUPS: tuple[PluginGroup[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS,
 def load_task(name: str) -> TaskSpec:
     """Load the task that ``NAME`` or ``PACKAGE:NAME`` chooses. Raises as :meth:`PluginGroup.load`."""
     return TASKS.load(name)
+
+
+def list_scene_names(task: PluginInfo) -> list[str]:
+    """List the scenes of a task without importing it.
+
+    They are the YAML files of ``conf/scene/NAME`` beside its module, and those that other packages register. Of a task
+    whose files are elsewhere only the latter are known.
+    """
+    added = [SCENES.typed_name(info.name) for info in SCENES.list_plugins() if info.name.startswith(f"{task.name}.")]
+    try:
+        found = importlib.util.find_spec(task.target.partition(":")[0])
+    except Exception:  # finding a module imports the packages around it, which can fail in any way
+        found = None
+    folders = [] if found is None else found.submodule_search_locations or []
+    own = {file.stem for folder in folders for file in Path(folder, "conf", "scene", task.name).glob("*.yaml")}
+    return sorted(own.union(added))
 
 
 @dataclass(frozen=True)

@@ -14,7 +14,7 @@ import torch
 
 from neuprim.core import checkpoint
 from neuprim.core.compression.file import is_compressed
-from neuprim.core.conditions import condition_flag, named, read_conditions, split_conditions
+from neuprim.core.conditions import condition_flag, read_conditions, split_conditions
 from neuprim.core.errors import ConfigError, DataError, NeuprimError, nearest
 from neuprim.core.extensions import Exporter, ExportJob, ExportReport, StoredModel
 from neuprim.core.io.files import StagedOutput, refuse_existing, staged_output
@@ -37,7 +37,7 @@ def export_run(
     """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``.
 
     Args:
-        words: ``KEY=VALUE`` options of the exporter, and conditions of the task, also as ``--NAME TEXT``.
+        words: ``KEY=VALUE`` options of the exporter, and conditions of the task as ``--NAME TEXT`` or ``--NAME=TEXT``.
         progress: called with (text, fraction 0..1).
 
     Raises:
@@ -97,9 +97,9 @@ def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) ->
 def _parse_run_export_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Options of the exporter and texts of conditions; where both have one name, ``NAME=`` means the option."""
+    """Options of the exporter and texts of conditions."""
     options = {name: default for name, (default, _) in exporter.options.items()}
-    conditions, rest = split_conditions(words, specs, bare=False)
+    conditions, rest = split_conditions(words, specs)
     if conditions and not exporter.conditions:
         raise ConfigError(f"{condition_flag(next(iter(conditions)))}: --format {exporter.name} takes no conditions")
     given = set()
@@ -107,18 +107,14 @@ def _parse_run_export_options(
         key, equals, text = word.partition("=")
         if not equals or not key:
             raise ConfigError(f"{word!r}: expected KEY=VALUE")
-        condition = named(key, specs) if exporter.conditions and key not in exporter.options else None
-        if key in given or (condition or "") in conditions:
+        if key in given:
             raise ConfigError(f"{key}: given twice")
-        if condition is not None:
-            conditions[condition] = text
-        elif key in exporter.options:
-            given.add(key)
-            options[key] = _parse_run_export_option(text)
-        else:
-            known = [*exporter.options, *((spec.name for spec in specs) if exporter.conditions else ())]
-            hint = nearest(key, known) or "; it has none"
+        if key not in exporter.options:
+            conditions_of_task = (condition_flag(spec.name) for spec in specs) if exporter.conditions else ()
+            hint = nearest(key, [*exporter.options, *conditions_of_task]) or "; it has none"
             raise ConfigError(f"{key}: no such option of --format {exporter.name}{hint}")
+        given.add(key)
+        options[key] = _parse_run_export_option(text)
     return options, conditions
 
 

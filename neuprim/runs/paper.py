@@ -51,7 +51,7 @@ def plan_paper_runs(
     tables: Sequence[Mapping[str, Any]],
     scenes: Sequence[str],
     rows: Sequence[str],
-    budget: str,
+    budget: str | None,
     seeds: int,
     out: Path,
     words: Sequence[str],
@@ -62,7 +62,7 @@ def plan_paper_runs(
         data: holds a folder per scene, named like it in any case.
         scenes: those to take; empty for all.
         rows: names of rows; empty for all.
-        budget: "full", the preset's own steps, or a run's seconds of training as 90s, 10m or 2h.
+        budget: a run's time of training as 90s, 10m or 2h; None for the preset's own steps.
         seeds: runs of each, with the seeds from 0.
         out: gets a run directory for each.
         words: ``key=value`` settings over the protocol's.
@@ -80,8 +80,8 @@ def plan_paper_runs(
         raise ConfigError(f"--data {data}: no such folder")
     folders = {entry.name.casefold(): entry for entry in sorted(data.iterdir()) if entry.is_dir()}
     common = list(words)
-    if budget != "full":
-        common.insert(0, f"train.max_seconds={parse_duration_setting(budget, f'--budget {budget}'):g}")
+    if budget is not None:
+        common.insert(0, f"train.max_seconds={parse_duration_setting(budget, f'budget={budget}'):g}")
     planned = []
     for table in tables:
         images = dict(zip(table["scenes"], table.get("images", ()), strict="images" in table))
@@ -96,7 +96,7 @@ def plan_paper_runs(
                 own.append(f"scene.images={images[scene]}")
             for row in (r for r in table["rows"] if not rows or r["name"] in rows):
                 for seed in range(seeds):
-                    name = f"{scene}-{row['name']}-{budget}-seed{seed}"
+                    name = f"{scene}-{row['name']}-{budget or 'full'}-seed{seed}"
                     place = f"output_dir='{out / name}'"
                     config = compose([*own, f"preset={row['preset']}", f"seed={seed}", place, *common])
                     planned.append(PlannedRun(table, row, scene, config))

@@ -43,9 +43,6 @@ from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.plugins.attribution import draw_task_layer
 from neuprim.version import __version__
 
-HEADS = ("renderer", "resolution", "density", "colour")
-"""First parts of the keys."""
-
 _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0, at most 1")]
 
 _MOST_LIGHTS = 128

@@ -19,11 +19,12 @@ from neuprim.config.overrides import drop_output_overrides, quote_override
 from neuprim.core.checkpoint import load_model_checkpoint
 from neuprim.core.data import Dataset
 from neuprim.core.errors import ConfigError, NeuprimError
-from neuprim.core.metrics.image import format_metrics
+from neuprim.core.metrics.image import format_failed_views, format_metrics
 from neuprim.core.task import Chunks, Loss
 from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.trainer import Trainer
 from neuprim.plugins.attribution import attribute_errors
+from neuprim.report.report_page import format_report_bytes
 from neuprim.runs.evaluate import evaluate_fitted
 from neuprim.runs.fit import Events, Finishing, Fitted, Note, Preparing, ignore_run_event, is_chunked, refuse_chunks
 from neuprim.runs.ground_truth import render_ground_truth_before_run
@@ -86,13 +87,21 @@ def run(
         else:
             fitted, interrupted = train_in_directory(config, events, between=preview, group=group)
         if first:
-            preview.finish(fitted)
+            preview.write(fitted)
             events(Finishing("measuring held-out views"))
             command = shlex.join(["neuprim", "run", *drop_output_overrides(config.overrides)])
-            events(Note(format_metrics(evaluate_fitted(fitted, directory, command))))
+            if failed := format_failed_views(evaluate_fitted(fitted, directory, command)):
+                events(Note(failed))
     if interrupted:
         raise KeyboardInterrupt
     return directory
+
+
+def summarize_run(run_dir: Path) -> str:
+    """Return one line with quality and size of a finished run's model, and the path of its report."""
+    metrics = read_metrics(run_dir)
+    size = format_report_bytes(metrics["model_bytes"])
+    return f"{format_metrics(metrics)}, {size}, report: {run_dir / 'report.html'}"
 
 
 def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
@@ -241,6 +250,6 @@ def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher:
     if failed:
         raise ChunksMissing(
             f"{'; '.join(failed)}; {count - len(failed)} of {count} chunks are done, and resume=true with "
-            f"output_dir={folder} makes the others"
+            f"--out {folder} makes the others"
         )
     return record

@@ -103,14 +103,14 @@ class LaunchRecord:
         old, names = {run.name: run for run in before.runs}, [run.name for run in self.runs]
         if not more and list(old) != names:
             raise ConfigError(
-                f"{self.file}: begun with {', '.join(old)}; the words now ask for {', '.join(names)}; expected the "
-                f"same words, or another output_dir"
+                f"{self.file}: begun with {', '.join(old)}; the settings now ask for {', '.join(names)}; expected "
+                f"the same settings, or another --out DIR"
             )
         for run in self.runs:
             if run.name in old and old[run.name].words != run.words:
                 was = " ".join(old[run.name].words)
                 raise ConfigError(
-                    f"{self.file}: {run.name} was begun with {was}; expected the same words, or another output_dir"
+                    f"{self.file}: {run.name} was begun with {was}; expected the same settings, or another --out DIR"
                 )
         own = tuple(old.get(run.name, run) for run in self.runs)
         others = tuple(run for run in before.runs if run.name not in names)
@@ -132,7 +132,7 @@ def read_launch_record(file: Path) -> LaunchRecord | None:
                 raise ValueError(f"name {run.name!r} is no folder's")
         return LaunchRecord(file, words, runs, validate_value(data.get("joined_steps"), int | None, "joined_steps"))
 
-    return read_json_record(file, "a record of launched runs", "another output_dir=DIR begins anew", _FORMAT, parse)
+    return read_json_record(file, "a record of launched runs", "another --out DIR begins anew", _FORMAT, parse)
 
 
 # ---------------------------------------------------------------- launch
@@ -214,7 +214,7 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
         before = read_launch_record(Path(str(given["output_dir"])).expanduser() / SWEEP_FILE)
     if before is None:
         raise ConfigError(
-            f"{' '.join(words) or 'nothing'}: no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of "
+            f"{' '.join(words) or 'nothing'}: no values to sweep; expected KEY=A,B,C, or --out DIR resume=true of "
             f"a sweep ({SWEEP_FILE} in it)"
         )
     for word in before.words:

@@ -52,8 +52,8 @@ from neuprim.runs.open import discard_results
 
 CURVE_FILE, PREVIEW_FILE = "metrics.jsonl", "renders/preview.png"
 
-PREVIEW_SECONDS = 5.0
-"""Training time until :data:`PREVIEW_FILE` is first written; each time after that is twice as far away."""
+_PREVIEW_PROGRESS = (0.05, 0.5)
+"""Progress at which :data:`PREVIEW_FILE` is written; the end of the run replaces it."""
 
 BEGIN = 0.8
 """Progress of the run that the first step stands for."""
@@ -174,8 +174,8 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
 
 
 class RunPreview:
-    """A function to call between steps, which writes a picture of the model now and then: the middle held-out view,
-    ground truth on the left.
+    """A function to call between steps, which writes a picture of a held-out view early in the training and again
+    halfway: ground truth on the left, the model on the right.
 
     Args:
         events: gets the name of the file when it is there.
@@ -184,24 +184,19 @@ class RunPreview:
 
     def __init__(self, events: Events, between: BetweenSteps) -> None:
         self._events, self._between = events, between
-        self._wait, self._due, self._written = PREVIEW_SECONDS, -1.0, False
+        self._due: tuple[float, ...] = _PREVIEW_PROGRESS
 
     def __call__(self, fitted: Fitted, stop: threading.Event) -> None:
         self._between(fitted, stop)
-        elapsed = fitted.trainer.elapsed
-        if self._due < 0:  # before the first step
-            self._due = elapsed + self._wait
-        elif elapsed >= self._due:
-            self._write(fitted)
-            self._wait *= 2
-            self._due = elapsed + self._wait
+        due = tuple(progress for progress in self._due if progress > fitted.trainer.progress)
+        if due != self._due:
+            path, first = self.write(fitted), self._due == _PREVIEW_PROGRESS
+            self._due = due
+            if first and path.exists():
+                self._events(Note(f"first picture (left ground truth, right model): {path}"))
 
-    def finish(self, fitted: Fitted) -> None:
-        """Show the final model, where there was a picture before."""
-        if self._written:
-            self._write(fitted)
-
-    def _write(self, fitted: Fitted) -> None:
+    def write(self, fitted: Fitted) -> Path:
+        """Write the picture of the model as it is now, and return its path."""
         test, background, display = fitted.dataset.test, fitted.dataset.background, fitted.channels.display
         index, path = 3 * len(test) // 4, fitted.config.output_dir / PREVIEW_FILE  # not the first of a film
         rendered = render_image(fitted.model, test.view(index), fitted.trainer.renderer, background)
@@ -209,9 +204,7 @@ class RunPreview:
         with _warn_of_unwritable_run_file(fitted, path):
             path.parent.mkdir(exist_ok=True)
             images.write_png(path, torch.cat(pair, dim=1))
-            if not self._written:
-                self._events(Note(f"a first picture, renewed as the training goes on: {path}"))
-            self._written = True
+        return path
 
 
 def _train_run_as_follower(trainer: Trainer) -> bool:

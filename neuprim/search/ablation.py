@@ -19,7 +19,7 @@ from typing import Any
 
 from neuprim.config import Job, RunConfig, compose, find_config_plugins, load_config_task
 from neuprim.config.command_settings import LauncherSettings
-from neuprim.config.overrides import parse_overrides, quote_override
+from neuprim.config.overrides import drop_output_overrides, parse_overrides, quote_override
 from neuprim.config.stored_run import ROOT
 from neuprim.core.compute.threads import limit_process_threads
 from neuprim.core.data import Dataset
@@ -85,13 +85,13 @@ def run_ablation(
     Returns the folder of the set and its record. A larger budget adds what did not fit.
 
     Args:
-        request: its overrides are those of ``neuprim run``, and ``output_dir`` among them is the folder of the set.
+        request: its overrides are those of ``neuprim run``.
         launcher: where models are trained; they are measured here.
 
     Raises:
         NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
     """
-    models = _compose_ablation_set(request.words, launcher)
+    models = _compose_ablation_set(request, launcher)
     folder, centre, task = models.folder, models.centre, load_config_task(models.centre)
     with use_one_torch_thread_for_run(), use_launcher_threads_for_runs(launcher), ExitStack() as stack:
         stack.enter_context(find_config_plugins(centre).attribute_errors())
@@ -327,14 +327,12 @@ class _AblationSession(TradeoffSession):
 # ---------------------------------------------------------------- the folder
 
 
-def _compose_ablation_set(overrides: Sequence[str], launcher: LauncherSettings) -> _AblationSet:
-    typed = parse_overrides(overrides)
-    words = [a.text for a in typed if a.key not in ("output_dir", "resume", "budget")]
-    places = [a.value for a in typed if a.key == "output_dir" and a.value is not None]
-    centre = compose([*words, "output_dir=null"], check_output=False)
-    folder = Path(str(places[-1])).expanduser() if places else ROOT / f"tradeoff-{centre.task}-{centre.scene_name}"
+def _compose_ablation_set(request: TradeoffRequest, launcher: LauncherSettings) -> _AblationSet:
+    words = drop_output_overrides(request.words)
+    centre = compose(words, check_output=False)
+    folder = request.out or ROOT / f"tradeoff-{centre.task}-{centre.scene_name}"
     if folder.exists() and not folder.is_dir():
-        raise ConfigError(f"output_dir={folder}: is a file; expected a directory")
+        raise ConfigError(f"--out {folder}: is a file; expected a directory")
     return _AblationSet(folder, words, centre, launcher)
 
 
@@ -343,11 +341,11 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
-            raise ConfigError(f"output_dir={folder}: holds something else; expected a new directory, or that of a set")
+            raise ConfigError(f"--out {folder}: holds something else; expected a new directory, or that of a set")
     elif before.same.get("kind") != "models":
-        raise DataError(f"{folder / TRADEOFF_FILE}: of a finished run; expected another output_dir=DIR for trainings")
+        raise DataError(f"{folder / TRADEOFF_FILE}: of a finished run; expected another --out DIR for trainings")
     elif changed := before.changes(models.identity()):
-        expected = "expected the same overrides, or another output_dir=DIR"
+        expected = "expected the same settings, or another --out DIR"
         raise ConfigError(f"{folder}: holds a set with another {' and '.join(changed)}; {expected}")
 
 

@@ -124,7 +124,7 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
     """
     run_dir = request.run_dir
     if request.tolerance is not None and request.by_level:
-        other = "--bits" if request.bits else "--level"
+        other = "bits.NAME=BITS" if request.bits else "--level"
         raise ConfigError(f"--tolerance {request.tolerance:g}: decides the bits of every number; expected no {other}")
     final = request.out or run_dir / COMPRESSED
     if final.is_dir():

@@ -1,6 +1,6 @@
 """Trade-offs of a finished run: change every setting of rendering alone, then several, and find the Pareto fronts.
 
-Results go to ``RUN_DIR/tradeoff``; points that were measured before are kept.
+Results go to ``RUN_DIR/tradeoff`` or the folder that was asked for; points that were measured before are kept.
 """
 
 from __future__ import annotations
@@ -94,7 +94,10 @@ def measure_tradeoff(
     Raises:
         NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
     """
-    setup, folder = load_tradeoff_setup(run_dir, request.words, request.views, request.lpips), run_dir / TRADEOFF_FOLDER
+    folder = request.out or run_dir / TRADEOFF_FOLDER
+    if request.out and folder.is_dir() and any(folder.iterdir()) and not (folder / TRADEOFF_FILE).exists():
+        raise ConfigError(f"--out {folder}: holds something else; expected a new folder, or one of `neuprim tradeoff`")
+    setup = load_tradeoff_setup(run_dir, request.words, request.views, request.lpips)
     knobs = list_render_knobs(setup.reference, setup.model)
     check_knobs(request, knobs, "this run")
     record = _resume_tradeoff_record(folder / TRADEOFF_FILE, _render_tradeoff_identity(setup), tell)

@@ -137,10 +137,10 @@ def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetR
     if before is None:
         if (folder / "config.yaml").exists():
             expected = "expected a new directory, or that of a target run"
-            raise ConfigError(f"output_dir={folder}: holds a run without a target; {expected}")
+            raise ConfigError(f"--out {folder}: holds a run without a target; {expected}")
         return TargetRecord(asked, same)
     if different := [key for key in same if before.same.get(key) != same[key]]:
-        expected = "expected the same overrides, or a new output_dir"
+        expected = "expected the same settings, or a new --out DIR"
         raise ConfigError(f"{folder / TARGET_FILE}: begun with another {', '.join(different)}; {expected}")
     if before.asked == asked:
         return before

@@ -253,6 +253,7 @@ class TradeoffRequest:
         repeats: rounds of timing.
         knobs: names of the settings to change; empty for all.
         lpips: weights for LPIPS; None for those of the run.
+        out: folder of the results; None for the one that follows from the run, or from task and scene.
     """
 
     words: Sequence[str] = ()
@@ -261,6 +262,7 @@ class TradeoffRequest:
     repeats: int = 15
     knobs: Sequence[str] = ()
     lpips: Path | None = None
+    out: Path | None = None
 
 
 class TradeoffSession:
@@ -337,4 +339,4 @@ def check_knobs(request: TradeoffRequest, known: Iterable[str], owner: str) -> N
     """Refuse a knob that a run, or a task's models, do not have."""
     for name in request.knobs:
         if name not in (names := list(known)):
-            raise ConfigError(f"--knobs {name}: no such knob of {owner}{nearest(name, names)}")
+            raise ConfigError(f"--vary {name}: no such setting of {owner}{nearest(name, names)}")

@@ -82,7 +82,7 @@ def test_the_plan_is_the_protocol(data: Path, tmp_path: Path, monkeypatch: pytes
         (["--scenes", "chiar"], "--scenes chiar: not in these tables; did you mean 'chair'?"),
         (["--rows", "real", "--tables", "3"], "--rows real: not in these tables"),
         (["--tables", "7"], "--data DATA: no folder named like a scene; expected one of train, truck, playroom"),
-        (["--budget", "soon"], "--budget soon: expected"),
+        (["budget=soon"], "budget=soon: expected"),
     ],
 )
 def test_what_cannot_be_is_said_in_one_line(

@@ -1,5 +1,6 @@
 import json
 import shlex
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -10,17 +11,34 @@ import pytest
 import torch
 
 import neuprim
-from neuprim.cli import main
+from neuprim.cli import COMMANDS, main
 from neuprim.cli.model_commands import print_export_report
 from neuprim.config import Job, RunConfig
 from neuprim.core.environment import EnvironmentFile
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.extensions import ExportReport
+from neuprim.plugins.registry import TASKS, list_scene_names
 from neuprim.runs.fit import Events
 from neuprim.runs.render_images import RenderRequest
+from tests.plugins.extras import add
 from tests.plugins.fakes import site, toy
 
 __all__ = ["site", "toy"]
+
+
+METRICS: dict[str, Any] = {
+    "task": "toy",
+    "psnr": None,
+    "psnr_infinite": True,
+    "ssim": 0.97654,
+    "lpips": None,
+    "psnr_worst": 27.0,
+    "worse_than_black_image": ["r_3"],
+    "per_view": [{"psnr": 27.0}, {"psnr": None, "psnr_infinite": True}],
+    "primitives": 12,
+    "model_bytes": 225_400,
+    "render_fps": 12.5,
+}
 
 
 @pytest.fixture
@@ -32,11 +50,12 @@ def calls(toy: Path, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
         made.append(config)
         config.output_dir.mkdir(parents=True)
         (config.output_dir / "config.yaml").write_text(config.to_yaml())
+        (config.output_dir / "metrics.json").write_text(json.dumps(METRICS))
         return config.output_dir
 
     def evaluate_run(run_dir: Path, lpips: Path | None = None, words: Any = ()) -> dict[str, Any]:
         made.append((run_dir, *words) if words else run_dir)
-        return {"psnr": 31.23456, "views": 20, "worst": {"name": "r_3", "psnr": 27.0}}
+        return METRICS
 
     def load_run(run_dir: Path) -> Any:
         """A run without a model."""
@@ -67,13 +86,24 @@ def error_line(capsys: pytest.CaptureFixture[str]) -> str:
 # ---------------------------------------------------------------- run
 
 
-def test_cfg_prints_and_stops(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
+def test_print_config_prints_and_stops(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     Path("full").mkdir()
     Path("full/x").touch()
-    assert main(["run", "--cfg", "task=toy", "output_dir=full"]) == 0
+    assert main(["run", "--print-config", "task=toy", "--out", "full"]) == 0
     Path("config.yaml").write_text(capsys.readouterr().out)
     assert RunConfig.from_yaml("config.yaml").train.iterations == 7
     assert calls == []
+
+
+def test_a_run_ends_with_what_it_reached_and_what_to_do_next(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for installed, words in ((object(), "view 'a b'"), (None, "render 'c d' --camera orbit")):
+        monkeypatch.setattr("neuprim.cli.progress.find_spec", lambda name, found=installed: found)
+        folder = words.split("'")[1]
+        assert main(["run", "task=toy", "--out", folder]) == 0
+        reached = f"PSNR 27.00 dB, SSIM 0.977 (2 held-out views, 1 exact), 225 kB, report: {folder}/report.html"
+        assert capsys.readouterr().out == f"{reached}\nnext: neuprim {words}\n"
 
 
 def test_sweep_with_the_flag_anywhere(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
@@ -105,7 +135,18 @@ def test_a_failing_combination_does_not_lose_the_others(
     [
         (["rn"], "rn: no such command; did you mean 'run'"),
         (["--versoin"], "--help"),
-        (["run", "--cfgg"], "--cfgg: no such argument of `neuprim run`; did you mean '--cfg'"),
+        (["run", "--confg", "x"], "--confg: no such argument of `neuprim run`; did you mean '--config'"),
+        (["run", "task=toy", "output_dir=x"], "output_dir=x: no setting of `neuprim run`; expected --out DIR"),
+        (["truth", "output_dir=x"], "output_dir=x: no setting of `neuprim truth`; expected no output_dir"),
+        (["run", "toy"], "toy: expected KEY=VALUE; did you mean: neuprim run task=toy?"),
+        (["run", "bal"], "bal: expected KEY=VALUE (see neuprim run --help)"),
+        (["run", "ball", "seed=2"], "ball: expected KEY=VALUE; did you mean: neuprim run task=toy scene=ball seed=2?"),
+        (
+            ["run", "static", "-m", "solids"],
+            "static solids: expected KEY=VALUE; did you mean: neuprim run task=static scene=solids?",
+        ),
+        (["truth", "smoke_fire", "task=dynamic"], "did you mean: neuprim truth scene=smoke_fire task=dynamic?"),
+        (["run", "smoke_fire", "task=static"], "smoke_fire: expected KEY=VALUE (see neuprim run --help)"),
         (["run", "task=toi"], "did you mean 'toy'"),
         (["run", "task=toy", "train.iterations=x"], "expected a whole number"),
         (["run", "task=toy", "seed=1,2"], "add -m"),
@@ -176,15 +217,14 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
 
     monkeypatch.setattr(sys.modules["neuprim.runs.run"], "run", stop)
     nasty = "it's a=b, $c"
-    quoted = "output_dir='it\\'s a=b, $c'"
     for words, where, said in (
         (
             ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "task.options.gain=2.5"],
             "outputs/toy-ball",
             "outputs/toy-ball has the run up to here",
         ),
-        (["task=toy", "seed=4", quoted], nasty, f"{nasty} has no checkpoint yet"),
-        (["task=toy", "seed=3", "resume=false", "output_dir=o"], "o", "o has the run up to here"),
+        (["--out", nasty, "task=toy", "seed=4"], nasty, f"{nasty} has no checkpoint yet"),
+        (["task=toy", "seed=3", "resume=false", "--out=o"], "o", "o has the run up to here"),
         (
             ["-m", "task=toy", "seed=3,4", "model.primitives=2,3"],
             "outputs/toy-ball-sweep/seed-3_model.primitives-2",
@@ -210,8 +250,8 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
 def test_a_target_prints_what_came_of_it(
     calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = ["run", "task=toy", "target.ssim=0.9", "target.megabytes=2", "budget=5m", "output_dir=out"]
-    assert main([*words, "--cfg"]) == 0
+    words = ["run", "task=toy", "target.ssim=0.9", "target.megabytes=2", "budget=5m", "--out", "out"]
+    assert main([*words, "--print-config"]) == 0
     first = "# target.ssim=0.9 target.megabytes=2 budget=300s; the search starts from\ntask:\n"
     assert capsys.readouterr().out.startswith(first)
     achieved: dict[str, Any] = {"predicted": {"psnr": (30.0, 0.5)}, "run_dir": "out", "file": "model.neuprim"}
@@ -219,9 +259,11 @@ def test_a_target_prints_what_came_of_it(
     achieved |= dict.fromkeys(("primitives", "packed_bytes", "model_bytes", "seconds", "fps"), 1234)
     record = SimpleNamespace(achieved=achieved, asked={"budget": 300.0}, why=["enough"], warning="psnr is missed")
     monkeypatch.setattr("neuprim.search.target.run_target", lambda *args, **options: record)
-    assert main(words) == 0
+    Path("out").mkdir()
+    Path("out/metrics.json").write_text(json.dumps(METRICS))
+    assert main([*words, "resume=true"]) == 0
     out, err = capsys.readouterr()
-    assert out == "out\n"
+    assert out.startswith("PSNR 27.00 dB, SSIM 0.977") and out.splitlines()[1].startswith("next: neuprim ")
     for text in ("predicted psnr ", "model.neuprim 1,234 bytes", "s of 300 s used", "ended: enough", "psnr is missed"):
         assert text in err
 
@@ -229,6 +271,7 @@ def test_a_target_prints_what_came_of_it(
         raise KeyboardInterrupt
 
     monkeypatch.setattr("neuprim.search.target.run_target", interrupt)
+    shutil.rmtree("out")
     assert main(words) == 130
     first, second = capsys.readouterr().err.splitlines()
     assert first == "neuprim: interrupted; out has the trials up to here; to go on:"
@@ -236,6 +279,30 @@ def test_a_target_prints_what_came_of_it(
 
 
 # ---------------------------------------------------------------- eval, render, export
+
+
+def test_eval_prints_six_metrics_unless_all_are_asked_for(
+    calls: list[Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Path("r").mkdir()
+    assert main(["eval", "r", "resolution=0.5"]) == 0 and calls == [(Path("r"), "resolution=0.5")]
+    out, err = capsys.readouterr()
+    rows = [
+        "psnr         inf",
+        "ssim         0.9765",
+        "psnr_worst   27.0000",
+        "model_bytes  225400",
+        "render_fps   12.5000",
+    ]
+    assert out.splitlines() == rows
+    assert err == "neuprim: warning: 1 of 2 held-out views are worse than a black image: r_3\n"
+    measured = {**METRICS, "lpips": 0.25, "psnr": 30.0, "psnr_infinite": False}
+    monkeypatch.setattr("neuprim.runs.measure.evaluate_run", lambda *args: measured)
+    assert main(["eval", "r"]) == 0
+    assert capsys.readouterr().out.splitlines()[:3] == ["psnr         30.0000", rows[1], "lpips        0.2500"]
+    assert main(["eval", "r", "--all"]) == 0
+    out = capsys.readouterr().out
+    assert "primitives " in out and "task " in out and "per_view " in out and len(out.splitlines()) == len(METRICS)
 
 
 def test_export_reports_numbers(capsys: pytest.CaptureFixture[str]) -> None:
@@ -249,7 +316,7 @@ def test_export_reports_numbers(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
-    main(["run", "task=toy", "output_dir=r"])
+    main(["run", "task=toy", "--out", "r"])
     capsys.readouterr()
     assert main(["render", "r", "--camera", "test"]) == 0
     assert calls[-1] == (Path("r"), RenderRequest("test", overrides=[]))
@@ -259,7 +326,7 @@ def test_render(calls: list[Any], capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["render", "r", *flags.split()]) == 0
     conditions = {"time": "0:1", "light_pos": "-1,0,2"}
     assert calls[-1][1] == RenderRequest("cams.json", (640, 480), "exr", Path("o"), 3, conditions, 12.0, overrides=[])
-    for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["light-pos=-1,0,2"], ["--light_pos=-1,0,2"]):
+    for words in (["--light_pos", "-1,0,2"], ["--light-pos", "-1,0,2"], ["--light_pos=-1,0,2"]):
         assert main(["render", "r", "--camera", "orbit", *words]) == 0
         assert calls[-1][1].conditions == {"light_pos": "-1,0,2"}
     capsys.readouterr()
@@ -282,9 +349,35 @@ def test_help_and_version(toy: Path, capsys: pytest.CaptureFixture[str]) -> None
     capsys.readouterr()
     assert main(["run", "--help"]) == 0
     out = capsys.readouterr().out
-    assert "train.iterations=N" in out
-    assert "toy  (neuprim-toy 0.3)" in out
+    assert "train.iterations=N" in out and "effort=N" in out and len(out.splitlines()) <= 60
+    assert "  static   blender, colmap, mesh, nerfstudio, room, solids\n" in out
+    assert "  toy      ball, files  (neuprim-toy 0.3)\n" in out
     assert "neuprim run task=static scene=solids" in out
+
+
+def test_scenes_are_listed_without_importing_their_task(site: Path) -> None:
+    """The files of a task in ``conf``, and the scenes that other packages register."""
+    add(site, "scene")
+    for info in TASKS.list_plugins():
+        added = ["extra"] if info.name == "static" else []
+        assert list_scene_names(info) == sorted([*(scene.name for scene in TASKS.load(info.name).scenes), *added])
+
+
+def test_settings_are_anywhere_on_the_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("a=b").mkdir()
+    settings = ["renderer.samples=2", "resolution=0.5"]
+    for words in (["a=b", *settings], [settings[0], "a=b", settings[1]], [*settings, "--lpips", "x=y", "a=b"]):
+        arguments = COMMANDS["eval"].parse(words)
+        assert (arguments.overrides, arguments.run_dir) == (settings, Path("a=b"))
+    assert arguments.lpips == Path("x=y"), "the value of a flag is no setting"
+    assert COMMANDS["run"].parse(["a=b", "-m", "c=d", "--out", "e=f"]).overrides == ["a=b", "c=d"]
+    assert COMMANDS["tradeoff"].parse(["--views", "3", "task=static"]).run_dir is None
+
+
+def test_every_command_that_writes_has_the_same_option() -> None:
+    writing = {name for name, command in COMMANDS.items() if "--out" in command.build_parser()._option_string_actions}
+    assert writing == {*"run render tradeoff export compress prune import inspect new-task bench".split()}
 
 
 def test_help_is_light_and_the_module_runs() -> None:

@@ -31,7 +31,7 @@ def test_without_viser_it_says_how_to_get_it(
         monkeypatch.delitem(sys.modules, f"neuprim.viewer.{module}", raising=False)
     for argv in (
         ["view", str(run_dir)],
-        ["run", "task=static", "scene=solids", "viewer=true", f"output_dir={run_dir}-new"],
+        ["run", "task=static", "scene=solids", "viewer=true", "--out", f"{run_dir}-new"],
     ):
         assert main(argv) == 2
         assert "pip install 'neuprim[viewer]'" in capsys.readouterr().err

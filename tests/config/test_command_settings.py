@@ -82,5 +82,5 @@ def test_what_makes_no_sense_is_refused_in_one_line(take: Take, words: list[str]
 
 def test_times_in_words() -> None:
     assert [parse_duration_setting(text, text) for text in ("90s", "10m", "1.5h")] == [90.0, 600.0, 5400.0]
-    with pytest.raises(ConfigError, match="--budget 5 m: expected a time"):
-        parse_duration_setting("5 m", "--budget 5 m")
+    with pytest.raises(ConfigError, match="budget=5 m: expected a time"):
+        parse_duration_setting("5 m", "budget=5 m")

@@ -148,10 +148,10 @@ def test_occupied_directory_is_refused(toy: Path) -> None:
     Path("full").mkdir()
     assert toys("output_dir=full").output_dir == Path("full")
     Path("full/x").write_text("precious")
-    with pytest.raises(ConfigError, match=r"output_dir=full: exists and is not empty.*resume=true"):
+    with pytest.raises(ConfigError, match=r"--out full: exists and is not empty.*resume=true"):
         toys("output_dir=full")
     assert toys("output_dir=full", "resume=true").output_dir == Path("full")
-    with pytest.raises(ConfigError, match=r"output_dir=full/x/y: .*full/x is a file; expected a directory"):
+    with pytest.raises(ConfigError, match=r"--out full/x/y: .*full/x is a file; expected a directory"):
         toys("output_dir=full/x/y")
     with pytest.raises(ConfigError, match="is a file"):
         toys("output_dir=full/x")

@@ -68,7 +68,7 @@ def test_what_the_file_has_said_already_is_refused(stored: RunConfig, word: str)
 
 
 def test_on_the_command_line(stored: RunConfig, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["run", "--config", "first/config.yaml", "--cfg", "model.primitives=9"]) == 0
+    assert main(["run", "--config", "first/config.yaml", "--print-config", "model.primitives=9"]) == 0
     Path("shown.yaml").write_text(capsys.readouterr().out)
     assert RunConfig.from_yaml("shown.yaml").model.primitives == 9
     for word, text in (("nowhere.yaml", "no such file; expected RUN_DIR/config.yaml"), ("first", "not a run's config")):

@@ -63,7 +63,7 @@ def test_contradictions_are_refused_by_name(
     run: Path, words: list[str], key: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     before = (run / "config.yaml").read_bytes()
-    assert main(["run", *words, "output_dir=run", "resume=true"]) == 2
+    assert main(["run", *words, "--out", "run", "resume=true"]) == 2
     error = capsys.readouterr().err
     assert error.startswith(f"neuprim: error: {key}") and "was begun with" in error and error.count("\n") == 1
     assert (run / "config.yaml").read_bytes() == before
@@ -91,7 +91,7 @@ def test_what_may_change_does(run: Path) -> None:
 
 def test_nothing_begun_there_starts_only_what_is_said(run: Path) -> None:
     for place in ("nowhere", "."):
-        with pytest.raises(ConfigError, match=rf"output_dir={place} resume=true: no run was begun there"):
+        with pytest.raises(ConfigError, match=rf"--out {place} resume=true: no run was begun there"):
             compose([f"output_dir={place}", "resume=true"])
     assert compose(["task=static", "output_dir=nowhere", "resume=true"]).scene_name == "solids"
 

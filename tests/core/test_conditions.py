@@ -55,8 +55,6 @@ def shifts(text: str, spec: ConditionSpec = SHIFT) -> list[float]:
         ["--wavelength_shift", "0.3"],
         ["--wavelength-shift=0.3"],
         ["--wavelength_shift=0.3"],
-        ["wavelength-shift=0.3"],
-        ["wavelength_shift=0.3"],
     ],
 )
 def test_every_spelling_is_the_same(words: list[str]) -> None:
@@ -68,8 +66,8 @@ def test_every_spelling_is_the_same(words: list[str]) -> None:
     [
         (["--sun"], "--sun: expected a value after it"),
         (["--sun", "--camera"], "--sun: expected a value after it"),
-        (["sun=1,1,1", "--sun=0,0,0"], "--sun: given twice"),
-        (["--wavelength-shift=0", "wavelength_shift=0"], "--wavelength-shift: given twice"),
+        (["--sun=1,1,1", "--sun=0,0,0"], "--sun: given twice"),
+        (["--wavelength-shift=0", "--wavelength_shift=0"], "--wavelength-shift: given twice"),
     ],
 )
 def test_a_condition_is_given_once_with_a_value(words: list[str], text: str) -> None:

@@ -14,10 +14,14 @@ import pytest
 import torch
 
 from neuprim.cli import COMMANDS
-from neuprim.cli.command import split_override_arguments
-from neuprim.cli.measure_commands import is_override_argument
+from neuprim.cli.command import split_settings
 from neuprim.config import compose, compose_all
-from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
+from neuprim.config.command_settings import (
+    take_budget_override,
+    take_launcher_overrides,
+    take_target_overrides,
+    take_viewer_overrides,
+)
 from neuprim.config.overrides import drop_output_overrides
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_conditions
@@ -163,35 +167,28 @@ def conditions() -> list[ConditionSpec]:
 def check(words: list[str], conditions: list[ConditionSpec]) -> None:
     """Raises where the command line or the configuration would refuse ``neuprim WORDS``."""
     name = words[0]
-    args, rest = COMMANDS[name].build_parser().parse_known_args(words[1:])
-    settings = [*getattr(args, "overrides", []), *(word for word in rest if not word.startswith("-"))]
-    flags = [word for word in rest if word.startswith("-")]
+    parser = COMMANDS[name].build_parser()
+    settings, others = split_settings(words[1:], parser) if COMMANDS[name].settings else ([], words[1:])
+    args, rest = parser.parse_known_args(others)
     if name == "run":
         for take in (take_viewer_overrides, take_launcher_overrides, take_target_overrides):
             _, settings = take(settings)
-        if (args.multirun and not drop_output_overrides(settings)) or args.config is not None:
-            settings = ["task=static", *settings]  # the others are in a file
-        (compose_all if args.multirun else compose)(settings, False)
-        rest = flags
+        if (args.multirun and not drop_output_overrides(settings)) or args.config is not None or args.out is not None:
+            settings = ["task=static", *settings]  # the others may be in a file
+        (compose_all if args.multirun else compose)([s for s in settings if s != "resume=true"], False)
     elif name == "truth":
         (compose_all if args.multirun else compose)(take_launcher_overrides(settings)[1], False)
-        rest = flags
     elif name == "bench":
-        compose(["scene=blender", "scene.path=DIR", *settings], False)
-        rest = flags
-    elif name == "tradeoff" and is_override_argument(args.run_dir):
-        typed = [word for word in (args.run_dir, *settings) if not word.startswith("budget=")]
-        compose(take_launcher_overrides(typed)[1], False)
-        rest = flags
-    elif name in ("eval", "render", "tradeoff"):
-        _, rest = split_override_arguments(rest)
+        compose(["scene=blender", "scene.path=DIR", *take_budget_override(settings)[1]], False)
+    elif name == "tradeoff" and args.run_dir is None:
+        compose(take_launcher_overrides(take_budget_override(settings)[1])[1], False)
+    elif name == "export":
+        options = EXPORTERS.load(args.format).options if not PLACEHOLDER.search(args.format) else {}
+        rest += [word for word in settings if word.partition("=")[0] not in options]
     if name in ("render", "inspect", "export"):
         given, rest = split_conditions(rest, conditions)
         known = {condition: text for condition, text in given.items() if not PLACEHOLDER.search(text)}
         read_conditions(conditions, known, pytest.fail)
-    if name == "export":
-        options = EXPORTERS.load(args.format).options if not PLACEHOLDER.search(args.format) else {}
-        rest = [word for word in rest if word.partition("=")[0] not in options]
     assert rest == [], f"{rest} is no argument of neuprim {name}"
 
 

@@ -196,10 +196,10 @@ def test_a_dynamic_model_needs_a_time_and_colours_follow_it(tmp_path: Path) -> N
     with pytest.raises(ConfigError, match=r"--time: required.*--time 0.5"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply")
     with pytest.raises(ConfigError, match="expected one value"):
-        export_run(run, "gaussian-ply", tmp_path / "g.ply", ["time=0:1:3"])
+        export_run(run, "gaussian-ply", tmp_path / "g.ply", ["--time=0:1:3"])
     found = {}
     for t in (0.25, 0.5):
-        report = export_run(run, "gaussian-ply", tmp_path / f"{t}.ply", [f"time={t}"])
+        report = export_run(run, "gaussian-ply", tmp_path / f"{t}.ply", [f"--time={t}"])
         found[t] = read_ply(report.files[0])
         assert any("linear" in note for note in report.notes) and report.errors["psnr"] > 15
         rows, back = (
@@ -242,7 +242,7 @@ def test_a_relit_model_takes_a_light_and_fits_its_colours(tmp_path: Path) -> Non
     run = marked.write_run(tmp_path / "run", model, ["task=relight", "scene=lit_solids"])
     with pytest.raises(ConfigError, match="--light: required"):
         export_run(run, "gaussian-ply", tmp_path / "g.ply")
-    report = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["light=1,2,3", "light_intensity=1,1,1"])
+    report = export_run(run, "gaussian-ply", tmp_path / "g.ply", ["--light=1,2,3", "--light-intensity=1,1,1"])
     assert any("no harmonics" in note for note in report.notes) and report.errors["psnr"] > 20
     light = {"light": torch.tensor([1.0, 2.0, 3.0]), "light_intensity": torch.ones(3)}
     fitted = fit_export_harmonics(open_run(run), light)

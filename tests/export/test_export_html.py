@@ -66,7 +66,7 @@ def test_a_page_of_what_is_not_active(active: str, start: float, tmp_path: Path)
     run = marked.write_run(
         tmp_path / "run", model, ["task=dynamic", "scene=vdb", f"scene.vdb={tmp_path / 'gone'}"], color_space="linear"
     )
-    report = export_run(run, "html", tmp_path / "p.html", [f"time={start}"])
+    report = export_run(run, "html", tmp_path / "p.html", [f"--time={start}"])
     header = header_of((tmp_path / "p.html").read_text(encoding="utf-8"))
     assert header["conditions"][0]["value"] == pytest.approx(start) and header["count"] == model.count
     if active == "late":
@@ -75,7 +75,7 @@ def test_a_page_of_what_is_not_active(active: str, start: float, tmp_path: Path)
     else:
         assert report.errors["psnr"] == math.inf
         with pytest.raises(ConfigError, match="no primitive absorbs anything under these conditions"):
-            export_run(run, "gaussian-ply", tmp_path / "g.ply", [f"time={start}"])
+            export_run(run, "gaussian-ply", tmp_path / "g.ply", [f"--time={start}"])
 
 
 def test_levels_lose_what_they_say(trained: Path, tmp_path: Path) -> None:

@@ -101,7 +101,7 @@ def test_a_dynamic_model_is_cut_at_a_time(tmp_path: Path) -> None:
         export_run(run, "mesh", tmp_path / "m.ply")
     early, late = (
         trimesh.load(
-            export_run(run, "mesh", tmp_path / f"{t}.ply", [f"time={t}", "grid=48", "level=1.5"]).files[0],
+            export_run(run, "mesh", tmp_path / f"{t}.ply", [f"--time={t}", "grid=48", "level=1.5"]).files[0],
             process=False,
         )
         for t in (0.2, 0.6)

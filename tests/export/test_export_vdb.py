@@ -104,7 +104,9 @@ def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Pat
 def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> None:
     values = {}
     for units in ("source", "world", "scene"):
-        report = export_run(moving, "vdb", tmp_path / units, ["time=0:1:5", f"units={units}", "grid=24", "name=smoke"])
+        report = export_run(
+            moving, "vdb", tmp_path / units, ["--time=0:1:5", f"units={units}", "grid=24", "name=smoke"]
+        )
         assert [p.name for p in report.files] == [f"density_{i:04d}.vdb" for i in range(5)]
         assert {k.split(".")[0] for k in report.errors} == {
             "frame_0003",
@@ -118,7 +120,7 @@ def test_units_times_and_voxels_can_be_chosen(moving: Path, tmp_path: Path) -> N
     scale = open_run(moving).volume().placement.scene_from_world[0, 0]  # type: ignore[union-attr]
     assert values["scene"] == pytest.approx(values["source"] * per_unit, rel=1e-5)
     assert values["world"] == pytest.approx(values["scene"] * scale, rel=1e-5)
-    one = export_run(moving, "vdb", tmp_path / "one.vdb", ["time=0.5"])
+    one = export_run(moving, "vdb", tmp_path / "one.vdb", ["--time=0.5"])
     assert one.files == (tmp_path / "one.vdb",)
 
 
@@ -137,7 +139,7 @@ def test_without_the_files_the_header_still_places_it(tmp_path: Path) -> None:
     bare = marked.dynamic_run(tmp_path / "c", files)
     with pytest.raises(ConfigError, match="--time: required"):
         export_run(bare, "vdb", tmp_path / "bare")
-    assert export_run(bare, "vdb", tmp_path / "bare", ["time=0.5"]).errors == {}
+    assert export_run(bare, "vdb", tmp_path / "bare", ["--time=0.5"]).errors == {}
 
 
 def test_a_time_when_nothing_lives_is_an_empty_frame(tmp_path: Path) -> None:

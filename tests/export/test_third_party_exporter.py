@@ -18,7 +18,7 @@ from tests.plugins.strangers import EXPORTER, INSPECTOR, add, run_dir, site
 
 __all__ = ["run_dir", "site"]
 
-SPELLINGS = [["--wavelength-shift", "X"], ["wavelength_shift=X"]]
+SPELLINGS = [["--wavelength-shift", "X"], ["--wavelength_shift=X"]]
 
 
 def call(*words: str | Path) -> int:
@@ -71,12 +71,13 @@ def test_words_that_mean_nothing_are_refused(run_dir: Path, capsys: pytest.Captu
         (["--format", "vdb", "--forc"], "did you mean '--force'"),
         (
             ["--format", "vdb", "wavelngth_shift=1"],
-            "wavelngth_shift: no such option of --format vdb; did you mean 'wavelength_shift'",
+            "wavelngth_shift: no such option of --format vdb; did you mean '--wavelength-shift'",
         ),
-        (["--format", "npz", "time"], "KEY=VALUE"),
+        (["--format", "npz", "time"], "time: no such argument of `neuprim export`"),
         (["--format", "mesh", "grid=9", "grid=9"], "twice"),
         (["--format", "npz", "--wavelength-shift", "1"], "--wavelength-shift: --format npz takes no conditions"),
-        (["--format", "vdb", "wavelength-shift=1", "--wavelength-shift", "1"], "wavelength-shift: given twice"),
+        (["--format", "vdb", "--wavelength-shift=1", "--wavelength-shift", "1"], "wavelength-shift: given twice"),
+        (["--format", "vdb", "wavelength-shift=1"], "did you mean '--wavelength-shift'"),
         (["--format", "vdb", "--wavelength-shift"], "--wavelength-shift: expected a value after it"),
     ):
         assert call("export", run_dir, *words) == 2
@@ -228,7 +229,7 @@ def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_p
     options = "{'digits': (6, ''), 'scale': (None, ''), 'pretty': (False, ''), 'up': ('z', '')}"
     source = EXPORTER.replace('path.write_text(json.dumps(job.run.model.params["means"].tolist()))', body)
     add(site, "exporter", source.replace("write=write", f"write=write, conditions=True, options={options}"))
-    shift = "wavelength-shift=0.25"
+    shift = "--wavelength-shift=0.25"
     for i, (words, expected) in enumerate(
         [
             ([], "(6, None, False, 'z', [{'wavelength_shift': tensor(0.2500)}])"),
@@ -246,13 +247,13 @@ def test_options_have_their_defaults_and_limits(site: Path, run_dir: Path, tmp_p
         ("scale=nan", "scale=nan: expected a finite number"),
         ("pretty=1", "pretty=1: expected true or false"),
         ("up=x", "up=x: expected y or z"),
-        ("wavelength_shift=0,1", "given twice"),
+        ("--wavelength_shift=0,1", "given twice"),
         ("gigits=1", "gigits: no such option of --format centres; did you mean 'digits'"),
     ):
         with pytest.raises(ConfigError, match=text):
             export_run(run_dir, "centres", tmp_path / "x", [shift, word])
     with pytest.raises(ConfigError, match="2 values; expected one value"):
-        export_run(run_dir, "centres", tmp_path / "x", ["wavelength_shift=0,1"])
+        export_run(run_dir, "centres", tmp_path / "x", ["--wavelength_shift=0,1"])
 
 
 # ---------------------------------------------------------------- errors

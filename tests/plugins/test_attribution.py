@@ -111,13 +111,13 @@ def test_a_crash_is_one_line_of_the_command_and_does_not_end_a_sweep(
     add(site, "loss", LOSS.replace("        value = ", "        if weight == 2.0: [][1]\n        value = "))
     text = "loss of loss 'extra' of fake-extra 0.3: IndexError: list index out of range (__init__.py line 8, in loss)"
     words = ["task=static", "scene=solids", *QUICK, "train.loss=extra"]
-    assert main(["run", "-m", *words, "task.options.weight=2.0,3.0", f"output_dir={tmp_path / 's'}"]) == 2
+    assert main(["run", "-m", *words, "task.options.weight=2.0,3.0", "--out", str(tmp_path / "s")]) == 2
     error = capsys.readouterr().err
     assert f": {text}" in error and "Traceback" not in error
     rows = (tmp_path / "s" / "sweep.csv").read_text()
     assert rows.count("failed") == 1 and rows.count("done") == 1, rows
     monkeypatch.setenv("NEUPRIM_TRACEBACK", "1")
-    assert main(["run", *words, "task.options.weight=2.0", f"output_dir={tmp_path / 'r'}"]) == 2
+    assert main(["run", *words, "task.options.weight=2.0", "--out", str(tmp_path / "r")]) == 2
     error = capsys.readouterr().err
     assert "Traceback" in error and error.splitlines()[-1] == f"neuprim: error: {text}"
 

@@ -62,7 +62,7 @@ def install_example(folder: Path) -> tuple[Path, Path]:
     return copy, site
 
 
-SMALL = "scene.size=16 scene.train_views=4 scene.test_views=1 train.iterations=5 output_dir=r"
+SMALL = "scene.size=16 scene.train_views=4 scene.test_views=1 train.iterations=5 --out r"
 
 
 @pytest.mark.timeout(900)

@@ -111,14 +111,14 @@ def test_without_the_package_every_command_names_it(made: Path, site: Path, caps
         ["render", "r", "--camera", "orbit"],
         ["export", "r", "--format", "ply"],
         ["inspect", "r", "--out", "x.html"],
-        ["run", "output_dir=r", "resume=true"],
-        ["run", "task=glow", "output_dir=r", "resume=true"],
+        ["run", "--out", "r", "resume=true"],
+        ["run", "task=glow", "--out", "r", "resume=true"],
     ):
         assert error(words, capsys) == f"neuprim: error: r/config.yaml: {text}", words
     assert error(["import", "r.npz", "--out", "again"], capsys) == f"neuprim: error: r.npz: {text}"
     assert not Path("again").exists()
     assert "task=glow: no such task" in error(["run", "task=glow"], capsys), "nothing is resumed"
-    assert "task=glwo: no such task" in error(["run", "task=glwo", "output_dir=r", "resume=true"], capsys), (
+    assert "task=glwo: no such task" in error(["run", "task=glwo", "--out", "r", "resume=true"], capsys), (
         "a typing error"
     )
 
@@ -129,11 +129,11 @@ def test_without_the_package_of_the_scene_or_the_loss(
     monkeypatch.chdir(tmp_path)
     add(site, "scene")
     add(site, "loss", package="fake_loss")
-    words = ["task=static", "scene=extra", "train.loss=extra", "output_dir=r"]
-    run(compose([*words, *QUICK, "model.primitives=12"]))
+    words = ["task=static", "scene=extra", "train.loss=extra"]
+    run(compose([*words, "output_dir=r", *QUICK, "model.primitives=12"]))
     uninstall(site, "fake-loss")
     assert main(["eval", "r"]) == 0, "only training needs the loss"
-    resume = ["run", *words, "resume=true"]
+    resume = ["run", *words, "--out", "r", "resume=true"]
     told = "neuprim: error: r/config.yaml: this run was made by "
     assert error(resume, capsys) == told + "fake-loss 0.3 (loss extra), which is not installed"
     uninstall(site, "fake-extra")
@@ -210,7 +210,7 @@ def test_a_run_does_not_go_on_with_another_packages_task(
     glow(site, "glow-too", "7", package="glow_too")
     before = (made / "checkpoint.safetensors").read_bytes()
     text = "written for task 'glow' of neuprim-glow 0.1; this run's task is that of glow-too 7"
-    told = error(["run", "task=glow-too:glow", *SMALL, *QUICK, "output_dir=r", "resume=true"], capsys)
+    told = error(["run", "task=glow-too:glow", *SMALL, *QUICK, "--out", "r", "resume=true"], capsys)
     assert told.endswith(f"neuprim: error: r/checkpoint.safetensors: {text}")
     assert (made / "checkpoint.safetensors").read_bytes() == before
     assert RunConfig.from_yaml(made).made_by == Provenance(

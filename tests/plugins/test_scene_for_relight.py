@@ -43,7 +43,7 @@ PLUGIN = SceneExtension(api=1, task="relight", scene=SceneSpec("mine", "two elli
 """
 WORDS = [
     "task=relight", "scene=mine", "renderer.backend=reference", "model.primitives=8", "model.colour.visibility=none",
-    "train.iterations=4", "train.max_seconds=null", "output_dir=r",
+    "train.iterations=4", "train.max_seconds=null", "--out", "r",
 ]  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def test_options_are_complete_typed_and_shown(toy: Path, capsys: pytest.CaptureF
     (toy / "conf/task/toy.yaml").write_text("scene: ball\noptions: {gain: 2}\n")
     assert toys().options == {"gain": 2.0}, "the default of the file"
     assert toys("task.options.gain=2").non_default == {}
-    assert main(["run", "task=toy", "--cfg"]) == 0
+    assert main(["run", "task=toy", "--print-config"]) == 0
     assert "  options:\n    gain: 2.0\n" in capsys.readouterr().out
     assert main(["tasks"]) == 0
     assert "options     task.options.gain=1.0  of the amplifier" in capsys.readouterr().out
@@ -129,7 +129,7 @@ def test_unused_settings_are_refused_in_a_preset(toy: Path) -> None:
 def test_what_is_not_used_is_not_shown(toy: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     config = toys()
     assert config.unused == ("model.sh_degree", "model.sh_every", "train.ssim_weight")
-    assert main(["run", "task=toy", "--cfg"]) == 0
+    assert main(["run", "task=toy", "--print-config"]) == 0
     shown = capsys.readouterr().out
     assert "neurons: 8" in shown
     assert not any(name.partition(".")[2] in shown for name in config.unused)

@@ -167,7 +167,7 @@ def test_a_meshs_colours_go_through_the_display(trained: Path, tmp_path: Path) -
     }
     rest = {k: v for k, v in header.items() if k not in ("format", "kind")}
     checkpoint.write_tensors(tmp_path / "model.safetensors", "model", painted, rest)
-    report = export_run(tmp_path, "mesh", tmp_path / "m.ply", ["grid=32", "wavelength_shift=0"])
+    report = export_run(tmp_path, "mesh", tmp_path / "m.ply", ["grid=32", "--wavelength_shift=0"])
     assert f"colours: {THROUGH}" in report.notes
     ball = trimesh.load(report.files[0], force="mesh", process=False)
     display = load_task("spectral").display
@@ -194,7 +194,7 @@ def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
     with pytest.raises(
         ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"
     ):
-        export_run(trained, "gaussian-ply", words=["wavelength_shift=0"])
+        export_run(trained, "gaussian-ply", words=["--wavelength_shift=0"])
 
 
 def test_a_damaged_header_is_the_files_fault(trained: Path, tmp_path: Path) -> None:
@@ -229,7 +229,7 @@ def test_without_a_display_it_is_said_what_is_shown(
     assert f"shown: {SHOWN}" in lines
     monkeypatch.setattr(mesh, "_sample_exported_density", lambda *a: pytest.fail("too late"))
     with pytest.raises(ConfigError, match=r"5 channels, .* and task 'spectral' has no display that makes these"):
-        export_run(out, "mesh", words=["wavelength_shift=0"])
+        export_run(out, "mesh", words=["--wavelength_shift=0"])
 
 
 @pytest.mark.parametrize(("count", "space"), [(1, "linear"), (31, "srgb")])
@@ -254,13 +254,13 @@ def test_a_grey_model_is_exported_as_grey(site: Path, tmp_path: Path) -> None:
     import trimesh
 
     out, _ = changed(site, tmp_path, "scene.bands=1", display="None", channels="()")
-    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "wavelength_shift=0"])
+    report = export_run(out, "gaussian-ply", tmp_path / "g.ply", ["views=orbit", "--wavelength_shift=0"])
     assert report.errors["psnr"] > 15
     rows = trimesh.load(tmp_path / "g.ply").metadata["_ply_raw"]["vertex"]["data"]
     assert np.array_equal(rows["f_dc_0"], rows["f_dc_2"]) and np.array_equal(rows["f_rest_0"], rows["f_rest_15"])
     assert rows["f_dc_0"].std() > 0
     ball = trimesh.load(
-        export_run(out, "mesh", tmp_path / "m.ply", ["grid=32", "wavelength_shift=0"]).files[0], process=False
+        export_run(out, "mesh", tmp_path / "m.ply", ["grid=32", "--wavelength_shift=0"]).files[0], process=False
     )
     colours = np.asarray(ball.visual.vertex_colors)[:, :3]
     assert (colours == colours[:, :1]).all() and colours.std() > 0

@@ -51,7 +51,7 @@ def refusal(capsys: pytest.CaptureFixture[str], *words: str | Path) -> str:
 
 def short(out: Path, *words: str) -> list[str]:
     size = "scene.size=16 scene.train_views=4 scene.test_views=1 model.primitives=20 train.iterations=5"
-    return ["run", "task=spectral", *size.split(), f"output_dir={out}", *words]
+    return ["run", "task=spectral", *size.split(), "--out", str(out), *words]
 
 
 # ---------------------------------------------------------------- from the scaffold to a run
@@ -92,13 +92,13 @@ def test_its_files_are_read(package: Path, tmp_path: Path, capsys: pytest.Captur
     data = folder_of_images(tmp_path / "data")
     small = "scene.test_every=4 model.primitives=20 train.iterations=5"
     words = ["run", "task=spectral", "scene=files", f"scene.path={data}", *small.split()]
-    assert call(*words, f"output_dir={tmp_path / 'run'}") == 0
+    assert call(*words, "--out", tmp_path / "run") == 0
     assert read_metrics(tmp_path / "run")["channels"] == list(NAMES)
-    assert refusal(capsys, *words, "scene.path=null", f"output_dir={tmp_path / 'x'}").startswith("scene.path: required")
+    assert refusal(capsys, *words, "scene.path=null", "--out", tmp_path / "x").startswith("scene.path: required")
     np.save(data / "v2.npy", np.zeros((16, 16, 3), "f4"))
-    assert "v2.npy: float32 (16, 16, 3); expected" in refusal(capsys, *words, f"output_dir={tmp_path / 'x'}")
+    assert "v2.npy: float32 (16, 16, 3); expected" in refusal(capsys, *words, "--out", tmp_path / "x")
     write_exr(data / "v1.exr", torch.zeros(16, 16, 3))
-    line = refusal(capsys, *words, f"output_dir={tmp_path / 'x'}")
+    line = refusal(capsys, *words, "--out", tmp_path / "x")
     assert "v1.exr: " in line and "450nm" in line
 
 
@@ -121,9 +121,9 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
     for word, text in (
         ("digits=x", "digits=x: expected a whole number from 0 to 12, or null"),
         ("digts=3", "digts: no such option of --format spectra; did you mean 'digits'?"),
-        ("wavelength-shift=0:1", "--wavelength-shift 0:1: 60 values; expected one value"),
+        ("--wavelength-shift=0:1", "--wavelength-shift 0:1: 60 values; expected one value"),
     ):
-        spoken = [] if word.startswith("wave") else advice
+        spoken = [] if word.startswith("--wave") else advice
         assert refusal(capsys, *table, *spoken, word, "--force") == text
     assert refusal(capsys, *table, *advice, "--out", tmp_path / "a.txt").endswith(
         "expected a file name that ends in .csv or .json"

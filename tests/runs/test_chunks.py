@@ -23,6 +23,7 @@ from neuprim.runs.open import load_run, read_metrics
 from neuprim.runs.run import CHUNKS_FILE, ChunksMissing, run
 from neuprim.runs.sweep import read_launch_record
 from neuprim.tasks.dynamic.time_density import TimeDensity
+from tests.short_runs import command_line
 from tests.tasks.dynamic.sequences import blob
 
 NAMES = ["frames_1-4", "frames_3-6"]
@@ -139,7 +140,7 @@ def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
     out, told = tmp_path / "run", list[Event]()
     with pytest.raises(
         ChunksMissing,
-        match=r"frames_1-4: no luck; 1 of 2 chunks are done, and resume=true with output_dir=\S+ makes the others",
+        match=r"frames_1-4: no luck; 1 of 2 chunks are done, and resume=true with --out \S+ makes the others",
     ):
         run(compose(words(files, out)), told.append)
     assert [event.text.partition("chunks/")[2] for event in told if isinstance(event, Note)] == ["frames_1-4: no luck"]
@@ -166,7 +167,7 @@ def _fail_first(data: Any, attempt: int, events: Any) -> str:
 def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "copy")
     with pytest.raises(
-        ConfigError, match=r"chunks.json: begun with frames_1-4, .* ask for frames_1-3, .*; expected the same words"
+        ConfigError, match=r"chunks.json: begun with frames_1-4, .* ask for frames_1-3, .*; expected the same settings"
     ):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")
@@ -215,7 +216,7 @@ def test_few_frames_in_auto_are_one_run(files: Path, tmp_path: Path) -> None:
 def test_what_cannot_be_is_said_in_one_line(
     typed: list[str], said: str, files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["run", *words(files, tmp_path / "run"), *typed]) == 2
+    assert main(["run", *command_line(words(files, tmp_path / "run")), *typed]) == 2
     assert capsys.readouterr().err.splitlines()[-1] == f"neuprim: error: {said}"
 
 

@@ -46,10 +46,13 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def words(files: Path, place: Path, *more: str) -> list[str]:
+def scene_words(files: Path, place: Path, *more: str) -> list[str]:
     scene = "task=dynamic scene=vdb scene.look=smoke_fire scene.size=16 scene.cameras=4 scene.samples=1".split()
-    places = [f"scene.vdb='{files}'", f"scene.cache='{place / 'cache'}'", f"output_dir='{place / 'outputs' / 'run'}'"]
-    return [*scene, *places, *more]
+    return [*scene, f"scene.vdb='{files}'", f"scene.cache='{place / 'cache'}'", *more]
+
+
+def words(files: Path, place: Path, *more: str) -> list[str]:
+    return scene_words(files, place, f"output_dir='{place / 'outputs' / 'run'}'", *more)
 
 
 def config(files: Path, place: Path, *more: str) -> RunConfig:
@@ -204,7 +207,7 @@ def test_a_shared_folder_that_vanishes_for_good(
 ) -> None:
     cache, away = tmp_path / "cache", tmp_path / "away"
     vanishing(monkeypatch, cache, away, back=False)
-    assert main(["truth", *words(files, tmp_path)]) == 2
+    assert main(["truth", *scene_words(files, tmp_path)]) == 2
     (place,) = (away / "volumes").iterdir()
     line = capsys.readouterr().err.splitlines()[-1]
     gone = f"neuprim: error: {cache / 'volumes' / place.name}: gone for 0 s while it was in use"
@@ -260,10 +263,10 @@ def test_runs_that_share_a_scene_wait_for_it_together_and_a_broken_one_holds_up_
 def test_the_command_says_where_it_is_or_why_not(
     files: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["truth", *words(files, tmp_path, "scene.frames='1:2'")]) == 0
+    assert main(["truth", *scene_words(files, tmp_path, "scene.frames='1:2'")]) == 0
     out = capsys.readouterr().out.strip()
     assert sorted(f.name for f in Path(out).iterdir()) == ["frame_00001", "frame_00002", "scene.json"]
-    assert main(["truth", "-m", *words(files, tmp_path, "scene.frames='1:1','2:2'", "output_dir=null")]) == 0
+    assert main(["truth", "-m", *scene_words(files, tmp_path, "scene.frames='1:1','2:2'")]) == 0
     assert len(capsys.readouterr().out.split()) == 2
     assert main(["truth", "task=static", "scene=solids"]) == 2
     assert "scene=solids: its images are not rendered frame by frame" in capsys.readouterr().err
@@ -274,5 +277,5 @@ def test_the_command_says_where_it_is_or_why_not(
 def test_on_a_cluster(files: Path, tmp_path: Path, alone: dict[str, str], launcher: list[str]) -> None:
     pytest.importorskip("ray" if launcher[0].endswith("ray") else "submitit")
     begun = time.monotonic()
-    assert main(["truth", *words(files, tmp_path), *launcher, "launcher.workers=2", "launcher.threads=1"]) == 0
+    assert main(["truth", *scene_words(files, tmp_path), *launcher, "launcher.workers=2", "launcher.threads=1"]) == 0
     assert contents(tmp_path) == alone and time.monotonic() - begun < 250

@@ -12,7 +12,6 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from neuprim.cli import main
-from neuprim.cli.command import RENDER_OVERRIDE_HEADS, split_override_arguments
 from neuprim.core.checkpoint import save_model
 from neuprim.core.errors import ConfigError
 from neuprim.core.model.primitives import Primitives
@@ -20,7 +19,6 @@ from neuprim.core.render import RenderSettings
 from neuprim.runs.measure import evaluate_run, render_image
 from neuprim.runs.open import load_dataset, load_run
 from neuprim.runs.render_config import (
-    HEADS,
     RenderConfig,
     estimate_run_file_bytes,
     parse_run_rendering,
@@ -62,11 +60,6 @@ def test_overrides_round_trip(model: Primitives, config: RenderConfig) -> None:
     defaults = RenderSettings()
     words = config.to_overrides(defaults)
     assert parse_run_rendering(words, defaults, model) == config
-    assert split_override_arguments(["--time", "0.5", "--", *words, "x=1"]) == (list(words), ["--time", "0.5", "x=1"])
-
-
-def test_the_command_line_knows_the_keys() -> None:
-    assert set(RENDER_OVERRIDE_HEADS) == set(HEADS)
 
 
 @pytest.mark.parametrize(

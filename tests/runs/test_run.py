@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,6 @@ from neuprim.core.errors import CheckpointError, ConfigError, DataError, Neuprim
 from neuprim.core.io.files import write_text
 from neuprim.core.train.settings import ModelSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
-from neuprim.runs import training
 from neuprim.runs.fit import Event, Note, compile_run_kernels, measure_run_curve_point, prepare_training, train_to_end
 from neuprim.runs.measure import evaluate_run, measure_views
 from neuprim.runs.open import read_metrics, result_files
@@ -38,7 +38,7 @@ from neuprim.runs.training import add_run_curve_line, cut_run_curve
 from neuprim.tasks.static import TASK
 from tests.core import tiny
 from tests.lpips_weights import weights, written
-from tests.short_runs import STEPS, fit, words
+from tests.short_runs import STEPS, command_line, fit, words
 from tests.systems import posix
 
 
@@ -282,7 +282,7 @@ def wait_for_step(process: subprocess.Popen[bytes], run_dir: Path, step: int) ->
 def test_ctrl_c_leaves_a_checkpoint_that_goes_on(scene: Path, whole: Path, tmp_path: Path) -> None:
     out = tmp_path / "stopped"
     overrides = words(scene, out, STEPS, "train.checkpoint_every_seconds=0")
-    command = [sys.executable, "-m", "neuprim", "run", *overrides]
+    command = [sys.executable, "-m", "neuprim", "run", *command_line(overrides)]
     process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
     try:
         wait_for_step(process, out, 30)
@@ -316,22 +316,21 @@ def test_what_cannot_go_on_leaves_an_earlier_run_alone(scene: Path, tmp_path: Pa
     refused(CheckpointError, r"checkpoint\.safetensors.*'dynamic'.*'static'")
 
 
-def test_a_preview_is_written_while_a_run_trains_and_changes_nothing(
-    scene: Path, whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(training, "PREVIEW_SECONDS", 1e-4)
-    out, seen, notes = tmp_path / "run", [], []
+def test_a_preview_is_written_while_a_run_trains_and_changes_nothing(scene: Path, whole: Path, tmp_path: Path) -> None:
+    """Within the first tenth, anew at half of the training, and at its end."""
+    out, seen, notes = tmp_path / "run", list[bytes | None](), list[str]()
     preview = out / "renders" / "preview.png"
 
     def listen(event: Event) -> None:
         notes.extend([event.text] if isinstance(event, Note) and "picture" in event.text else [])
 
-    run(compose(words(scene, out)), listen, lambda fitted, stop: seen.append(preview.is_file()))
-    assert (
-        not any(seen[:2])
-        and all(seen[2:])
-        and notes == [f"a first picture, renewed as the training goes on: {preview}"]
-    )
+    def look(fitted: Any, stop: Any) -> None:
+        seen.append(preview.read_bytes() if preview.is_file() else None)
+
+    run(compose(words(scene, out)), listen, look)
+    written = [i for i, (before, after) in enumerate(pairwise(seen)) if before != after]
+    assert written == [0.05 * STEPS, 0.5 * STEPS] and seen[0] is None and preview.read_bytes() != seen[-1]
+    assert notes == [f"first picture (left ground truth, right model): {preview}"]
     assert_same_run(whole, out)
     (drawn,) = (p for p in (out / "renders").glob("test_001_*.png") if not p.stem.endswith(("_truth", "_error")))
     pair = [Image.open(drawn.with_name(f"{drawn.stem}{end}.png")) for end in ("_truth", "")]

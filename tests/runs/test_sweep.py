@@ -15,7 +15,7 @@ from neuprim.core import checkpoint
 from neuprim.runs.open import lock_run_directory
 from neuprim.runs.sweep import read_launch_record
 from tests.core import tiny
-from tests.short_runs import words
+from tests.short_runs import command_line, words
 
 
 @pytest.fixture(scope="module")
@@ -24,7 +24,8 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def typed(scene: Path, out: Path, *more: str) -> list[str]:
-    return ["run", "-m", *(w for w in words(scene, out, 20) if not w.startswith("seed=")), "seed=1,2,3", *more]
+    own = [word for word in words(scene, out, 20) if not word.startswith("seed=")]
+    return ["run", "-m", *command_line(own), "seed=1,2,3", *more]
 
 
 def table(out: Path) -> list[dict[str, str]]:
@@ -77,7 +78,7 @@ def test_one_fails_the_others_are_compared_and_resume_makes_the_rest(
 
     monkeypatch.undo()
     before = {n: (out / f"seed-{n}" / "metrics.json").stat().st_mtime_ns for n in (1, 3)}
-    assert main(["run", "-m", f"output_dir={out}", "resume=true"]) == 0, "sweep.json has the words"
+    assert main(["run", "-m", "--out", str(out), "resume=true"]) == 0, "sweep.json has the words"
     assert "[2/3]" in (said := capsys.readouterr()).out and "[1/3]" not in said.out
     assert [r["state"] for r in table(out)] == ["done"] * 3 and "failed" not in (out / "sweep.html").read_text()
     assert before == {n: (out / f"seed-{n}" / "metrics.json").stat().st_mtime_ns for n in (1, 3)}, (
@@ -137,10 +138,10 @@ def test_a_launcher_that_is_refused_leaves_nothing(
 def test_nothing_to_sweep_and_a_damaged_record_are_said(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["run", "-m", f"output_dir={tmp_path}", "resume=true"]) == 2
-    assert "no values to sweep; expected KEY=A,B,C, or output_dir=DIR resume=true of a sweep" in capsys.readouterr().err
+    assert main(["run", "-m", "--out", str(tmp_path), "resume=true"]) == 2
+    assert "no values to sweep; expected KEY=A,B,C, or --out DIR resume=true of a sweep" in capsys.readouterr().err
     for text in ("{", "[]", '{"format": 9}', '{"format": 1, "words": [], "runs": [{"name": "../x"}]}'):
         (tmp_path / "sweep.json").write_text(text)
-        assert main(["run", "-m", f"output_dir={tmp_path}", "resume=true"]) == 2
+        assert main(["run", "-m", "--out", str(tmp_path), "resume=true"]) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert f"{tmp_path / 'sweep.json'}: " in line and "another output_dir=DIR begins anew" in line
+        assert f"{tmp_path / 'sweep.json'}: " in line and "another --out DIR begins anew" in line

@@ -23,7 +23,7 @@ from neuprim.search.tradeoff_measuring import TradeoffRequest
 from neuprim.search.tradeoff_record import COMBINED, TradeoffRecord, read_tradeoff_record
 from neuprim.search.trials import Outcome, Trial, run_trial
 from tests.core import tiny
-from tests.short_runs import words
+from tests.short_runs import command_line, words
 
 STEPS = 40
 KNOBS = ("model.primitives", "model.neurons", "train.iterations")
@@ -50,7 +50,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def request(scene: Path, folder: Path, *more: str, **changes: Any) -> TradeoffRequest:
     values: dict[str, Any] = {"budget": 600.0, "views": 2, "repeats": 3, "knobs": KNOBS, **changes}
-    return TradeoffRequest([*words(scene, folder, STEPS), *more], **values)
+    return TradeoffRequest([*words(scene, folder, STEPS), *more], out=folder, **values)
 
 
 @pytest.fixture(scope="module")
@@ -152,18 +152,19 @@ def test_folders_that_hold_something_else_are_refused(
     TradeoffRecord({}, {}, measured[1].points[:1]).write(tmp_path / "tradeoff.json")
     with pytest.raises(DataError, match="of a finished run"):
         run_ablation(request(scene, tmp_path))
-    with pytest.raises(ConfigError, match="no such knob of a model"):
+    with pytest.raises(ConfigError, match="no such setting of a model"):
         run_ablation(request(scene, tmp_path / "set", knobs=("model.neuron",)))
 
 
 def test_the_command(scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    typed = words(scene, tmp_path / "set", 20)
-    flags = ["--views", "1", "--repeats", "1", "--knobs", "train.iterations"]
+    typed = command_line(words(scene, tmp_path / "set", 20))
+    flags = ["--views", "1", "--repeats", "1", "--vary", "train.iterations"]
     assert main(["tradeoff", *typed, "budget=60s", *flags]) == 0
     out = capsys.readouterr().out
     assert "Every model trains for the same time" in out and "front of size" in out and "neuprim run" in out
-    assert main(["tradeoff", *typed, "budget=60s", "--budget", "1m"]) == 2
-    assert "expected one of them" in capsys.readouterr().err
+    assert (tmp_path / "set" / "tradeoff.json").is_file()
+    assert main(["tradeoff"]) == 2
+    assert "expected RUN_DIR, or task=NAME scene=NAME" in capsys.readouterr().err
 
 
 def test_lengths_fit_the_budget(scene: Path, tmp_path: Path) -> None:

@@ -58,7 +58,7 @@ def test_the_command_says_what_became_of_every_parameter(
 ) -> None:
     out = tmp_path / "m.neuprim"
     command = ["compress", str(whole), "--seconds", "0", "--level", "2", "--out", str(out)]
-    assert main([*command, "--bits", "W1=12", "means=20", "sh_rest=9,7"]) == 0
+    assert main([*command, "bits.W1=12", "bits.means=20", "bits.sh_rest=9,7"]) == 0
     lines = capsys.readouterr().out.splitlines()
     model = load_run(whole).model
     rows = {line.split()[0]: line.split()[1:] for line in lines[2 : 2 + len(model.specs)]}
@@ -94,9 +94,10 @@ def test_what_is_measured_is_what_eval_measures_and_again_it_is_the_same(
             ["--tolerance", "0.2", "--level", "3"],
             "--tolerance 0.2: decides the bits of every number; expected no --level",
         ),
-        (["--tolerance", "0.2dB", "--bits", "W1=3"], "expected no --bits"),
-        (["--bits", "sh=3"], "no parameter 'sh'; did you mean"),
-        (["--bit", "W1=3"], "--bit: no such argument of `neuprim compress`; did you mean '--bits'"),
+        (["--tolerance", "0.2dB", "bits.W1=3"], "expected no bits.NAME=BITS"),
+        (["bits.sh=3"], "no parameter 'sh'; did you mean"),
+        (["W1=3"], "W1=3: no setting of `neuprim compress`; expected bits.NAME=BITS"),
+        (["--output", "m"], "--output: no such argument of `neuprim compress`; did you mean '--out'"),
     ],
 )
 def test_wrong_words(whole: Path, capsys: pytest.CaptureFixture[str], more: list[str], message: str) -> None:

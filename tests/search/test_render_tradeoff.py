@@ -84,21 +84,27 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
         "1",
         "--repeats",
         "1",
-        "--knobs",
-        "resolution",
+        "--vary",
+        "resolution,sort",
         "renderer.alpha_min=0.01",
+        "--out",
+        str(tmp_path / "set"),
     ]
     assert main(words) == 0
     out = capsys.readouterr().out
     assert (
         "front of speed" in out
         and "front of size" in out
-        and str(run_dir / "tradeoff" / "tradeoff.html") in out.replace("\n", "")
+        and str(tmp_path / "set" / "tradeoff.html") in out.replace("\n", "")
     )
-    assert json.loads((run_dir / "tradeoff" / "tradeoff.json").read_text())["same"]["reference"] == [
+    assert json.loads((tmp_path / "set" / "tradeoff.json").read_text())["same"]["reference"] == [
         "renderer.alpha_min=0.01"
     ]
-    for more, text in ((["--knobs", "alpha"], "no such knob"), (["--budget", "x"], "--budget x")):
+    for more, text in (
+        (["--vary", "alpha"], "--vary alpha: no such setting of this run"),
+        (["budget=x"], "budget=x: expected"),
+        (["--out", str(run_dir)], f"--out {run_dir}: holds something else"),
+    ):
         assert main(["tradeoff", str(run_dir), *more]) == 2
         assert text in capsys.readouterr().err
 

@@ -201,4 +201,4 @@ def test_nobody_who_looks_costs_one_question(scene: Path, tmp_path: Path, monkey
     with LiveTraining(ViewerSettings(port=0), config, lambda address: None, events.append) as live:
         monkeypatch.setattr(live.queue, "work", lambda patience: pytest.fail("asked for work"))
         trained(config, live)
-    assert live.progress.step == 20 and [e.text[:13] for e in events if isinstance(e, Note)] == ["PSNR of 2 vie"]
+    assert live.progress.step == 20

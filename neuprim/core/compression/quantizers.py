@@ -254,11 +254,11 @@ def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) 
     for word in words:
         name, equals, text = word.partition("=")
         if not equals:
-            raise ConfigError(f"--bits {word}: expected NAME=BITS, for example means=16")
+            raise ConfigError(f"bits.{word}: expected bits.NAME=BITS, for example bits.means=16")
         if name not in names and name != OTHERS:
-            raise ConfigError(f"--bits {word}: the model has no parameter {name!r}{nearest(name, [*names, OTHERS])}")
+            raise ConfigError(f"bits.{word}: the model has no parameter {name!r}{nearest(name, [*names, OTHERS])}")
         if name in table.exact:
-            raise ConfigError(f"--bits {word}: {name} is given twice")
+            raise ConfigError(f"bits.{word}: {name} is given twice")
         bits = _parse_quantizer_bits(word, text, name)
         if name == OTHERS:
             table = replace(
@@ -277,5 +277,5 @@ def _parse_quantizer_bits(word: str, text: str, name: str) -> tuple[int, ...]:
         len(parts) > 1 and not several
     ):
         more = "; several, as 7,6,5, for the bands of spherical harmonics" if several else ""
-        raise ConfigError(f"--bits {word}: expected {low} to {high}{more}")
+        raise ConfigError(f"bits.{word}: expected {low} to {high}{more}")
     return tuple(map(int, parts))

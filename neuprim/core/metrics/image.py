@@ -144,18 +144,20 @@ def metric_from_json(entries: Mapping[str, object], key: str) -> float | None:
 
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
-    """Summarise metrics.json in one line: mean of inexact views, worst view, views worse than a black image."""
-    worst, bad = metric_from_json(metrics, "psnr_worst"), metrics["worse_than_black_image"]
+    """Summarise metrics.json: ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``. PSNR is the mean of inexact views."""
     values = [value for entry in metrics["per_view"] if (value := metric_from_json(entry, "psnr")) is not None]
     wrong = [value for value in values if math.isfinite(value)]
     exact = f", {len(values) - len(wrong)} exact" if len(wrong) < len(values) else ""
     mean = sum(wrong) / len(wrong) if wrong else math.inf
-    text = f"PSNR of {len(values)} views{exact}: mean {mean:.2f} dB, worst {worst:.2f} dB ({metrics['view_worst']})"
+    views = f"{len(values)} held-out view{'s' * (len(values) != 1)}"
+    return f"PSNR {mean:.2f} dB, SSIM {metrics['ssim']:.3f} ({views}{exact})"
+
+
+def format_failed_views(metrics: Mapping[str, Any]) -> str:
+    """Name the held-out views of metrics.json that are worse than a black image; empty without any."""
+    bad = metrics["worse_than_black_image"]
     if not bad:
-        return text
-    more = (
-        f" and {len(bad) - _MAX_NAMED} more, see worse_than_black_image in metrics.json"
-        if len(bad) > _MAX_NAMED
-        else ""
-    )
-    return f"{text}; worse than a black image: {len(bad)} of {len(values)} ({', '.join(bad[:_MAX_NAMED])}{more})"
+        return ""
+    more = f" and {len(bad) - _MAX_NAMED} more" if len(bad) > _MAX_NAMED else ""
+    count, named = len(metrics["per_view"]), f"{', '.join(bad[:_MAX_NAMED])}{more}"
+    return f"{len(bad)} of {count} held-out views are worse than a black image: {named}"

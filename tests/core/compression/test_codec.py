@@ -117,9 +117,9 @@ def test_positions_get_the_bits_that_the_primitives_sizes_ask_for() -> None:
     ("level", "word", "message"),
     [
         (6, "", "--level 6: expected one of 1, 2, 3, 4, 5"),
-        (3, "means", "--bits means: expected NAME=BITS"),
+        (3, "means", "bits.means: expected bits.NAME=BITS"),
         (3, "mean=16", "no parameter 'mean'; did you mean 'means'"),
-        (3, "means=21", "--bits means=21: expected 1 to 20"),
+        (3, "means=21", "bits.means=21: expected 1 to 20"),
         (3, "W1=0", "expected 1 to 16"),
         (3, "others=8,7", "expected 1 to 16"),
     ],

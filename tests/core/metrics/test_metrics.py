@@ -24,7 +24,7 @@ from neuprim.core.metrics import (
     ssim,
     ssim_3dgs,
 )
-from neuprim.core.metrics.image import format_metrics
+from neuprim.core.metrics.image import format_failed_views, format_metrics
 
 
 def pair(
@@ -239,17 +239,20 @@ def metrics(values: list[float], bad: list[str]) -> dict[str, Any]:
     worst = min(range(len(values)), key=lambda i: values[i])
     return {
         "per_view": views,
+        "ssim": 0.97654,
         **metric_to_json("psnr_worst", values[worst]),
         "view_worst": f"v{worst}",
         "worse_than_black_image": bad,
     }
 
 
-def test_the_worst_view_and_those_worse_than_black_are_named() -> None:
-    found = format_metrics(metrics([40.0, 20.0, math.inf], ["v1"]))
-    assert found == (
-        "PSNR of 3 views, 1 exact: mean 30.00 dB, worst 20.00 dB (v1); worse than a black image: 1 of 3 (v1)"
+def test_the_mean_and_views_worse_than_black_are_named() -> None:
+    found = metrics([40.0, 20.0, math.inf], ["v1"])
+    assert format_metrics(found) == "PSNR 30.00 dB, SSIM 0.977 (3 held-out views, 1 exact)"
+    assert format_failed_views(found) == "1 of 3 held-out views are worse than a black image: v1"
+    assert format_metrics(metrics([40.0], [])) == "PSNR 40.00 dB, SSIM 0.977 (1 held-out view)"
+    assert format_metrics(metrics([math.inf], [])) == "PSNR inf dB, SSIM 0.977 (1 held-out view, 1 exact)"
+    assert format_failed_views(metrics([40.0], [])) == ""
+    assert format_failed_views(metrics([1.0] * 9, [f"v{i}" for i in range(9)])).endswith(
+        "9 of 9 held-out views are worse than a black image: v0, v1, v2, v3, v4, v5 and 3 more"
     )
-    assert format_metrics(metrics([40.0], [])) == "PSNR of 1 views: mean 40.00 dB, worst 40.00 dB (v0)"
-    many = format_metrics(metrics([1.0] * 9, [f"v{i}" for i in range(9)]))
-    assert many.endswith("(v0, v1, v2, v3, v4, v5 and 3 more, see worse_than_black_image in metrics.json)")

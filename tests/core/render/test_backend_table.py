@@ -25,7 +25,7 @@ from neuprim.core.render.output import Draw
 from neuprim.core.render.reference import render as reference
 from tests import scenes
 from tests.core import tiny
-from tests.short_runs import words
+from tests.short_runs import command_line, words
 
 
 @dataclass
@@ -62,7 +62,7 @@ def fake(monkeypatch: pytest.MonkeyPatch) -> Fake:
 def test_commands_know_it(fake: Fake, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("neuprim.runs.evaluate._ORBIT_FRAMES", 2)
     scene, folder = tiny.write_blender(tmp_path / "two"), tmp_path / "run"
-    assert main(["run", *words(scene, folder, 3, "renderer.backend=fake")]) == 0
+    assert main(["run", *command_line(words(scene, folder, 3, "renderer.backend=fake"))]) == 0
     drawn = fake.frames
     assert drawn > 4 and RunConfig.from_yaml(folder).renderer.backend == "fake"
     metrics = json.loads((folder / "metrics.json").read_text())

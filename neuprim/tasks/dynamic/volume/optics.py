@@ -57,7 +57,12 @@ DATA_DEPENDENT = ("extinction", "flame_extinction", "flame_range")
 
 @dataclass(frozen=True)
 class Light:
-    """A light at infinity: its direction, scene axes, any length, and RGB irradiance on a plane that faces it."""
+    """A light at infinity.
+
+    Attributes:
+        direction: towards the light, on the scene's axes, of any length.
+        irradiance: RGB irradiance on a plane that faces the light.
+    """
 
     direction: Direction
     irradiance: RGB
@@ -83,14 +88,19 @@ class Optics:
     the sequence's box; radiances are linear sRGB in one arbitrary unit. Negative, NaN and infinite voxels count as 0.
 
     Attributes:
-        extinction_grids: names in order of preference; the first that a file has is d.
-        ambient: radiance that arrives from everywhere, unshadowed.
-        flame_grid: f; a file without it does not glow.
-        flame_range: values of f that mean ``kelvin``'s ends.
-        emission: strength of the glow, radiance of the hottest flame; 0 for none.
-        color_grid: a vec3s grid that multiplies the albedo, clamped to 0..1.
-        gradient: RGB from the bottom to the top of the unit box, where a file has no ``color_grid``.
-        up: 'y' or 'z', for the gradient.
+        extinction_grids: names of the grid d in order of preference; the first that a file has is used.
+        extinction: extinction per unit of d.
+        albedo: share of extinction that scatters, RGB.
+        ambient: radiance that arrives from all directions, without shadows, RGB.
+        light: a light at infinity; null for none.
+        flame_grid: name of the grid f; a file without it does not glow.
+        flame_range: values of f at the two ends of ``kelvin``.
+        kelvin: temperatures of the coldest and the hottest flame.
+        emission: radiance of the hottest flame; 0 for no glow.
+        flame_extinction: extinction per unit of f.
+        color_grid: name of a vec3s grid that multiplies the albedo, clamped to 0..1; null for none.
+        gradient: RGB from the bottom to the top of the unit box, where a file has no ``color_grid``; null for none.
+        up: upward axis of the gradient, y or z.
     """
 
     extinction_grids: ExtinctionGrids = ("density", "temperature")

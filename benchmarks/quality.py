@@ -10,9 +10,9 @@ computes while the model learns, or steps. --tune judges by training views that 
 in a record of its own.
 
 Rows go to benchmarks/results/TASK.json one by one, and the table to TASK.md beside it. Only what is missing is run; a
-row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of docs/static.md or
-docs/relighting.md, --readme the static rows of README_SECONDS into the README. Without SCENE nothing is run, and the
-static table is made, or that of --record. The README's picture:
+row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of
+docs/results/static.md or docs/results/relighting.md, --readme the static rows of README_SECONDS into the README.
+Without SCENE nothing is run, and the static table is made, or that of --record. The picture of mic:
 
     python docs/make_pictures.py outputs/quality/mic_800-240s-0 docs/pictures/static.png 3 400
 
@@ -34,7 +34,18 @@ from unittest.mock import patch
 
 import torch
 from shared.arguments import make_parser
-from shared.tables import DOCS, README, RESULTS, Record, Run, Table, between_markers, group_runs, read_record, spread_of
+from shared.tables import (
+    README,
+    RESULT_PAGES,
+    RESULTS,
+    Record,
+    Run,
+    Table,
+    between_markers,
+    group_runs,
+    read_record,
+    spread_of,
+)
 from shared.trials import Trial, run_all
 
 from neuprim.config import compose
@@ -71,7 +82,7 @@ SCORES: dict[str, dict[str, tuple[str, int]]] = {
 }
 """Columns of each task, of metrics, with digits."""
 KEYS = (*(key for scores in SCORES.values() for key in scores), "psnr_worst", "primitives", "model_bytes")
-PAGES = {"static": DOCS / "static.md", "relight": DOCS / "relighting.md"}
+PAGES = {"static": RESULT_PAGES / "static.md", "relight": RESULT_PAGES / "relighting.md"}
 
 
 def scene_words(text: str) -> tuple[str, str, list[str]]:

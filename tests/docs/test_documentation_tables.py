@@ -69,7 +69,6 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "results": ("README.md", "readme", lambda s: s.results_table()),
     "budgets": ("docs/results/budgets.md", "budget", budgets),
     "static": ("docs/results/static.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "static.json"))),
-    "full-size": ("README.md", "quality", lambda s: s.readme_table(s.read_record(s.RESULTS / "static.json"))),
     "relight": ("docs/results/relighting.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "relight.json"))),
     **{
         name: ("docs/results/dynamic.md", "dynamic_quality", lambda s, name=name: s.make_tables(record_of(s))[name])

@@ -12,7 +12,7 @@ benchmarks/results/budget.json after every run, and only what is missing is run;
 another file.
 
 A *fall* is a doubling after which a measure is more than 0.1 dB worse. --docs puts the tables between the markers of
-docs/budgets.md and draws docs/pictures/budgets.png; --print runs nothing.
+docs/results/budgets.md and draws docs/pictures/budgets.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from pathlib import Path
 
 from shared.arguments import make_parser, require_folders
 from shared.forms import SCENES
-from shared.tables import DOCS, RESULTS, Run, Table, between_markers, read_trials, spread
+from shared.tables import DOCS, RESULT_PAGES, RESULTS, Run, Table, between_markers, read_trials, spread
 from shared.trials import Trial, run_all
 
 from neuprim.report.charts import LARGE, Chart, ChartPoints, write_png_charts
@@ -147,7 +147,7 @@ def main() -> None:
     falls = describe_falls(runs)
     print(f"\n{falls}")
     if args.docs:
-        between_markers(DOCS / "budgets.md", "budgets", f"{text}\n\n{falls}")
+        between_markers(RESULT_PAGES / "budgets.md", "budgets", f"{text}\n\n{falls}")
         write_png_charts(PICTURE, [make_chart(name, runs) for name in scenes], rows=2)
 
 

@@ -7,7 +7,7 @@ DIR holds a data set in the layout of `scene=olat`, of which the first COUNTS tr
 cameras are shifted, or lights are shifted and their intensities multiplied, by normal noise of a root mean square given
 in percent of their distance from the origin; the test views stay as they are and judge. One seed, one thread, 6,000
 primitives. Results go to benchmarks/results/capture.json after every run, and only what is missing is run; --docs puts
-the tables between the markers of docs/capture.md, --print runs nothing.
+the tables between the markers of docs/results/relighting.md, --print runs nothing.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from typing import Any
 
 import numpy as np
 from shared.arguments import make_parser
-from shared.tables import DOCS, RESULTS, Record, Table, between_markers, read_record
+from shared.tables import RESULT_PAGES, RESULTS, Record, Table, between_markers, read_record
 from shared.trials import Trial, run_all
 
 RECORD = RESULTS / "capture.json"
@@ -107,7 +107,7 @@ def main() -> None:
             run_all(plan(args.folder.resolve(), Path(work), args.steps), RECORD, KEYS, args.jobs)
     text = tables(read_record(RECORD))
     if args.docs:
-        between_markers(DOCS / "capture.md", "capture", text)
+        between_markers(RESULT_PAGES / "relighting.md", "capture", text)
 
 
 if __name__ == "__main__":

@@ -15,8 +15,8 @@ DIR is a folder of .vdb files of JangaFX EmberGen (the recorded numbers: a free 
 
 Images are 96 x 96, 40 cameras (two held out), linear RGB over the exposure's peak, black background; means over seeds
 +- half the spread, of the last checkpoint. Results go to benchmarks/results/dynamic_quality.json after every run, and
-only what is missing is run. --docs puts the recorded tables between the markers of docs/dynamic.md; without DIR nothing
-is run.
+only what is missing is run. --docs puts the recorded tables between the markers of docs/results/dynamic.md; without DIR
+nothing is run.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from typing import Any
 import torch
 from shared.arguments import make_parser
 from shared.tables import (
-    DOCS,
+    RESULT_PAGES,
     RESULTS,
     Run,
     Table,
@@ -308,7 +308,7 @@ def main() -> None:
             run_all(trials, RECORD, wanted, args.jobs, machines=known | machine)
     for name, text in make_tables(read_record(RECORD)).items():
         if args.docs:
-            between_markers(DOCS / "dynamic.md", name, text)
+            between_markers(RESULT_PAGES / "dynamic.md", name, text)
 
 
 if __name__ == "__main__":

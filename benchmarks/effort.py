@@ -11,7 +11,7 @@ the time at paces measured side by side. Each is trained once, one thread, all e
 the two test cameras of a rig of 38, as those of the usual 40 must not decide. The level is the smallest model within
 TIE dB of the best of so much time or less. Results go to benchmarks/results/effort/SCENE.json after every run, and only
 what is missing is run. --write freezes the levels in the tasks' `effort/NAME.yaml`, --docs puts the tables between the
-markers of docs/tradeoffs.md and draws docs/pictures/effort.png; --print runs nothing.
+markers of docs/results/tradeoffs.md and draws docs/pictures/effort.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -23,7 +23,18 @@ from pathlib import Path
 import yaml
 from shared.arguments import make_parser
 from shared.forms import SCENES
-from shared.tables import DOCS, RESULTS, ROOT, Run, Table, between_markers, group_runs, make_table, read_trials
+from shared.tables import (
+    DOCS,
+    RESULT_PAGES,
+    RESULTS,
+    ROOT,
+    Run,
+    Table,
+    between_markers,
+    group_runs,
+    make_table,
+    read_trials,
+)
 from shared.trials import Trial, measure_paces, run_all
 
 from neuprim.config import compose
@@ -159,7 +170,7 @@ def levels_file(runs: Sequence[Run], scene: str) -> str:
     lines = [
         "# Levels of effort: the best use of 1/16 to 4 times the time that the preset takes, as measured by "
         "`python benchmarks/effort.py --write`",
-        f"# on {TITLES[scene].partition(': ')[2]}. Tables: docs/tradeoffs.md",
+        f"# on {TITLES[scene].partition(': ')[2]}. Tables: docs/results/tradeoffs.md",
         "",
         "preset: quick",
         "levels:",
@@ -224,8 +235,8 @@ def main() -> None:
     if args.docs:
         levels = {task: levels_of_views(task) for task in SCORES}
         for task, own in levels.items():
-            between_markers(DOCS / "tradeoffs.md", f"effort-{task}", str(table_of_views(own, task)))
-        between_markers(DOCS / "tradeoffs.md", "effort", text)
+            between_markers(RESULT_PAGES / "tradeoffs.md", f"effort-{task}", str(table_of_views(own, task)))
+        between_markers(RESULT_PAGES / "tradeoffs.md", "effort", text)
         charts = [make_chart(runs, scene) for scene, runs in found.items()]
         write_png_charts(PICTURE, [*(chart_of_views(own, task) for task, own in levels.items()), *charts])
 

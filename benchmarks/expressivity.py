@@ -17,7 +17,7 @@ hold. Parts:
 
 Numbers are means over seeds +- half the spread, of the last checkpoint, on the test views. Results go to
 benchmarks/results/expressivity.json after every run, and only what is missing is run. --docs puts the tables between
-the markers in docs/expressivity.md; --print runs nothing.
+the markers in docs/results/expressivity.md; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from typing import Any
 from shared.arguments import make_parser, require_folders
 from shared.forms import AS_RECORDED, PAPER, SCENES, Form
 from shared.tables import (
-    DOCS,
+    RESULT_PAGES,
     RESULTS,
     Run,
     between_markers,
@@ -211,7 +211,7 @@ def main() -> None:
         text = make(record)
         print()
         if args.docs:
-            between_markers(DOCS / "expressivity.md", name, text)
+            between_markers(RESULT_PAGES / "expressivity.md", name, text)
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ size trained equally long.
 
 It is `neuprim tradeoff task=… scene=…` with the words below: every model trains for the same time, on one thread, and
 times of frames are taken in rounds that take turns between all of them. What is trained is kept in --out and gone on
-with. Results go to benchmarks/results/fronts.json; --docs puts the tables between the markers of docs/tradeoffs.md and
-draws docs/pictures/fronts.png; --print runs nothing.
+with. Results go to benchmarks/results/fronts.json; --docs puts the tables between the markers of
+docs/results/tradeoffs.md and draws docs/pictures/fronts.png; --print runs nothing.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.arguments import make_parser, require_folders
-from shared.tables import DOCS, RESULTS, ROOT, between_markers, make_table, read_record, update_record
+from shared.tables import DOCS, RESULT_PAGES, RESULTS, ROOT, between_markers, make_table, read_record, update_record
 
 from neuprim.config.command_settings import parse_duration_setting
 from neuprim.core.compute.threads import cpu_name
@@ -149,7 +149,7 @@ def main() -> None:
     names = [name for name in SCENES if name in found]
     text = "\n\n".join(report(name, found[name]) for name in names)
     if args.docs:
-        between_markers(DOCS / "tradeoffs.md", "fronts", text)
+        between_markers(RESULT_PAGES / "tradeoffs.md", "fronts", text)
         charts = [make_chart(name, found[name], front) for front in ("speed", "size") for name in names]
         write_png_charts(PICTURE, charts, rows=2)
 

@@ -1,9 +1,11 @@
 """How well Gaussians reproduce trained primitives, for each edge and each rule of the ``gaussian-ply`` export.
 
-    python benchmarks/gaussians.py [RUN_DIR ...] [--edges 0 1 2] [--neurons 8 0] [--iterations 600] [--docs]
+    python benchmarks/gaussians.py [RUN_DIR ...] [--edges 0 1 2] [--neurons 8 0] [--iterations 600] [--record]
+    python benchmarks/gaussians.py --print [--docs]
 
 Without run directories it trains the static task's `solids`. PSNR in dB over all pixels of the test views, on the
-scene's background. --docs puts the table between the markers of docs/export.md.
+scene's background. --record writes the table to benchmarks/results/gaussians.json and docs/results/static.md; --print
+makes it from the record.
 """
 
 from __future__ import annotations
@@ -14,13 +16,15 @@ from pathlib import Path
 
 import torch
 from shared.arguments import make_parser
-from shared.tables import DOCS, Table, between_markers
+from shared.tables import RESULTS, Record, Table, publish
 
 from neuprim.config import compose
 from neuprim.core.model.edge import EDGES
 from neuprim.export.gaussian_ply import SIZES
 from neuprim.runs.export import export_run
 from neuprim.runs.run import run
+
+RECORD = RESULTS / "gaussians.json"
 
 
 def train(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
@@ -32,34 +36,46 @@ def train(folder: Path, neurons: int, edge: int, iterations: int) -> Path:
     return run(compose(words))
 
 
-def export_table(runs: Sequence[tuple[str, Path]]) -> Table:
-    table = Table("model", *(f"size={size}" for size in SIZES))
+def measure(runs: Sequence[tuple[str, Path]]) -> Record:
+    """PSNR of every run and rule, dB."""
+    rows = []
     for name, folder in runs:
         with tempfile.TemporaryDirectory() as target:
-            reports = [
-                export_run(folder, "gaussian-ply", Path(target) / f"{size}.ply", [f"size={size}"]) for size in SIZES
-            ]
-        table.row(name, *(f"{report.errors['psnr']:.1f} dB" for report in reports))
-    return table
+            reports = {
+                size: export_run(folder, "gaussian-ply", Path(target) / f"{size}.ply", [f"size={size}"])
+                for size in SIZES
+            }
+        rows.append({"model": name} | {size: report.errors["psnr"] for size, report in reports.items()})
+    return {"rows": rows}
+
+
+def document(record: Record) -> str:
+    """The text between the markers."""
+    table = Table("model", *(f"size={size}" for size in SIZES))
+    for row in record["rows"]:
+        table.row(row["model"], *(f"{row[size]:.1f} dB" for size in SIZES))
+    return str(table)
 
 
 def main() -> None:
-    parser = make_parser(__doc__, "--docs")
+    parser = make_parser(__doc__, "--record", "--docs", "--print")
     parser.add_argument("runs", type=Path, nargs="*")
     parser.add_argument("--edges", nargs="*", type=int, choices=EDGES, default=EDGES)
     parser.add_argument("--neurons", nargs="*", type=int, default=[8, 0])
     parser.add_argument("--iterations", type=int, default=600)
     args = parser.parse_args()
     torch.set_num_threads(1)
-    with tempfile.TemporaryDirectory() as folder:
-        runs = [(str(path), path) for path in args.runs] or [
-            (f"`solids`, K = {K}, edge {edge}", train(Path(folder) / f"{K}_{edge}", K, edge, args.iterations))
-            for K in args.neurons
-            for edge in args.edges
-        ]
-        table = export_table(runs)
-    if args.docs:
-        between_markers(DOCS / "export.md", "gaussians-export", str(table))
+
+    def train_and_measure() -> Record:
+        with tempfile.TemporaryDirectory() as folder:
+            runs = [(str(path), path) for path in args.runs] or [
+                (f"`solids`, K = {K}, edge {edge}", train(Path(folder) / f"{K}_{edge}", K, edge, args.iterations))
+                for K in args.neurons
+                for edge in args.edges
+            ]
+            return measure(runs)
+
+    publish(args, RECORD, "static.md", "gaussians-export", train_and_measure, document)
 
 
 if __name__ == "__main__":

@@ -14,8 +14,8 @@
               views
     runs      the static preset on NeRF-synthetic mic at 800x800 (--mic) for 60 and 140 seconds
 
---record writes benchmarks/results/gpu/DEVICE.json and the tables of docs/gpu.md, in which every recorded device has its
-own; --print makes them from what is recorded. Times are absolute, of the device named there.
+--record writes benchmarks/results/gpu/DEVICE.json and the tables of docs/results/gpu.md, in which every recorded device
+has its own; --print makes them from what is recorded. Times are absolute, of the device named there.
 """
 
 from __future__ import annotations
@@ -31,7 +31,17 @@ from shared.arguments import make_parser, require_folders
 from shared.forms import SCENES
 from shared.parity import NAMES, measure_parity
 from shared.scenes import lower, random_scene, view
-from shared.tables import DOCS, RESULTS, Columns, Record, Run, between_markers, make_table, read_record, update_record
+from shared.tables import (
+    RESULT_PAGES,
+    RESULTS,
+    Columns,
+    Record,
+    Run,
+    between_markers,
+    make_table,
+    read_record,
+    update_record,
+)
 from shared.trials import Trial, begin
 
 from neuprim.config import compose
@@ -42,7 +52,7 @@ from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderSettings, render_lowered
 from neuprim.runs.fit import prepare_training, train_to_end
 
-FOLDER, PAGE = RESULTS / "gpu", DOCS / "gpu.md"
+FOLDER, PAGE = RESULTS / "gpu", RESULT_PAGES / "gpu.md"
 FORMS = {"K=8 p=0": (8, 0), "K=2 p=2": (2, 2), "K=0 p=2": (0, 2)}
 PARTS = ("parity", "times", "kernels", "train", "runs")
 RUNS = ((60, 25_000), (140, 30_000))

@@ -2,7 +2,7 @@
 shared memory, code.
 
     python benchmarks/gpu_kernels.py [--archs 80 89 90] [--forms "K=8 p=0" ...] [--kernels forward ...] [--record |
-    --check | --from-record]
+    --check | --print [--docs]]
 
 Compiled are the kernels of K = 0, 2, 8 and 16 neurons, hard edges and p = 2, with constant colours and with colour
 networks of 8 units, those that every frame needs, and those beside frames: of training and lights. No
@@ -10,9 +10,9 @@ driver is needed. A stack of a frame's kernel means spilled registers, but for k
 neurons there; one at K <= 8 exits with status 1. Beside frames it means lists of arguments (Adam) and cosines of large
 angles (grid). "Capped" are kernels that ask for fewer registers than they could use, as more warps hide more.
 
---record        writes benchmarks/results/gpu_kernels.json and the table in docs/gpu.md
---check         compares with what is recorded there: exits with status 1 when registers, stack or shared memory have
-grown --from-record   writes the table from the file and compiles nothing
+--record   writes benchmarks/results/gpu_kernels.json and the table in docs/results/gpu.md
+--check    compares with what is recorded there: exits with status 1 when registers, stack or shared memory have grown
+--print    compiles nothing and prints the recorded table; --docs writes it
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from typing import Any
 import warp
 from shared.arguments import make_parser
 from shared.cubins import compile_kernel, read_resources
-from shared.tables import DOCS, RESULTS, Table, between_markers, make_table, read_record
+from shared.tables import RESULT_PAGES, RESULTS, Table, between_markers, make_table, read_record
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model import colours_warp
@@ -41,7 +41,7 @@ from neuprim.core.render.cuda.projection import PER_BLOCK
 from neuprim.core.train import kernels_warp
 
 RECORD = RESULTS / "gpu_kernels.json"
-PAGE = DOCS / "gpu.md"
+PAGE = RESULT_PAGES / "gpu.md"
 ARCHS = (80, 89, 90)
 EVERY, BESIDE = "every frame", "beside frames"
 NET = ", H=8"
@@ -129,7 +129,7 @@ def grown(rows: list[Row], recorded: list[Row]) -> list[str]:
 
 
 def document(record: dict[str, Any]) -> str:
-    """The table of docs/gpu.md: registers of the hot kernels, with the stack where there is any."""
+    """The table of docs/results/gpu.md: registers of the hot kernels, with the stack where there is any."""
     found = {(r["form"], r["kernel"], r["arch"]): r for r in record["kernels"]}
 
     def cell(form: str, kernel: str) -> str:
@@ -156,19 +156,21 @@ def document(record: dict[str, Any]) -> str:
 
 
 def main() -> int:
-    parser = make_parser(__doc__)
+    parser = make_parser(__doc__, "--docs")
     parser.add_argument("--archs", nargs="*", type=int, choices=ARCHS, default=list(ARCHS))
     parser.add_argument("--forms", nargs="*", choices=(*FORMS, EVERY, BESIDE), default=[*FORMS, EVERY, BESIDE])
     parser.add_argument("--kernels", nargs="*", help="of the forms, those of these names alone")
     what = parser.add_mutually_exclusive_group()
     what.add_argument("--record", action="store_true")
     what.add_argument("--check", action="store_true")
-    what.add_argument("--from-record", action="store_true")
+    what.add_argument("--print", action="store_true", dest="only_print", help="run nothing")
     args = parser.parse_args()
     if args.record and (args.kernels is not None or len(args.forms) < len(FORMS) + 2 or len(args.archs) < len(ARCHS)):
         parser.error("--record: expected every form, kernel and architecture")
-    if args.from_record:
-        between_markers(PAGE, "gpu-kernels", document(read_record(RECORD)))
+    if args.only_print:
+        text = document(read_record(RECORD))
+        if args.docs:
+            between_markers(PAGE, "gpu-kernels", text)
         return 0
     rows: list[Row] = []
     keys = ("form", "kernel", "arch", "threads", "capped", "registers", "stack", "shared", "code")

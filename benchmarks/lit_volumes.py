@@ -9,7 +9,7 @@ some frame: under a light that no training view had, under the look's own, and u
 Values are PSNR of all those pixels together, in linear light over the brightest radiance of the data with four lights.
 A frame is timed on one thread. `fire` is a folder of EmberGen's files, under the light of `smoke_fire`. Results go to
 benchmarks/results/lit_volumes.json after every run, and only what is missing is run; --docs puts the table between the
-markers of docs/dynamic.md, --print runs nothing.
+markers of docs/results/dynamic.md, --print runs nothing.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from typing import Any
 
 import torch
 from shared.arguments import make_parser, require_folders
-from shared.tables import DOCS, RESULTS, Record, Table, between_markers, group_runs, read_record, spread
+from shared.tables import RESULT_PAGES, RESULTS, Record, Table, between_markers, group_runs, read_record, spread
 from shared.trials import Trial, run_all
 
 from neuprim.core.render import render
@@ -119,7 +119,7 @@ def main() -> None:
         run_all(plan(args.scenes, args.steps, args.seeds, args.fire, args.frames), RECORD, measure, args.jobs)
     text = table(read_record(RECORD))
     if args.docs:
-        between_markers(DOCS / "dynamic.md", "lit volumes", text)
+        between_markers(RESULT_PAGES / "dynamic.md", "lit volumes", text)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 """Static scenes and relighting: quality, size and speed by training time, beside published results.
 
     python benchmarks/quality.py SCENE ... [--seconds 240 1200] [--steps 2500] [--seeds 3] [--set KEY=VALUE ...]
-    [--tune] [--lpips FILE] [--jobs 1] [--out DIR] [--record FILE] [--docs] [--readme]
+    [--tune] [--lpips FILE] [--jobs 1] [--out DIR] [--record FILE] [--docs]
 
 SCENE is the folder of a data set or the name of a built-in scene, all of one task; `SCENE,KEY=VALUE,...` has settings
 of its own, as in `solids`, `room,scene.size=400` or `DIR/cup,scene.downsample=2`. A row is a run in a directory below
@@ -10,9 +10,9 @@ computes while the model learns, or steps. --tune judges by training views that 
 in a record of its own.
 
 Rows go to benchmarks/results/TASK.json one by one, and the table to TASK.md beside it. Only what is missing is run; a
-row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of docs/static.md or
-docs/relighting.md, --readme the static rows of README_SECONDS into the README. Without SCENE nothing is run, and the
-static table is made, or that of --record. The README's picture:
+row that was interrupted goes on from its checkpoint. --docs puts the table between the markers of
+docs/results/static.md or docs/results/relighting.md.
+Without SCENE nothing is run, and the static table is made, or that of --record. The picture of mic:
 
     python docs/make_pictures.py outputs/quality/mic_800-240s-0 docs/pictures/static.png 3 400
 
@@ -34,7 +34,17 @@ from unittest.mock import patch
 
 import torch
 from shared.arguments import make_parser
-from shared.tables import DOCS, README, RESULTS, Record, Run, Table, between_markers, group_runs, read_record, spread_of
+from shared.tables import (
+    RESULT_PAGES,
+    RESULTS,
+    Record,
+    Run,
+    Table,
+    between_markers,
+    group_runs,
+    read_record,
+    spread_of,
+)
 from shared.trials import Trial, run_all
 
 from neuprim.config import compose
@@ -48,8 +58,6 @@ from neuprim.search.compress import CompressRequest, compress_run
 
 PUBLISHED = RESULTS / "published.json"
 PAPER_SIZE = "800×800"
-README_SECONDS = (240, 1200)
-README_CELLS = (0, 1, 2, 3, 4, 7, 9)  # of row_cells
 HOLD_OUT = 8
 COMPRESS_SECONDS = 30.0  # as `neuprim compress` fine-tunes unless told otherwise
 COLUMNS = ("scene", "method", "training", "primitives", "bytes", "compressed")
@@ -71,7 +79,7 @@ SCORES: dict[str, dict[str, tuple[str, int]]] = {
 }
 """Columns of each task, of metrics, with digits."""
 KEYS = (*(key for scores in SCORES.values() for key in scores), "psnr_worst", "primitives", "model_bytes")
-PAGES = {"static": DOCS / "static.md", "relight": DOCS / "relighting.md"}
+PAGES = {"static": RESULT_PAGES / "static.md", "relight": RESULT_PAGES / "relighting.md"}
 
 
 def scene_words(text: str) -> tuple[str, str, list[str]]:
@@ -205,24 +213,6 @@ def table(record: Record) -> str:
     return f"{made}\n\nOwn rows: one thread of {record['cpu']}.\n\n{sources}"
 
 
-def readme_table(record: Record) -> str:
-    """Own rows with README_SECONDS and no settings, and below them the PSNR of published ones; empty without any."""
-    budgets = [f"{seconds} s" for seconds in README_SECONDS]
-    runs = [run for run in record["trials"] if run["budget"] in budgets and not run["settings"]]
-    if not runs:
-        return ""
-    titles = (*COLUMNS[2:], *(title for title, _ in SCORES["static"].values()), "ms a frame")
-    made, published = Table("scene", *(titles[number] for number in README_CELLS)), []
-    for scene, size, rows in group_rows(runs):
-        for own in rows:
-            cells = row_cells(own)
-            made.row(f"{scene}, {size}", *(cells[number] for number in README_CELLS))
-        others = "; ".join(f"{row['method']}: {row['psnr']:.2f}" for row in published_rows(scene, size))
-        if others:
-            published.append(f"Published for {scene}, {size}, dB: {others}.")
-    return "\n\n".join([str(made), *published])
-
-
 def main() -> None:
     parser = make_parser(__doc__, "--seeds", "--jobs", "--docs")
     parser.set_defaults(jobs=1)
@@ -234,7 +224,6 @@ def main() -> None:
     parser.add_argument("--lpips", type=Path, help="weights, as metrics.lpips takes them")
     parser.add_argument("--out", type=Path, default=Path("outputs/quality"), help="folder of the runs")
     parser.add_argument("--record", type=Path, help="another record than benchmarks/results/TASK.json")
-    parser.add_argument("--readme", action="store_true", help="write the README's table")
     args = parser.parse_args()
     tasks = {scene_words(scene)[0] for scene in args.scenes} or {"static"}
     if len(tasks) > 1:
@@ -248,8 +237,6 @@ def main() -> None:
     if args.docs:
         task = record["trials"][0].get("task", "static")
         between_markers(PAGES[task], task, text)
-    if args.readme:
-        between_markers(README, "full-size", readme_table(record))
 
 
 if __name__ == "__main__":

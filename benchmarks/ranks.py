@@ -7,8 +7,8 @@ Both ranks of a torchrun hold the same trainer, in the middle of its budget, wit
 turns: together; the first one alone with the same views a step, on two threads and on one; and alone with one view a
 step. So all meet the same noise of a shared machine, and the ratios are medians of those of each round, and ratios of
 the fastest turns. `steps` trains with as many views in fewer, larger steps.
-Results go to benchmarks/results/ranks.json; --docs puts the tables between the markers of docs/scaling.md, --print only
-prints what was recorded.
+Results go to benchmarks/results/ranks.json; --docs puts the tables between the markers of docs/results/performance.md,
+--print only prints what was recorded.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from shared.arguments import make_parser
-from shared.tables import DOCS, RESULTS, Record, between_markers, make_table, read_record, spread, update_record
+from shared.tables import RESULT_PAGES, RESULTS, Record, between_markers, make_table, read_record, spread, update_record
 
 from neuprim.config import compose
 from neuprim.core.compute.threads import core_count, cpu_name
@@ -195,7 +195,7 @@ def main() -> None:
     record = read_record(RECORD)
     for name, text in (("ranks", pace_table(record)), ("larger-steps", steps_table(record["larger steps"]))):
         if args.docs:
-            between_markers(DOCS / "scaling.md", name, text)
+            between_markers(RESULT_PAGES / "performance.md", name, text)
 
 
 if __name__ == "__main__":

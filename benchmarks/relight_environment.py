@@ -2,6 +2,7 @@
 more lights.
 
     python benchmarks/relight_environment.py RUN_DIR [--lights 16 64 256] [--views N] [--record] [--picture FILE.png]
+    python benchmarks/relight_environment.py --print [--docs]
 
 - same lights: the model's image against the ray-cast sum over the very point lights that stand for the environment, so
   that only the model is wrong;
@@ -9,19 +10,21 @@ more lights.
 - distant: against 1024 lights at 1e4 units, so that the lights' number and finite distance count too;
 - lights alone: the ray caster under the few lights against the distant ones, what a perfect model would score there.
 
-PSNR of linear light clamped to 0..1, means over views of the test split. --record writes the table to
-docs/relighting.md.
+PSNR of linear light clamped to 0..1, means over views of the test split. --record writes
+benchmarks/results/relight_environment.json and the table of docs/results/relighting.md; --print makes it from the
+record.
 """
 
 from __future__ import annotations
 
+import argparse
 import math
 from pathlib import Path
 
 import numpy as np
 import torch
 from shared.arguments import make_parser
-from shared.tables import DOCS, Table, between_markers
+from shared.tables import RESULTS, Record, Table, publish
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
@@ -36,6 +39,8 @@ from neuprim.runs.open import load_dataset, load_run
 from neuprim.scenes.lit import INTENSITY, build_lit_solids, draw_lit_solids
 from neuprim.scenes.raycast import Scene
 
+RECORD = RESULTS / "relight_environment.json"
+SCORES = ("same lights", "seen lights", "distant", "lights alone")
 MANY, DISTANT = 1024, 1e4
 PIXELS = 176  # of one image in the picture
 Lights = list[dict[str, Tensor]]
@@ -82,14 +87,8 @@ def truth(scene: Scene, camera: Camera, lights: Lights, supersampling: int = 2) 
     return torch.from_numpy(total)
 
 
-def main() -> None:
-    parser = make_parser(__doc__, "--record")
-    parser.add_argument("run_dir", type=Path)
-    parser.add_argument("--lights", type=int, nargs="*", default=[16, 64, 256])
-    parser.add_argument("--views", type=int, default=3)
-    parser.add_argument("--picture", type=Path, help="environment; truth and model under 64 lights near trained ones")
-    args = parser.parse_args()
-    torch.set_num_threads(1)
+def measure(args: argparse.Namespace) -> Record:
+    """A row per environment and number of lights, and the picture if one is asked for."""
     stored = load_run(args.run_dir)
     config, model, header = stored.config, stored.model, stored.header
     facts, dataset, scene = header["data"], load_dataset(stored), Scene(build_lit_solids())
@@ -109,7 +108,7 @@ def main() -> None:
         images = [small, truth(scene, camera, lights, 3).float(), draw(View("picture", camera), lights)]
         return torch.cat([Channels(color_space="linear").display(image).clamp(0, 1) for image in images])
 
-    table = Table("environment", "lights", "same lights", "seen lights", "distant", "lights alone")
+    rows = []
     for name, radiance in environments().items():
         environment = Environment(radiance)
         distant = [
@@ -124,14 +123,40 @@ def main() -> None:
                 fair = (draw(view, seen).double(), truth(scene, view.camera, seen))
                 pairs = ((drawn, cast), fair, (drawn, reference), (cast, reference))
                 scores.append([psnr(a.clamp(0, 1), b.clamp(0, 1)) for a, b in pairs])
-            table.row(name, len(lights), *(f"{score:.2f} dB" for score in np.mean(scores, axis=0)))
+            means = dict(zip(SCORES, np.mean(scores, axis=0).tolist(), strict=True))
+            rows.append({"environment": name, "lights": len(lights), **means})
     if args.picture:
         write_png(args.picture, torch.cat([picture(radiance) for radiance in environments().values()], 1))
-    if args.record:
-        camera, seconds = views[0].camera, header["train_seconds"]
-        run = f"{model.count} primitives, {seconds:.0f} s of training."
-        text = f"{table}\n\n{len(views)} test views of {camera.width}x{camera.height}, {run}"
-        between_markers(DOCS / "relighting.md", "relight-environment", text)
+    return {
+        "views": len(views),
+        "size": [views[0].camera.width, views[0].camera.height],
+        "primitives": model.count,
+        "train_seconds": header["train_seconds"],
+        "rows": rows,
+    }
+
+
+def document(record: Record) -> str:
+    """The text between the markers."""
+    table = Table("environment", "lights", *SCORES)
+    for row in record["rows"]:
+        table.row(row["environment"], row["lights"], *(f"{row[key]:.2f} dB" for key in SCORES))
+    size = "x".join(map(str, record["size"]))
+    run = f"{record['primitives']} primitives, {record['train_seconds']:.0f} s of training."
+    return f"{table}\n\n{record['views']} test views of {size}, {run}"
+
+
+def main() -> None:
+    parser = make_parser(__doc__, "--record", "--docs", "--print")
+    parser.add_argument("run_dir", type=Path, nargs="?")
+    parser.add_argument("--lights", type=int, nargs="*", default=[16, 64, 256])
+    parser.add_argument("--views", type=int, default=3)
+    parser.add_argument("--picture", type=Path, help="environment; truth and model under 64 lights near trained ones")
+    args = parser.parse_args()
+    if args.run_dir is None and not args.only_print:
+        parser.error("found no RUN_DIR; expected the directory of a run, or --print")
+    torch.set_num_threads(1)
+    publish(args, RECORD, "relighting.md", "relight-environment", lambda: measure(args), document)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,13 @@
 """Speed of the CPU backend: time per evaluated lane, lanes per true hit, arithmetic rate and memory.
 
     python benchmarks/render.py [--scenes 5000x400 20000x400 20000x800] [--threads 1 2] [--rounds 9] [--record]
+    python benchmarks/render.py --print [--docs]
     python benchmarks/render.py --against CHECKOUT [--scenes 20000x400] [--threads 1] [--rounds 9] [--turns 5]
 
 Draws random scenes, with preparation and binning. A step is forward, backward and Adam on all parameters; three
 colours, no depth. Flops are counted by one rule: 420 per evaluated lane forward, 1,100 backward (K = 8). --record
-writes the result to benchmarks/results/render.json and docs/performance.md.
+writes the result to benchmarks/results/render.json and docs/results/performance.md; --print makes the table from the
+record.
 
 --against compares with another commit (`git worktree add CHECKOUT COMMIT`): processes of both checkouts run their own
 copy of this script in turns, and the ratio of the fastest times is printed.
@@ -26,7 +28,7 @@ import torch
 from numba import njit
 from shared.arguments import make_parser
 from shared.scenes import fastest, lower, random_scene, view
-from shared.tables import PERFORMANCE, RESULTS, ROOT, Table, between_markers, make_table, update_record
+from shared.tables import RESULTS, ROOT, Record, Table, make_table, publish
 
 from neuprim.core.cameras import Camera
 from neuprim.core.compute.threads import cpu_name
@@ -37,6 +39,7 @@ from neuprim.core.render import RenderSettings, layout, render_lowered
 from neuprim.core.render.cpu.layout import gradient_width, row_width
 from neuprim.core.train.optimizer import RowAdam
 
+RECORD = RESULTS / "render.json"
 FLOPS = {"forward": 420, "backward": 1100}
 MEMORY = (
     f"Per primitive {4 * row_width(8) + 4 * layout.SPAN_WIDTH} bytes of rows and spans and per pair 8 bytes of lists; "
@@ -143,6 +146,11 @@ COLUMNS: dict[str, Callable[[dict[str, Any]], object]] = {
 }
 
 
+def document(record: Record) -> str:
+    """The text between the markers."""
+    return f"{make_table(COLUMNS, record['rows'])}\n\n{record['cpu']}. {MEMORY}"
+
+
 def times_of(checkout: Path, args: argparse.Namespace) -> dict[tuple[str, ...], float]:
     """Milliseconds by scene, threads and pass, as a checkout's own script prints them."""
     options = ["--rate", args.rate, "--rounds", args.rounds, "--scenes", *args.scenes, "--threads", *args.threads]
@@ -168,7 +176,7 @@ def compare(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = make_parser(__doc__, "--rounds", "--record")
+    parser = make_parser(__doc__, "--rounds", "--record", "--docs", "--print")
     parser.add_argument("--scenes", nargs="*", default=["5000x400", "20000x400", "20000x800"], help="PRIMITIVESxSIZE")
     parser.add_argument("--threads", nargs="*", type=int, default=[1, 2])
     parser.add_argument("--rate", type=float, default=4.0, help="largest phase rate per axis, radians per m")
@@ -180,11 +188,14 @@ def main() -> None:
         compare(args)
         return
     print(MEMORY)
-    rows: list[dict[str, Any]] = []
-    table = make_table(COLUMNS, (rows.append(row) or row for row in measure(args)))
-    if args.record:
-        update_record(RESULTS / "render.json", cpu=cpu_name(), rows=rows)
-        between_markers(PERFORMANCE, "render", f"{table}\n\n{cpu_name()}. {MEMORY}")
+    publish(
+        args,
+        RECORD,
+        "performance.md",
+        "render",
+        lambda: {"cpu": cpu_name(), "rows": list(measure(args))},
+        document,
+    )
 
 
 if __name__ == "__main__":

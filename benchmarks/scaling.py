@@ -1,11 +1,13 @@
 """Cost of a frame against primitives, pixels and overlap; peak memory of a million primitives.
 
     python benchmarks/scaling.py [--most 1000000] [--threads 0] [--record]
+    python benchmarks/scaling.py --print [--docs]
 
 Random scenes whose primitives shrink as they multiply, so that a ray meets about the same number of them ("overlap":
 how many times they would cover the unit cube's face). Every point is the fastest of a few frames. Times are of this
-machine; the shape of the curves is what travels. --record writes benchmarks/results/scaling.json, docs/performance.md
-and docs/pictures/scaling.png.
+machine; the shape of the curves is what travels. --record writes benchmarks/results/scaling.json and
+docs/results/performance.md, --print makes the tables from the record; both, with --docs, draw
+docs/pictures/scaling.png.
 """
 
 from __future__ import annotations
@@ -21,13 +23,14 @@ from typing import Any
 import torch
 from shared.arguments import make_parser
 from shared.scenes import fastest, lower, random_scene, view
-from shared.tables import DOCS, PERFORMANCE, RESULTS, Run, Table, between_markers, make_table, update_record
+from shared.tables import DOCS, RESULTS, Record, Run, Table, make_table, publish
 
 from neuprim.core.compute.threads import core_count, cpu_name
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.report.charts import LARGE, Chart, ChartPoints, write_png_charts
 
+RECORD = RESULTS / "scaling.json"
 PICTURE = DOCS / "pictures" / "scaling.png"
 MEMORY_BOUND = 4e9
 SERIES = {
@@ -98,8 +101,30 @@ COLUMNS = {
 }
 
 
+def measure_all(args: argparse.Namespace) -> Record:
+    """Every point, and the peak memory of small and large scenes."""
+    rows = [row for series in SERIES for row in measure(series, args)]
+    peaks = {
+        f"{count} primitives at 800x800, {'forward and backward' if b else 'forward'}": peak_memory(
+            count, b, args.threads
+        )
+        for count in (1000, args.most)
+        for b in (False, True)
+    }
+    return {"cpu": cpu_name(), "threads": core_count(), "rows": rows, "peak_bytes": peaks}
+
+
+def document(record: Record) -> str:
+    """The text between the markers."""
+    memories = Table("peak memory of a process that draws", "GB")
+    for name, peak in record["peak_bytes"].items():
+        memories.row(name, f"{peak / 1e9:.2f}")
+    where = f"Times on {record['threads']} threads of {record['cpu']}."
+    return f"{memories}\n\n{where}\n\n{make_table(COLUMNS, record['rows'])}"
+
+
 def main() -> None:
-    parser = make_parser(__doc__, "--threads", "--record")
+    parser = make_parser(__doc__, "--threads", "--record", "--docs", "--print")
     parser.add_argument("--most", type=int, default=1_000_000, help="largest number of primitives")
     parser.add_argument("--one", nargs=2, type=int, metavar=("COUNT", "BACKWARD"), help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -108,24 +133,10 @@ def main() -> None:
         render_frame(lower(random_scene(args.one[0])), 800, args.threads, bool(args.one[1]))
         print(own_peak())
         return
-    rows: list[Run] = []
-    table = make_table(COLUMNS, (rows.append(row) or row for series in SERIES for row in measure(series, args)))
-    peaks = {
-        f"{count} primitives at 800x800, {'forward and backward' if b else 'forward'}": peak_memory(
-            count, b, args.threads
-        )
-        for count in (1000, args.most)
-        for b in (False, True)
-    }
-    memories = Table("peak memory of a process that draws", "GB")
-    for name, peak in peaks.items():
-        memories.row(name, f"{peak / 1e9:.2f}")
-    if args.record:
-        update_record(RESULTS / "scaling.json", rows=rows, peak_bytes=peaks)
-        write_png_charts(PICTURE, [make_chart(series, rows) for series in SERIES])
-        text = f"{memories}\n\nTimes on {core_count()} threads of {cpu_name()}.\n\n{table}"
-        between_markers(PERFORMANCE, "scaling", text)
-    worst = max(peaks.values())
+    record = publish(args, RECORD, "performance.md", "scaling", lambda: measure_all(args), document)
+    if args.record or args.docs:
+        write_png_charts(PICTURE, [make_chart(series, record["rows"]) for series in SERIES])
+    worst = max(record["peak_bytes"].values())
     if worst > MEMORY_BOUND:
         raise SystemExit(f"peak memory {worst / 1e9:.2f} GB exceeds {MEMORY_BOUND / 1e9:g} GB")
 

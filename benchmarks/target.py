@@ -16,7 +16,8 @@ tests/search/test_size_search.py replays the decisions of a search on the record
 
 It is a reduced comparison: half of the presets' views, one thread, some minutes of one core a search. Trainings are
 kept in --work, so that a benchmark that is cut short goes on; --grid trains the grid alone. Results go to
-benchmarks/results/target.json; --docs puts the tables between the markers of docs/tradeoffs.md, --print runs nothing.
+benchmarks/results/target.json; --docs puts the tables between the markers of docs/results/tradeoffs.md, --print runs
+nothing.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ from pathlib import Path
 from typing import Any
 
 from shared.arguments import make_parser, require_folders
-from shared.tables import DOCS, RESULTS, Run, Table, between_markers, make_table, read_record, update_record
+from shared.tables import RESULT_PAGES, RESULTS, Run, Table, between_markers, make_table, read_record, update_record
 
 from neuprim.config import Job, compose, load_config_task
 from neuprim.config.command_settings import SearchTarget
@@ -99,7 +100,7 @@ def main() -> None:
     found = read_record(RECORD)
     texts = [report(name, found[name]) for name in SCENES if name in found]
     if args.docs:
-        between_markers(DOCS / "tradeoffs.md", "target", "\n\n".join(texts))
+        between_markers(RESULT_PAGES / "tradeoffs.md", "target", "\n\n".join(texts))
 
 
 def words_of(name: str, data: Sequence[str], out: Path) -> list[str]:

@@ -16,7 +16,7 @@ trainings of `solids`, `smoke_fire` and `lit_solids` begin: the median of 60 fra
 and while time or the light moves, too.
 
 Needs a Chromium and the package playwright. Results go to benchmarks/results/webpage.json, by row and scene; --docs
-puts both tables into docs/export.md.
+puts both tables into docs/results/performance.md.
 """
 
 from __future__ import annotations
@@ -32,7 +32,17 @@ from typing import Any
 
 import torch
 from shared.arguments import make_parser
-from shared.tables import DOCS, RESULTS, ROOT, Run, Table, between_markers, make_table, read_record, update_record
+from shared.tables import (
+    RESULT_PAGES,
+    RESULTS,
+    ROOT,
+    Run,
+    Table,
+    between_markers,
+    make_table,
+    read_record,
+    update_record,
+)
 from torch import Tensor
 
 from neuprim.config import compose
@@ -235,7 +245,7 @@ def main() -> None:
     tables = {"webpage": page_table(record["runs"]), "webpage-prepare": prepare_table(record["prepare"])}
     if args.docs:
         for marker, table in tables.items():
-            between_markers(DOCS / "export.md", marker, str(table))
+            between_markers(RESULT_PAGES / "performance.md", marker, str(table))
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""The pictures of docs/inspection.md, from a run of ``scene=vdb`` or a built-in volume scene.
+"""The pictures of the density in docs/viewer.md, from a run of ``scene=vdb`` or a built-in volume scene.
 
     python docs/make_inspection_pictures.py RUN_DIR [AGAINST] [TIME]
 
@@ -17,10 +17,7 @@ from neuprim.runs.inspect import InspectRequest, inspect_run
 
 FOLDER = Path(__file__).parent / "pictures"
 PICTURES = {
-    "volume": (["volume"], True, (960, 440)),
-    "isosurface": (["isosurface"], True, (960, 440)),
     "slices": (["slices"], True, (960, 440)),
-    "difference": (["difference"], True, (560, 480)),
     "primitives": (["primitives", "primitive"], False, (960, 440)),
 }
 """Name of the picture -> views, whether beside the truth, size."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import json
 import statistics
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -11,8 +12,9 @@ from typing import Any
 ROOT = Path(__file__).parents[2]
 DOCS = ROOT / "docs"
 README = ROOT / "README.md"
-PERFORMANCE = DOCS / "performance.md"
 RESULTS = ROOT / "benchmarks" / "results"
+RESULT_PAGES = DOCS / "results"
+"""Records, and the pages of the site that show them."""
 
 Record = dict[str, Any]
 Run = Mapping[str, Any]
@@ -45,6 +47,28 @@ def between_markers(page: Path, name: str, text: str) -> None:
     head, rest = page.read_text().split(first, 1)
     _, tail = rest.split(last, 1)
     page.write_text(f"{head}{first}\n{text.rstrip()}\n{last}{tail}")
+
+
+def publish(
+    args: argparse.Namespace,
+    path: Path,
+    page: str,
+    marker: str,
+    measure: Callable[[], Record],
+    document: Callable[[Record], str],
+) -> Record:
+    """Measure, or with --print read the record at ``path``, print ``document`` of it, and return it.
+
+    --record stores what was measured. The text goes between the markers of docs/results/``page`` with --record, and
+    with --print --docs.
+    """
+    record = read_record(path) if args.only_print else measure()
+    text = document(record)
+    if args.record and not args.only_print:
+        update_record(path, **record)
+    if args.record or (args.only_print and args.docs):
+        between_markers(RESULT_PAGES / page, marker, text)
+    return record
 
 
 class Table:

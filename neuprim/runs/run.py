@@ -44,7 +44,7 @@ CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
 
 JOINT_SHARE = 0.2
 """Share of the budget in which the joined model is trained as one, so that primitives on both sides of a boundary adapt
-to each other. More of it makes the result worse (docs/dynamic.md)."""
+to each other. More of it makes the result worse."""
 
 _MIN_PRIMITIVES = 8
 """Primitives of a chunk, at least: their sizes follow from the distances between them."""

@@ -5,8 +5,11 @@ from __future__ import annotations
 import json
 import re
 import shutil
+import sys
 import tomllib
 from collections.abc import Callable
+from dataclasses import replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +26,7 @@ from neuprim.config.command_settings import (
     take_viewer_overrides,
 )
 from neuprim.config.overrides import drop_output_overrides
+from neuprim.conformance import named_checks
 from neuprim.core.cameras.camera_files import read_cameras
 from neuprim.core.conditions import read_conditions, split_conditions
 from neuprim.core.data.dataset_check import check_dataset_views
@@ -31,21 +35,20 @@ from neuprim.core.io.images import write_png
 from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.task import SceneContext
+from neuprim.plugins.new_task import write_plugin_package
 from neuprim.plugins.registry import EXPORTERS, TASKS
 from neuprim.runs.run import run
 from tests.docs.pages import PAGES, ROOT, Block, blocks, commands, name_of
 
-NOT_RUN: dict[str, int] = {"docs/data_formats.md": 1}
+NOT_RUN: dict[str, int] = {"docs/data_formats.md": 1, "docs/static.md": 1}
 """Page -> how many of its Python and shell blocks carry a comment ``<!-- not run: reason -->``."""
 
 EVERY = [block for page in PAGES for block in blocks(page)]
 PYTHON = [page for page in PAGES if any(b.language == "python" and b.skipped is None for b in blocks(page))]
 SHELL = [block for block in EVERY if block.language == "sh" and block.skipped is None]
 OF_THE_READER = {
-    "docs/plugins.md": {
-        *("task=glow", "scene=ball", "train.loss=charbonnier", "task.options.width=0.05"),
-        *("task=neuprim-spectral:static", "scene=neuprim-spectral:ball", "train.loss=my-losses:photometric"),
-    }
+    "docs/plugins.md": {"task=glow", "--dimmer", "0:1:60"},
+    "docs/plugin_reference.md": {"scene=ball", "train.loss=charbonnier", "task.options.width=0.05"},
 }
 """Page -> words of its commands that name what its reader writes; they are left out, the rest of the command is
 checked."""
@@ -84,6 +87,19 @@ def with_volumes(static_run: Path) -> None:
         write_vdb(path, [grid])
 
 
+def with_run_and_volumes(static_run: Path) -> None:
+    with_run(static_run)
+    with_volumes(static_run)
+
+
+def with_plugin_package(static_run: Path) -> None:
+    """Make the package of ``neuprim new-task glow`` importable."""
+    folder = static_run.parent / "neuprim-glow"
+    if not folder.exists():
+        write_plugin_package("glow", folder)
+        sys.path.insert(0, str(folder))
+
+
 def has_copy(names: dict[str, Any]) -> None:
     assert Path("copy.vdb").stat().st_size > 1000 and names["dense"].shape == (64, 64, 64) and len(names["frames"]) == 2
 
@@ -117,14 +133,28 @@ def has_a_loader_of_photographs(names: dict[str, Any]) -> None:
     assert 0 < len(read.initial_points(50, torch.Generator()).means) <= 50
 
 
-PREPARE: dict[str, Callable[[Path], None]] = {"docs/data_formats.md": with_run, "docs/vdb.md": with_volumes}
+def has_plugin_objects(names: dict[str, Any]) -> None:
+    has_a_loader_of_photographs(names)
+    made = import_module("neuprim_glow")
+    waves = names["Waves"]
+    fields = {"Waves": waves, "PlainColour": made.PlainColour}
+    task = replace(made.TASK, build=lambda model, data: (waves(), made.PlainColour(data.channels)), fields=fields)
+    for check in ("fields", "parameters", "integral", "scaling", "split"):
+        named_checks(task)[check]()
+
+
+PREPARE: dict[str, Callable[[Path], None]] = {
+    "docs/data_formats.md": with_run_and_volumes,
+    "docs/plugins.md": with_plugin_package,
+    "docs/plugin_reference.md": with_plugin_package,
+}
 """Page -> puts the files that its blocks talk about into the working directory."""
 
 AFTER: dict[str, Callable[[dict[str, Any]], None]] = {
-    "docs/vdb.md": has_copy,
+    "docs/data_formats.md": has_copy,
     "docs/rasterize.md": has_frames,
     "docs/getting_started.md": has_same_metrics,
-    "docs/plugins.md": has_a_loader_of_photographs,
+    "docs/plugin_reference.md": has_plugin_objects,
 }
 """Page -> checks what its blocks left behind."""
 

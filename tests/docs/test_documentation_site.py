@@ -35,11 +35,11 @@ def test_files_beside_the_pages_come_along(hooks: Any) -> None:
 
     config = load_config(str(ROOT / "mkdocs.yml"))
     files = Files([])
-    text = "[a](../examples/train_your_own.py) [b](../CONTRIBUTING.md) [c](../no.md) [d](vdb.md)"
+    text = "[a](../examples/train_your_own.py) [b](../CONTRIBUTING.md) [c](../no.md) [d](dynamic.md)"
     changed = hooks.on_page_markdown(text, page("rasterize.md"), config, files)
-    assert changed == "[a](examples/train_your_own.py) [b](contributing.md) [c](../no.md) [d](vdb.md)"
+    assert changed == "[a](examples/train_your_own.py) [b](contributing.md) [c](../no.md) [d](dynamic.md)"
     assert [file.src_uri for file in files] == ["examples/train_your_own.py"]
-    assert hooks.on_page_markdown("[d](../vdb.md)", page("api/vdb.md"), config, files) == "[d](../vdb.md)"
+    assert hooks.on_page_markdown("[d](../dynamic.md)", page("api/vdb.md"), config, files) == "[d](../dynamic.md)"
     changes = hooks.on_page_markdown("", page("changelog.md"), config, files)
     assert "](relighting.md)" in changes and "](docs/" not in changes
     assert "](contributing.md)" in changes and "](CONTRIBUTING.md)" not in changes

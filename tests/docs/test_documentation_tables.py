@@ -1,4 +1,4 @@
-"""Tables of numbers in README and on the site are what the benchmarks recorded, and the README stays a page."""
+"""Tables of numbers in README and on the site are what the benchmarks recorded; README and site stay short."""
 
 from __future__ import annotations
 
@@ -12,9 +12,11 @@ from typing import Any
 
 import pytest
 
-from tests.docs.pages import ROOT, prose
+from tests.docs.pages import ROOT, name_of, prose
+from tests.numerics.extremes.regions import REGIONS
 
 Load = Callable[[str], ModuleType]
+MARKER = re.compile(r"^<!-- (?!/)(.+) -->$", re.MULTILINE)
 
 
 @pytest.fixture
@@ -23,6 +25,13 @@ def load(monkeypatch: pytest.MonkeyPatch) -> Load:
     monkeypatch.syspath_prepend(str(ROOT / "benchmarks"))
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     return importlib.import_module
+
+
+@pytest.fixture
+def count_words(monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    monkeypatch.syspath_prepend(str(ROOT / "docs"))
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)
+    return importlib.import_module("count_words")
 
 
 def between(page: str, name: str) -> str:
@@ -58,41 +67,52 @@ def reports(script: ModuleType) -> str:
 
 TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
     "results": ("README.md", "readme", lambda s: s.results_table()),
-    "budgets": ("docs/budgets.md", "budget", budgets),
-    "static": ("docs/static.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "static.json"))),
-    "full-size": ("README.md", "quality", lambda s: s.readme_table(s.read_record(s.RESULTS / "static.json"))),
-    "relight": ("docs/relighting.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "relight.json"))),
+    "budgets": ("docs/results/budgets.md", "budget", budgets),
+    "static": ("docs/results/static.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "static.json"))),
+    "relight": ("docs/results/relighting.md", "quality", lambda s: s.table(s.read_record(s.RESULTS / "relight.json"))),
     **{
-        name: ("docs/dynamic.md", "dynamic_quality", lambda s, name=name: s.make_tables(record_of(s))[name])
+        name: ("docs/results/dynamic.md", "dynamic_quality", lambda s, name=name: s.make_tables(record_of(s))[name])
         for name in ("dynamic-quality", "dynamic-equations", "dynamic-control")
     },
-    "webpage": ("docs/export.md", "webpage", lambda s: s.page_table(record_of(s)["runs"])),
-    "webpage-prepare": ("docs/export.md", "webpage", lambda s: s.prepare_table(record_of(s)["prepare"])),
-    "lit volumes": ("docs/dynamic.md", "lit_volumes", lambda s: s.table(record_of(s))),
-    "capture": ("docs/capture.md", "capture", lambda s: s.tables(record_of(s))),
-    "fronts": ("docs/tradeoffs.md", "fronts", reports),
-    "target": ("docs/tradeoffs.md", "target", reports),
-    "effort": ("docs/tradeoffs.md", "effort", effort),
+    "webpage": ("docs/results/performance.md", "webpage", lambda s: s.page_table(record_of(s)["runs"])),
+    "webpage-prepare": ("docs/results/performance.md", "webpage", lambda s: s.prepare_table(record_of(s)["prepare"])),
+    "lit volumes": ("docs/results/dynamic.md", "lit_volumes", lambda s: s.table(record_of(s))),
+    "capture": ("docs/results/relighting.md", "capture", lambda s: s.tables(record_of(s))),
+    "fronts": ("docs/results/tradeoffs.md", "fronts", reports),
+    "target": ("docs/results/tradeoffs.md", "target", reports),
+    "effort": ("docs/results/tradeoffs.md", "effort", effort),
     **{
         f"effort-{task}": (
-            "docs/tradeoffs.md",
+            "docs/results/tradeoffs.md",
             "effort",
             lambda s, task=task: s.table_of_views(s.levels_of_views(task), task),
         )
         for task in ("static", "relight")
     },
-    "expressivity": ("docs/expressivity.md", "expressivity", lambda s: s.forms_table(record_of(s))),
+    "expressivity": ("docs/results/expressivity.md", "expressivity", lambda s: s.forms_table(record_of(s))),
     "expressivity-gaussian": (
-        "docs/expressivity.md",
+        "docs/results/expressivity.md",
         "expressivity",
         lambda s: s.gaussian_table(record_of(s)["trials"]),
     ),
     **{
-        name: ("docs/gpu.md", "gpu", lambda s, name=name: s.make_tables(s.read_records())[name])
+        name: ("docs/results/gpu.md", "gpu", lambda s, name=name: s.make_tables(s.read_records())[name])
         for name in ("gpu-parity", "gpu-times", "gpu-training", "gpu-runs")
     },
-    "ranks": ("docs/scaling.md", "ranks", lambda s: s.pace_table(record_of(s))),
-    "larger-steps": ("docs/scaling.md", "ranks", lambda s: s.steps_table(record_of(s)["larger steps"])),
+    "ranks": ("docs/results/performance.md", "ranks", lambda s: s.pace_table(record_of(s))),
+    **{
+        name: ("docs/results/performance.md", name, lambda s: s.document(record_of(s)))
+        for name in ("render", "edges", "scaling", "sorting")
+    },
+    "relight-environment": (
+        "docs/results/relighting.md",
+        "relight_environment",
+        lambda s: s.document(record_of(s)),
+    ),
+    "gaussians-export": ("docs/results/static.md", "gaussians", lambda s: s.document(record_of(s))),
+    "gpu-kernels": ("docs/results/gpu.md", "gpu_kernels", lambda s: s.document(record_of(s))),
+    "limits": ("docs/results/numerics.md", "numerics", lambda s: s.describe(s.read_rows())),
+    "larger-steps": ("docs/results/performance.md", "ranks", lambda s: s.steps_table(record_of(s)["larger steps"])),
 }
 """Markers -> their page, the script, and what it makes of its record."""
 
@@ -100,7 +120,30 @@ TABLES: dict[str, tuple[str, str, Callable[[Any], object]]] = {
 @pytest.mark.parametrize("name", TABLES)
 def test_tables_show_what_was_recorded(name: str, load: Load) -> None:
     page, script, make = TABLES[name]
+    if script == "gpu_kernels":
+        pytest.importorskip("warp")
     assert between(page, name) == str(make(load(script)))
+
+
+def test_every_table_of_the_results_is_compared() -> None:
+    pages = sorted((ROOT / "docs" / "results").glob("*.md"))
+    shown = {(name_of(page), marker) for page in pages for marker in MARKER.findall(page.read_text(encoding="utf-8"))}
+    assert len(pages) == 9 and shown == {(page, name) for name, (page, *_) in TABLES.items() if page != "README.md"}
+
+
+def test_every_region_is_recorded(load: Load) -> None:
+    rows = load("numerics").read_rows()
+    found = {(row["region"], row["backend"], row["precision"], int(row["edge"])) for row in rows}
+    backends = {row[1:3] for row in found}
+    assert found == {(r.name, *backend, edge) for r in REGIONS for backend in backends for edge in r.edges}
+
+
+def test_hand_written_words_are_counted(count_words: ModuleType) -> None:
+    text = "# Two words\n\n<!-- table -->\n| a | b |\n<!-- /table -->\n\n| c | d |\n\nthree more words\n"
+    assert count_words.hand_written(text, tables=True) == 11 and count_words.hand_written(text, tables=False) == 6
+    counts = count_words.count()
+    assert "README.md" in counts and "docs/results/static.md" in counts
+    assert not any(page.startswith("docs/api/") for page in counts)
 
 
 def test_the_readme_is_one_page_that_says_what_is_generated() -> None:

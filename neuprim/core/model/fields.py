@@ -137,8 +137,8 @@ class Field(ABC):
         return dict(params)
 
     def script(self) -> str | None:
-        """JavaScript that folds conditions into the closed form, for web pages (docs/plugins.md); None: not shown
-        there."""
+        """JavaScript that folds conditions into the closed form, for web pages (docs/plugin_reference.md); None: not
+        shown there."""
         return None
 
 

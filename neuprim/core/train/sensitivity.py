@@ -3,7 +3,7 @@
 To first order an image changes by J delta when numbers change by delta. For random signs z per pixel and channel, the
 mean of (z . J delta)^2 is the sum of squares |J delta|^2 (Hutchinson 1990), and z . J is what a backward pass gives. A
 whole primitive's part in a pixel is its weight w = alpha T times how much its colour differs from what is behind it.
-Its sum of w^2 predicts the loss better than its sum of w (docs/tradeoffs.md).
+Its sum of w^2 predicts the loss better than its sum of w.
 """
 
 from __future__ import annotations

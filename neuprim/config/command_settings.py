@@ -12,6 +12,8 @@ from neuprim.config.overrides import take_settings
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import Range, format_setting_value, nonempty_text, validate_fields, validate_value
 
+__all__ = ["LauncherSettings", "SearchTarget", "ViewerSettings"]
+
 LOOPBACK = "127.0.0.1"
 LauncherName = Literal["inline", "processes", "ray", "slurm"]
 LAUNCHERS: tuple[str, ...] = get_args(LauncherName)
@@ -24,12 +26,15 @@ class LauncherSettings:
     """Where runs work, and how many at once: ``launcher=NAME launcher.KEY=VALUE``.
 
     Attributes:
-        workers: runs at once; None: as many as there are, and as the cores of this machine or the cluster allow.
-        threads: of each run; None shares the cores.
+        name: "inline" (this process, one after the other), "processes" (on this machine), "ray" or "slurm".
+        workers: runs at the same time; null: as many as there are, and as the cores of this machine or the cluster
+            allow.
+        threads: threads of each run; null shares the cores.
         retries: how often a run continues from its checkpoint after its worker died.
-        address: of Ray, as ``ray.init`` takes it; of Slurm, submitit's executor ("slurm" or "local"). None: the Ray of
-            ``RAY_ADDRESS``, else one on this machine; Slurm.
-        options: for the engine: Ray's options of a task, such as ``num_gpus``; submitit's, such as ``slurm_partition``.
+        address: address of Ray, as ``ray.init`` takes it; for Slurm the executor of submitit, "slurm" or "local". null:
+            the Ray of ``RAY_ADDRESS``, else one on this machine; Slurm.
+        options: options of the engine: of a Ray task, such as ``num_gpus``, or of submitit, such as
+            ``slurm_partition``.
     """
 
     name: LauncherName = "inline"
@@ -43,18 +48,18 @@ class LauncherSettings:
         validate_fields(self, "launcher")
 
     def given_settings(self) -> dict[str, Any]:
-        """Name -> value of what differs from the defaults, and the launcher's own name."""
+        """Return the settings that differ from the defaults, and the name."""
         values, default = dataclasses.asdict(self), dataclasses.asdict(LauncherSettings())
         return {name: value for name, value in values.items() if name == "name" or value != default[name]}
 
 
 @dataclass(frozen=True)
 class ViewerSettings:
-    """Where the live viewer of a training listens: ``viewer=true viewer.port=8080``.
+    """Show a training in the browser: ``viewer=true viewer.port=8080``; a host or port alone does so, too.
 
     Attributes:
-        host: an address of this machine; the default is reached from this machine alone.
-        port: 0 for any that is free.
+        host: address of this machine to listen on; only this machine can reach the default.
+        port: port of the page; 0 for any that is free.
     """
 
     host: Annotated[str, nonempty_text("an address of this machine")] = LOOPBACK
@@ -68,13 +73,14 @@ class ViewerSettings:
 class SearchTarget:
     """What a model is to reach: ``target.psnr=30``.
 
-    With ``psnr`` or ``ssim``, or both, the smallest model that has them is wanted, and ``megabytes`` and ``fps`` are
-    limits; without, the best model within the limits is.
+    With ``psnr`` or ``ssim``, or both, the result is the smallest model that reaches them, and ``megabytes`` and
+    ``fps`` are limits; without, it is the best model within the limits.
 
     Attributes:
-        psnr, ssim: means over views; dB.
-        megabytes: at most; millions of bytes of the compressed model, ``model.neuprim``.
-        fps: at least; frames per second on this machine, at the size of the views.
+        psnr: PSNR to reach, mean over views, dB.
+        ssim: SSIM to reach, mean over views.
+        megabytes: largest size of the compressed model, ``model.neuprim``, in millions of bytes.
+        fps: smallest number of frames per second on this machine, at the size of the views.
     """
 
     psnr: Annotated[float, Range(above=0, at_most=100, says="decibels, above 0 and at most 100")] | None = None
@@ -83,12 +89,12 @@ class SearchTarget:
     fps: Annotated[float, Range(above=0, says="a positive number of frames per second")] | None = None
 
     def given_settings(self) -> dict[str, float]:
-        """Name -> value of what was asked for."""
+        """Return the targets and limits that are set, by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     @property
     def quality(self) -> dict[str, float]:
-        """Name -> value of the measures of quality among them."""
+        """The targets of quality that are set, by name."""
         return {name: value for name, value in self.given_settings().items() if name in ("psnr", "ssim")}
 
     def __str__(self) -> str:

@@ -9,36 +9,40 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.validation import Range, nonempty_text, validate_fields
 
 SortOrder = Literal["center", "entry"]
+__all__ = ["MetricsSettings", "RenderSettings"]
+
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 
 @dataclass(frozen=True)
 class RenderSettings:
-    """How a frame is drawn; part of a run's configuration as ``renderer``.
+    """How images are rendered; part of a run's configuration as ``renderer``.
 
     Attributes:
-        backend: a name of the table :mod:`neuprim.core.render.backends`: "reference" (float64 torch, the oracle), "cpu"
-            (numba), ...; or "auto", the fastest that can run the model.
-        device: where a run keeps the model, the optimiser's state and the images it compares: "cpu", "cuda" (refused
-            where there is no NVIDIA GPU), or "auto": a GPU with a backend that draws the model, else the CPU. Files are
-            the same either way: a run begun on one goes on on the other.
-        sort: what is composited front to back. "center": whole primitives by camera-z of their centres, one order for
-            all pixels. "entry": the chords of each pixel by camera-z of where the ray enters them, those cut by the
-            near plane first, and by their centres where entries are equal; no popping when centres swap, but slower.
-        samples: rays per pixel side, on a regular grid inside the pixel, averaged: 1 draws through pixel centres, n
-            costs n^2.
-        alpha_max: opacity clamp of one primitive; at most 0.9999, as the backward pass divides by 1 - alpha.
-        alpha_min: a ray-primitive pair fainter than this is skipped.
-        transmittance_min: a ray stops after the primitive that takes its transmittance below this.
-        near: camera-z of the near plane, scene units; chords are cut there. Ray distance for a ``RayCamera``, which has
-            no z plane. "auto", the default of a run: 1/400 of the median depth at which training cameras see the
-            starting points, and at most a tenth of the least; decided when training begins, and recorded. Without a
-            training it follows from the primitives and each camera.
-        depth_floor: lower bound on D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette,
-            where float32 knows D to about 3e-7. At 1e-4 they keep three digits, and one chord in ten thousand is
+        backend: "auto" (the fastest that can render the model), "reference" (float64 torch), "cpu" (numba) or another
+            name that ``neuprim doctor`` lists.
+        device: where a run keeps the model, the state of the optimiser and its images: "cpu", "cuda" (refused without
+            an NVIDIA GPU) or "auto" (a GPU if a backend can render the model there, else the CPU). Files do not depend
+            on it: a run begun on one device can continue on the other.
+        sort: order of compositing, front to back. "center": whole primitives by the camera-z of their centres, one
+            order for all pixels. "entry": in every pixel by the camera-z at which the ray enters, first the primitives
+            that the near plane cuts, equal ones by their centres; slower, but primitives do not pop when their centres
+            swap.
+        samples: rays per pixel side, on a regular grid in the pixel, averaged. 1 renders through pixel centres; n takes
+            n^2 times as long.
+        alpha_max: upper bound of the opacity of one primitive; at most 0.9999, as the backward pass divides by 1 -
+            alpha.
+        alpha_min: pairs of a ray and a primitive with less opacity are skipped.
+        transmittance_min: a ray ends after the primitive that takes its transmittance below this.
+        near: camera-z of the near plane in scene units; primitives are cut there. For a ``RayCamera``, which has no
+            plane, a distance along the ray. "auto", the default of a run, is 1/400 of the median depth at which
+            training cameras see the starting points, and at most a tenth of the smallest depth; a training chooses and
+            records it. Without a training it follows from the primitives and each camera.
+        depth_floor: lower bound of D = 1 - |x_m|^2 in the backward pass only: gradients grow as D^-1/2 at a silhouette,
+            where float32 resolves D to about 3e-7. At 1e-4 they keep three digits, and one chord in ten thousand is
             affected.
-        depth: whether to accumulate the depth image.
-        threads: worker threads of the cpu backend, 0 for all cores; results are bit-identical for any count.
+        depth: whether to render the depth image too.
+        threads: threads of the cpu backend; 0 uses all cores. Results are bit-identical for any number.
     """
 
     backend: Annotated[str, nonempty_text("auto or the name of a backend")] = "auto"
@@ -58,7 +62,7 @@ class RenderSettings:
 
     @property
     def near_plane(self) -> float:
-        """``near`` as a number; raises ConfigError where it is still "auto"."""
+        """``near`` as a number; raises ConfigError if it is "auto"."""
         if self.near == "auto":
             raise ConfigError("renderer.near=auto: nothing has decided it here; expected a positive distance")
         return self.near
@@ -66,11 +70,11 @@ class RenderSettings:
 
 @dataclass(frozen=True)
 class MetricsSettings:
-    """What a run measures beside its usual numbers; part of its configuration as ``metrics``.
+    """What a run measures on request; part of its configuration as ``metrics``.
 
     Attributes:
-        lpips: weights for LPIPS, as :meth:`neuprim.core.metrics.lpips.Lpips.load` reads them; None does not measure it.
-            neuprim has no weights and downloads none.
+        lpips: file or folder with weights for LPIPS (:class:`neuprim.core.metrics.lpips.Lpips`); null does not measure
+            it. neuprim has no weights and downloads none.
     """
 
     lpips: Annotated[str, nonempty_text("a file or folder with the weights of LPIPS")] | None = None

@@ -26,21 +26,22 @@ def _are_training_reductions(words: list[Any]) -> bool:
 
 @dataclass
 class ModelSettings:
-    """What is fitted.
+    """Settings of the model: number of primitives, density and colour.
 
     Attributes:
-        primitives: how many there are to be. "auto" follows the budget: ``auto_primitives`` times the square root of
-            the steps, or of as many as a short test of the pace expects in ``train.max_seconds``; a run stores the
-            number.
-        auto_primitives: see ``primitives``.
-        density, colour: which density and colour the task builds; the task says what there is to choose, see its
-            presets.
-        neurons: hidden width K of the cosine density, 0..16; 0 is a constant density. A Gaussian has none.
-        sh_degree: spherical-harmonics degree of the colour, 0..3.
-        sh_every: fraction of the budget after which one more SH band is unlocked; 0 unlocks all at once.
-        init: free settings of the fields' initialisers, see the preset files.
+        primitives: number of primitives. "auto" chooses it from the budget: ``auto_primitives`` times the square root
+            of the number of steps, or of the steps that a short test of the pace expects in ``train.max_seconds``; a
+            run stores the number.
+        auto_primitives: the factor of ``primitives=auto``.
+        density: settings of the density that the task builds; the presets of a task show what there is.
+        colour: settings of the colour that the task builds; the presets of a task show what there is.
+        neurons: hidden width K of the cosine density, 0 to 16; 0 is a constant density. A Gaussian density has none.
+        sh_degree: degree of the spherical harmonics of the colour, 0 to 3.
+        sh_every: fraction of the budget after which one more band of spherical harmonics is trained; 0 trains all from
+            the start.
+        init: settings of the starting values of the fields; the presets of a task show what there is.
         reduced: reductions of density and colour, one after the other, as ``density.neurons=0`` and
-            ``colour.degree=1``; what ``neuprim prune`` found that a scene does not require.
+            ``colour.degree=1``; ``neuprim prune`` writes those that a scene permits.
     """
 
     primitives: Annotated[int, Range(at_least=1)] | Literal["auto"] = 2000
@@ -60,10 +61,10 @@ class ModelSettings:
 
     @property
     def count(self) -> int:
-        """``primitives`` as a number.
+        """Number of primitives.
 
         Raises:
-            ConfigError: it is "auto", and only the start of a training measures the pace that it depends on.
+            ConfigError: ``primitives`` is "auto"; only the start of a training chooses the number.
         """
         if self.primitives == "auto":
             raise ConfigError(
@@ -72,8 +73,7 @@ class ModelSettings:
         return self.primitives
 
     def with_count_for(self, train: TrainSettings, pace: float | None = None) -> ModelSettings:
-        """Replace "auto" by the number for a budget: that of steps, or of seconds where ``pace`` is known, the smaller
-        where there are both.
+        """Return the settings with "auto" replaced by the number for a budget of steps or of seconds, the smaller one.
 
         Args:
             pace: seconds of a step per primitive; None leaves "auto" to budgets of seconds.
@@ -88,23 +88,27 @@ class ModelSettings:
 
 @dataclass
 class PopulationSettings:
-    """How primitives are born, moved and removed. ``start`` and ``stop`` are fractions of the training budget.
+    """How primitives are added, moved and removed during a training (population control).
 
     Attributes:
-        strategy: "fixed", "relocate" (the least used primitives move to where the error is; the count is constant once
-            it is reached) or "gradient" (clone, split and prune by the density network's gradient norm, as the authors
-            do).
+        strategy: "fixed", "relocate" (move the least used primitives to where the error is largest; the number is
+            constant once it is reached) or "gradient" (clone, split and prune by the norm of the density gradient, as
+            the authors of the method do).
         every: steps between two interventions.
-        fraction: relocate: the largest share of primitives moved at once.
-        idle: relocate: only primitives move whose weight in the images since the last intervention is below this share
-            of the mean primitive's; null moves the least used ones, however much they contribute.
-        grow_to: relocate: how many primitives there are to be; where the start has fewer, those with the largest error
-            split. null is as many as ``model.primitives``, of which data may not offer enough points.
-        grow_from: relocate: the share of ``model.primitives`` at the start; the others are born where the error turns
-            out to be largest. 1 starts with all that the data offer points for.
-        grow_threshold, prune_threshold: gradient: on the mean norm of the density gradient.
-        clone_scale, prune_scale: gradient: in units of the scene's extent.
-        max_primitives: growth cap.
+        start: fraction of the budget at which interventions begin.
+        stop: fraction of the budget at which interventions end.
+        fraction: relocate: largest share of primitives moved at once.
+        idle: relocate: move only primitives whose weight in the images since the last intervention is below this share
+            of the mean weight; null moves the least used ones, whatever their weight.
+        grow_to: relocate: number of primitives to reach; where the start has fewer, those with the largest error split.
+            null is ``model.primitives``, for which the data may not offer enough starting points.
+        grow_from: relocate: share of ``model.primitives`` at the start; the others are added where the error is
+            largest. 1 starts with all that the data offer points for.
+        grow_threshold: gradient: mean norm of the density gradient from which primitives are cloned or split.
+        prune_threshold: gradient: mean norm of the density gradient below which primitives are removed.
+        clone_scale: gradient: largest size of a primitive that is cloned, in units of the scene's extent.
+        prune_scale: gradient: size from which primitives are removed, in units of the scene's extent.
+        max_primitives: gradient: upper bound of the number of primitives.
     """
 
     strategy: str = "relocate"
@@ -134,45 +138,47 @@ class PopulationSettings:
 
 @dataclass
 class TrainSettings:
-    """How it is fitted. Every schedule runs on the used fraction of the budget: the larger of step/iterations and
+    """How a model is trained. Schedules run on the used fraction of the budget: the larger of step/iterations and
     elapsed/max_seconds.
 
     Attributes:
-        iterations: steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A command line
-            that types ``max_seconds`` alone means that: all the seconds are used, however fast the machine.
-        views_per_step: views of a step; gradients are their mean. A GPU has room for several small images.
+        iterations: number of steps, each of ``views_per_step`` views; null leaves the budget to ``max_seconds``. A
+            command line with ``max_seconds`` alone sets it to null, so that all the seconds are used.
+        views_per_step: views of a step; gradients are their mean. Several small images use a GPU better than one.
         stride: a step renders every stride-th pixel of a view in x and y, from a random first one; 1 renders whole
-            views. "auto" lets the pixels of a step take about as long as its primitives, and is finer towards the end.
-        angular_size: limit of a primitive's largest semi-axis over its distance to the nearest training camera; null
-            for none.
-        exposure_rate: learning rate of a gain per training view and channel, for photographs that are not exposed
-            alike, per step in which a view is used; 0 for none. Held-out views are rendered with the mean gain.
-        max_seconds: stop after this many seconds of training, if given; such a run is not bit-reproducible.
-        rates: learning rate by parameter name, over the specs' own.
-        rate_units: unit of a parameter's rate by its name, over the spec's own: "absolute" (a position's is in scene
-            units a step), "extent" (times the scene's extent, so that it does not depend on the scale) or "pixel"
-            (times the size of a pixel at the median depth of the start, at most 1/250 of the extent: sharper images
-            need smaller steps).
-        final_rate: the rates decay exponentially to this fraction of themselves; 1 is constant.
-        cooldown: the last share of the budget, over which the rates also fall linearly to next to nothing; 0 for none.
-        adam_beta2: decay of Adam's second moment per step, in [0, 1).
-        warmup_steps: steps over which the rates rise linearly from zero.
-        supervision: "images", "voxels" (points of the files that the images were made of, where the data set has
-            them), "both", or "auto": both where the data set has voxels, else images.
-        voxels_per_step: points of one frame in a step.
-        voxels_every: both: steps from one use of points to the next; each step has an image.
-        voxel_weight: both: weight of the points' loss beside the images'.
-        voxel_colour: weight of the source radiance at the points beside their extinction; 0 leaves colours to the
+            views. "auto" balances the time of pixels and of primitives, and is finer towards the end.
+        angular_size: upper bound of a primitive's largest semi-axis over its distance to the nearest training camera;
+            null for none.
+        exposure_rate: learning rate of a gain per training view and channel, per step that uses the view, for
+            photographs with different exposures; 0 for none. Held-out views are rendered with the mean gain.
+        max_seconds: budget of training time in seconds; null for none. Such a run is not bit-reproducible.
+        rates: learning rates by parameter name, which replace those of the fields.
+        rate_units: unit of a parameter's learning rate, by its name, over the field's own: "absolute" (of positions:
+            scene units per step), "extent" (times the scene's extent, so that it does not depend on the scale) or
+            "pixel" (times the size of a pixel at the median depth of the starting points, at most 1/250 of the extent:
+            sharper images need smaller steps).
+        final_rate: learning rates decay exponentially to this fraction of themselves; 1 keeps them constant.
+        cooldown: last share of the budget, in which learning rates also fall linearly to almost nothing; 0 for none.
+        adam_beta2: decay of Adam's second moment per step, at least 0 and below 1.
+        warmup_steps: steps in which learning rates rise linearly from zero.
+        supervision: what is compared: "images", "voxels" (points of the volume files that the images were rendered
+            from, where the data set has them), "both", or "auto" (both where the data set has voxels, else images).
+        voxels_per_step: points in a step, all of one frame.
+        voxels_every: both: steps from one use of points to the next; every step has an image.
+        voxel_weight: both: weight of the points' loss, relative to that of the images.
+        voxel_colour: weight of the source radiance at the points, relative to their extinction; 0 leaves colours to the
             images.
-        loss: name of a loss that a package provides (``neuprim tasks`` lists them), or null for the task's own.
+        loss: name of a loss that a package provides (``neuprim tasks`` lists them); null for the task's own.
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         size_weight: weight of the mean semi-axis over the scene's extent. Smaller primitives overlap less: steps are
-            faster, and what a view does not ask for goes away (3DGS-MCMC, Kheradmand et al. 2024).
-        anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step it starts at.
-        background: "white", "black", "random" or "auto" (the data set's own choice).
-        checkpoint_every_seconds: a checkpoint is written at the first step after this many seconds, and at the end.
+            faster, and primitives that no view needs vanish (3DGS-MCMC, Kheradmand et al. 2024).
+        anisotropy_weight: weight of mean(std over axes of s / min s).
+        anisotropy_from: step at which the anisotropy weight begins.
+        background: "white", "black", "random" or "auto" (the choice of the data set).
+        checkpoint_every_seconds: seconds between two checkpoints; the end of the training writes one too.
         log_every: steps between two lines of metrics.jsonl.
-        eval_every: fraction of the budget between two evaluations on a few held-out views for the curve; 0 for none.
+        eval_every: fraction of the budget between two points of the curve, measured on a few held-out views; 0 for
+            none.
     """
 
     iterations: Annotated[int, Range(at_least=0)] | None = 30_000
@@ -215,8 +221,10 @@ if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
     from neuprim.core.task import TaskSpec
 
+__all__ = ["ModelSettings", "OPTIONAL", "PopulationSettings", "TrainSettings"]
+
 OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight")
-"""Shared settings that a task or loss uses only if it says so."""
+"""Shared settings that a task or loss gets only if its ``uses`` lists them."""
 
 
 class TrackedMapping(dict[str, Any]):

@@ -1,4 +1,4 @@
-"""The renderer as one function: tensors in, images out, batched over cameras, for trainers of your own."""
+"""The renderer as one function for your own training loop: tensors in, images out, batched over cameras."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ _REQUIRED = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2", "colors")
 
 @dataclass(frozen=True)
 class Rasterized:
-    """C frames of one model.
+    """Images of one model from C cameras.
 
     Attributes:
         rgb: (C, H, W, channels) composited over the backgrounds.
         alpha: (C, H, W) accumulated opacity 1 - T.
         depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where nothing is hit; None unless
             the settings ask for it.
-        stats: one per camera, see :class:`neuprim.core.render.output.RenderStats`.
+        stats: statistics of each camera's image, see :class:`~neuprim.core.render.output.RenderStats`.
     """
 
     rgb: Tensor
@@ -41,10 +41,12 @@ class Rasterized:
     stats: tuple[RenderStats, ...]
 
     def request_contributions(self, error: Tensor) -> tuple[Contributions, ...]:
-        """Have the backward pass sum each primitive's part in every camera's frame and error; call it before that.
+        """Return, for each camera, how much every primitive contributes to the image and to an error.
+
+        The backward pass fills the result; call this before ``backward()``.
 
         Args:
-            error: (C, H, W) any measure of what is wrong at each pixel; no gradient reaches it.
+            error: (C, H, W) any measure of error at each pixel; no gradient reaches it.
         """
         _check_tensor("request_contributions: error", error)
         if error.shape != self.alpha.shape:
@@ -64,14 +66,14 @@ def rasterize(
     backgrounds: Tensor | None = None,
     **settings: Any,
 ) -> Rasterized:
-    """Draw N primitives from C pinhole cameras, differentiably.
+    """Render N primitives from C pinhole cameras; differentiable.
 
     Inside its ellipsoid, of semi-axes ``s = exp(log_scales)``, a primitive has the density (1 / scene unit)
 
         sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),
         g = exp(log_gain),   f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
 
-    and outside none. With I the integral of sigma along a pixel's ray, in closed form, and primitives sorted front to
+    and 0 outside. With I the integral of sigma along a pixel's ray, in closed form, and primitives sorted front to
     back,
 
         alpha_i = min(alpha_max, 1 - exp(-max(I_i, 0))),   T_i = prod_{j<i} (1 - alpha_j),

@@ -12,6 +12,8 @@ from neuprim.config.overrides import take_settings
 from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import Range, format_setting_value, nonempty_text, validate_fields, validate_value
 
+__all__ = ["LauncherSettings", "SearchTarget", "ViewerSettings"]
+
 LOOPBACK = "127.0.0.1"
 LauncherName = Literal["inline", "processes", "ray", "slurm"]
 LAUNCHERS: tuple[str, ...] = get_args(LauncherName)
@@ -46,7 +48,7 @@ class LauncherSettings:
         validate_fields(self, "launcher")
 
     def given_settings(self) -> dict[str, Any]:
-        """Name -> value of what differs from the defaults, and the launcher's own name."""
+        """Return the settings that differ from the defaults, and the name."""
         values, default = dataclasses.asdict(self), dataclasses.asdict(LauncherSettings())
         return {name: value for name, value in values.items() if name == "name" or value != default[name]}
 
@@ -87,12 +89,12 @@ class SearchTarget:
     fps: Annotated[float, Range(above=0, says="a positive number of frames per second")] | None = None
 
     def given_settings(self) -> dict[str, float]:
-        """Name -> value of what was asked for."""
+        """Return the targets and limits that are set, by name."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     @property
     def quality(self) -> dict[str, float]:
-        """Name -> value of the measures of quality among them."""
+        """The targets of quality that are set, by name."""
         return {name: value for name, value in self.given_settings().items() if name in ("psnr", "ssim")}
 
     def __str__(self) -> str:

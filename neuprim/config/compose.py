@@ -117,9 +117,9 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     """Return the configuration of one run.
 
     Args:
-        overrides: ``key=value`` in Hydra's grammar.
+        overrides: ``key=value`` in Hydra's grammar, as after ``neuprim run``.
         check_output: refuse an ``output_dir`` that already holds files, unless ``resume=true``.
-        stored: an earlier run, whose settings stand under the overrides; the run gets a directory of its own.
+        stored: an earlier run whose settings replace the defaults; the new run has its own directory.
 
     Raises:
         ConfigError: one line that names the key, what was found and what was expected.
@@ -158,7 +158,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 def compose_all(
     overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
 ) -> list[RunConfig]:
-    """As :func:`compose`: return the configurations of a sweep, each in its own folder of one output directory."""
+    """Return the configurations of a sweep, each in its own folder of one directory; see :func:`compose`."""
     swept = set(swept_override_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]

@@ -34,16 +34,15 @@ class RunSettings:
     """The part of the configuration that is the same for every task; defaults are a run's defaults.
 
     Attributes:
-        model, train, renderer, metrics: groups of settings.
         output_dir: directory of the run, on the command line ``--out DIR``; null for a new one in ``outputs``.
         seed: seed of every random number of the run.
         resume: continue the run in its directory from the checkpoint.
     """
 
-    model: ModelSettings = field(default_factory=ModelSettings)
-    train: TrainSettings = field(default_factory=TrainSettings)
-    renderer: RenderSettings = field(default_factory=lambda: RenderSettings(near="auto"))
-    metrics: MetricsSettings = field(default_factory=MetricsSettings)
+    model: ModelSettings = field(default_factory=ModelSettings)  # settings under model
+    train: TrainSettings = field(default_factory=TrainSettings)  # settings under train
+    renderer: RenderSettings = field(default_factory=lambda: RenderSettings(near="auto"))  # settings under renderer
+    metrics: MetricsSettings = field(default_factory=MetricsSettings)  # settings under metrics
     output_dir: str | None = None
     seed: Annotated[int, Range(0, 2**63 - 1, says="a whole number from 0 to 2^63 - 1")] = 0
     resume: bool = False
@@ -57,26 +56,25 @@ class RunSettings:
 
 @dataclass
 class RunConfig:
-    """Everything a run depends on, validated.
+    """All settings of a run, validated.
 
     Attributes:
-        task, scene_name, preset: what was chosen.
-        scene: the scene's own settings, as its loader takes them.
-        options: the task's own settings and those of its loss (``task.options``).
+        scene: settings of the scene, as its loader takes them.
+        options: settings of the task and its loss (``task.options``).
         unused: names of the shared settings that nothing in this run reads; ``config.yaml`` does not show them.
-        output_dir: the run's directory; it need not exist yet.
-        seed: of every random number the run draws.
-        resume: continue from the checkpoint in ``output_dir``, if there is one.
-        overrides: what the user typed.
-        non_default: dotted key -> (value with the same task, scene and preset and nothing typed, value of this run).
-        source: the file that it was read from; None for one that the user composed.
-        made_by: the packages that task, scene and loss come from.
+        output_dir: directory of the run; it need not exist yet.
+        seed: seed of every random number of the run.
+        resume: whether to continue from the checkpoint in ``output_dir``, if there is one.
+        overrides: overrides that the user typed.
+        non_default: dotted key -> (value without any override, value of this run), where they differ.
+        source: file that the configuration was read from; None for a new one.
+        made_by: packages and versions of task, scene and loss.
     """
 
-    task: str
-    scene_name: str
+    task: str  # name of the task
+    scene_name: str  # name of the scene
     scene: dict[str, Any]
-    preset: str
+    preset: str  # name of the preset
     model: ModelSettings
     train: TrainSettings
     renderer: RenderSettings
@@ -92,7 +90,7 @@ class RunConfig:
     source: Path | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain nested values, in the layout of the command line's keys."""
+        """Return plain nested values by the keys of the command line."""
         tree: dict[str, Any] = {
             "task": {"name": self.task, "options": self.options},
             "scene": {"name": self.scene_name, **self.scene},
@@ -114,7 +112,7 @@ class RunConfig:
         return tree
 
     def override(self, values: Mapping[str, Any]) -> RunConfig:
-        """Return the configuration with other settings, by dotted key, and with its record of what is not a default."""
+        """Return the configuration with other settings, by dotted key; updates ``non_default``."""
         tree = self.to_dict()
         for key, value in values.items():
             *path, name = key.split(".")
@@ -131,7 +129,10 @@ class RunConfig:
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> RunConfig:
-        """Reads a run directory's ``config.yaml`` (``path`` is the file or the directory); no code in it is run.
+        """Return the configuration in a run's ``config.yaml``; no code in it is executed.
+
+        Args:
+            path: the file or the run directory.
 
         Raises:
             CheckpointError: there is no such file, or it is not a run's configuration.
@@ -150,7 +151,7 @@ class RunConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
-        """Read what :meth:`to_dict` gave.
+        """Return the configuration of what :meth:`to_dict` returned.
 
         Raises:
             ConfigError: a setting in it does not exist or has an impossible value.

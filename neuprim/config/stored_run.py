@@ -37,7 +37,7 @@ _SEARCH, _SWEEP = "target.json", "sweep.json"
 
 
 def read_stored_config(path: Path) -> RunConfig:
-    """Return the configuration of a run, from its ``config.yaml`` or its directory."""
+    """Return the configuration of an earlier run, from its ``config.yaml`` or its directory."""
     if not path.exists():
         raise ConfigError(f"--config {path}: no such file; expected RUN_DIR/config.yaml of an earlier run")
     return RunConfig.from_yaml(path)

@@ -356,11 +356,11 @@ CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
 def named_checks(
     task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None
 ) -> dict[str, Callable[[], None]]:
-    """Return check name -> function without arguments that raises :class:`ConformanceError`.
+    """Return the checks of a task by name, as functions without arguments that raise :class:`ConformanceError`.
 
     Args:
-        preset: whose settings the models are built with; None is the task's default.
-        model: changes to its model settings, e.g. ``{"neurons": 2, "density": {"form": "gaussian"}}``.
+        preset: preset with the settings of the models; None is the task's default.
+        model: changes to the model settings, e.g. ``{"neurons": 2, "density": {"form": "gaussian"}}``.
     """
     subject = TaskUnderTest(task, preset=preset, model=model)
     return {name: partial(_run_check, subject, name) for name in CHECKS}
@@ -400,7 +400,7 @@ def check_task(task: TaskSpec, preset: str | None = None, model: Mapping[str, An
 
 
 def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None) -> Any:
-    """Parametrize a pytest test with the checks, which it gets as ``check``; see :func:`named_checks`."""
+    """Return a pytest decorator that runs a test once per check, passed as ``check``; see :func:`named_checks`."""
     import pytest
 
     found = named_checks(task, preset, model)

@@ -33,7 +33,7 @@ EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, trans
 
 
 class ConformanceError(AssertionError):
-    """A task does not do what the framework relies on; names task, check, place, what was found and expected."""
+    """A task breaks a rule of the interface; the message names task, check, place, and what was found and expected."""
 
 
 class TaskUnderTest:

@@ -18,6 +18,8 @@ from neuprim.core.task import Display, TaskSpec
 if TYPE_CHECKING:
     from neuprim.core.data import Dataset
 
+__all__ = ["Channels"]
+
 _LISTED = 8  # names that a line of text lists; of more, the first three and the last
 
 
@@ -27,10 +29,10 @@ class Channels:
 
     Attributes:
         names: one per channel, in the order of the tensors' last axis.
-        color_space: "srgb" or "linear", the data set's.
+        color_space: colour space of the data set, "srgb" or "linear".
         own: the task's display. None: three channels are red, green and blue, one is grey, and of others the first
             three are shown.
-        task: its name, for messages.
+        task: name of the task, for messages.
     """
 
     names: tuple[str, ...] = ("R", "G", "B")
@@ -45,24 +47,24 @@ class Channels:
 
     @property
     def rgb(self) -> tuple[int, int, int] | None:
-        """Indices of red, green and blue: by name, or all three channels, or the only one three times; else None."""
+        """Indices of red, green and blue by name, of all three channels, or of a single one; else None."""
         if {"R", "G", "B"} <= set(self.names):
             return self.names.index("R"), self.names.index("G"), self.names.index("B")
         return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)
 
     @property
     def is_rgb(self) -> bool:
-        """Whether an image is red, green and blue and nothing else, so that the sRGB curve applies to all of it."""
+        """Whether the channels are red, green and blue, so that the sRGB curve applies to all of them."""
         return self.own is None and sorted(self.names) == ["B", "G", "R"]
 
     @property
     def hides_channels(self) -> bool:
-        """Whether pictures leave channels out or have too few, because the task has no display."""
+        """Whether pictures show only some channels, because the task has no display."""
         return self.own is None and self.count not in (1, 3)
 
     @property
     def display_text(self) -> str:
-        """What pictures show, in words; empty for plain red, green and blue or grey."""
+        """Text that says what pictures show; empty for red, green and blue or grey."""
         if self.own is not None:
             return f"{self.name_list} through the display of task {self.task!r}"
         if self.names == default_exr_channel_names(self.count) and not self.hides_channels:
@@ -75,7 +77,7 @@ class Channels:
 
     @property
     def name_list(self) -> str:
-        """The names in a line; of many, the first and the last ones."""
+        """Names in one line; of many channels the first ones and the last."""
         if self.count <= _LISTED:
             return ", ".join(self.names)
         return f"{', '.join(self.names[:3])}, … {self.names[-1]} ({self.count} channels)"

@@ -36,6 +36,8 @@ from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import dense_primitive_parameters, sparse_primitive_parameters
 from neuprim.core.task import TaskSpec
 
+__all__ = ["load_model_checkpoint", "read_header", "save_model"]
+
 FORMAT = 1
 _KEY = "neuprim"
 _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitives")
@@ -55,7 +57,7 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: 
 
 
 def read_header(path: Path, kind: str) -> dict[str, Any]:
-    """Return the JSON header of a file of this kind; reads no tensor.
+    """Return the JSON header of a file of this kind, "model" or "checkpoint"; reads no tensor.
 
     Raises:
         CheckpointError: missing, truncated, foreign or of another format version.
@@ -135,10 +137,12 @@ def read_tensors(
 
 
 def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any], without_zeros: bool = False) -> None:
-    """Write what rendering needs. ``extra`` (JSON-able) joins the header: background, colour space, data source.
+    """Write a model: all that rendering needs. The file is complete or absent.
 
     Args:
-        without_zeros: leave out zeros of the fields, as in pruned models (:mod:`neuprim.core.model.prunable`).
+        task: name of the task.
+        extra: JSON-able entries of the header: background, colour space, data source.
+        without_zeros: leave out zeros of the fields, as for pruned models.
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
     tensors, sparse = sparse_primitive_parameters(model.params, specs)
@@ -198,7 +202,7 @@ def load_model_checkpoint(path: Path, task: TaskSpec) -> tuple[Primitives, dict[
     """Return the model in ``path`` and its header.
 
     Raises:
-        CheckpointError: damaged, of another task, with fields that it does not have, or tensors that do not fit them.
+        CheckpointError: the file is damaged or of another task, or its fields or tensors do not fit.
     """
     header = read_header(path, "model")
     if header.get("task") != task.name:

@@ -28,6 +28,8 @@ from torch import Tensor
 from neuprim.core.errors import ConfigError, DataError
 from neuprim.core.io.images import image_info, read_image, srgb_to_linear
 
+__all__ = ["DirectionalLights", "Environment", "EnvironmentFile", "Illumination", "read_environment"]
+
 MAX_LIGHTS = 4096
 _ROWS = 512  # larger images are summed to at most so many rows of cells, of which no energy is lost
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear
@@ -36,13 +38,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class EnvironmentFile:
-    """What a user asks for."""
+    """An environment map and how to use it, as ``neuprim render --environment`` takes it."""
 
-    path: Path  # see read_environment
-    samples: int = 64  # number of lights that stand for it
+    path: Path  # image that read_environment reads
+    samples: int = 64  # number of lights that approximate it
     rotation: float = 0.0  # degrees about the scene's upward direction
     scale: float = 1.0  # multiplies the radiance
-    guesses: bool = True  # whether light from directions that the model never saw counts
+    guesses: bool = True  # whether light from directions without training data counts
 
 
 @dataclass(frozen=True)
@@ -55,32 +57,30 @@ class DirectionalLights:
 
 @dataclass(frozen=True)
 class Illumination:
-    """What a task makes of an environment: frames to draw one by one and to add up."""
+    """The frames whose sum is an image under an environment; what ``TaskSpec.environment`` returns."""
 
-    # of each frame, one or more; they replace the view's own of the same names
-    conditions: tuple[dict[str, Tensor], ...]
+    conditions: tuple[dict[str, Tensor], ...]  # of each frame; they replace the view's conditions of the same names
     notes: tuple[str, ...] = ()  # one line each, for the user
-    # of each frame, whether its light comes from where the model never saw any; empty if none does
-    guessed: tuple[bool, ...] = ()
+    guessed: tuple[bool, ...] = ()  # whether the light of a frame has no training data nearby; empty if none has
 
     def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:
-        """The conditions, without the guessed ones unless ``guesses``; none may be left."""
+        """Return the conditions of the frames, without those of guessed light unless ``guesses``; perhaps none."""
         if guesses or not any(self.guessed):
             return self.conditions
         return tuple(c for c, guess in zip(self.conditions, self.guessed, strict=True) if not guess)
 
 
 class Environment:
-    """Radiance from every direction, see the module.
+    """Radiance from every direction: an image of latitude and longitude.
 
     Args:
         radiance: (H, 2H, 3) linear RGB, finite and not negative.
-        up: (3,) the direction of the top row, scene axes.
-        rotation: degrees about ``up``.
-        where: names the image in messages.
+        up: (3,) direction of the top row, scene axes; None is +z.
+        rotation: degrees about ``up``, anticlockwise as seen from above.
+        where: name of the image in messages.
 
     Raises:
-        DataError: another shape, or values that are negative or not finite.
+        DataError: the shape is wrong, or a value is negative or not finite.
     """
 
     def __init__(
@@ -94,13 +94,13 @@ class Environment:
 
     @property
     def irradiance(self) -> Tensor:
-        """(3,) float64 sum of radiance times solid angle over all directions; 4 pi for a uniform radiance of 1."""
+        """Sum of radiance times solid angle over all directions, (3,) float64; 4 pi for a uniform radiance of 1."""
         return torch.from_numpy(self._flux.sum((0, 1)))
 
     def directional_lights(self, count: int) -> DirectionalLights:
-        """Return at most ``count`` (1 to :data:`MAX_LIGHTS`) directions that carry all of the energy.
+        """Return at most ``count`` lights (1 to 4096) that together carry all energy of the image.
 
-        They are fewer where fewer cells of the image shine, none if it is black. Nothing is random.
+        There are fewer if fewer cells of the image are bright, and none if it is black. Nothing is random.
         """
         if not 1 <= count <= MAX_LIGHTS:
             raise ConfigError(f"{count} lights for an environment; expected 1 to {MAX_LIGHTS}")
@@ -117,7 +117,7 @@ class Environment:
         return DirectionalLights(*map(torch.from_numpy, arrays))
 
     def share_beyond(self, directions: Tensor, degrees: float) -> float:
-        """Return the share 0..1 of the luminance from farther than ``degrees`` from each of (D, 3) ``directions``."""
+        """Return the share 0..1 of the luminance that is farther than ``degrees`` from all ``directions`` (D, 3)."""
         weight = self._flux @ _LUMINANCE
         total = float(weight.sum())
         if total == 0.0:
@@ -133,11 +133,12 @@ class Environment:
 
 
 def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0, scale: float = 1.0) -> Environment:
-    """The environment in an OpenEXR file (linear radiance), or in a PNG or JPEG (sRGB, made linear); alpha is ignored.
+    """Read an environment from an OpenEXR file (linear), or a PNG or JPEG (sRGB, made linear); alpha is ignored.
 
     Args:
-        up, rotation: see :class:`Environment`.
-        scale: multiplies the radiance.
+        up: see :class:`Environment`.
+        rotation: see :class:`Environment`.
+        scale: factor on the radiance.
 
     Raises:
         DataError: as :func:`neuprim.core.io.images.read_image`, and for another shape than 2:1 or negative values.

@@ -15,6 +15,9 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
+__all__ = ["BackendUnavailable", "CheckpointError", "ConfigError", "DataError", "DeviceMemoryError", "FormError"]
+__all__ += ["NeuprimError", "NeuprimWarning", "NonFiniteError", "RankError", "warn_once"]
+
 DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
@@ -23,7 +26,7 @@ DISK = (
 
 
 class NeuprimError(Exception):
-    """Base of every error that is the input's fault; its text is the whole message."""
+    """Base class of all errors that the user can correct; the text is the whole message."""
 
 
 class DataError(NeuprimError):
@@ -47,14 +50,14 @@ class NonFiniteError(NeuprimError):
 
 
 class DeviceMemoryError(NeuprimError):
-    """A GPU's memory is full; the message says with what, and what to lower."""
+    """The memory of a GPU is full; the message says what uses it and what to lower."""
 
 
 class RankError(NeuprimError):
     """Another process of the same training ended, failed or differs.
 
     Attributes:
-        reported: whether another rank has told the user already.
+        reported: whether another rank has reported the error.
     """
 
     def __init__(self, message: str, reported: bool = False) -> None:
@@ -63,7 +66,7 @@ class RankError(NeuprimError):
 
 
 class FormError(NeuprimError):
-    """A field handed over tensors that cannot be used; the message names field, method and tensor."""
+    """A field returned tensors of a wrong shape, type or device; the message names field, method and tensor."""
 
 
 def cut_error_text(text: str, most: int = 80) -> str:
@@ -103,14 +106,14 @@ def one_line(error: BaseException) -> str | None:
 
 
 class NeuprimWarning(UserWarning):
-    """Something that a user should know and that stops nothing; its text is the whole message."""
+    """A warning for the user that stops nothing; the text is the whole message."""
 
 
 _said: set[str] = set()
 
 
 def warn_once(text: str) -> None:
-    """Warns, unless this process has done so with the same words."""
+    """Warn, unless this process has given the same warning before."""
     if text not in _said:
         _said.add(text)
         warnings.warn(text, NeuprimWarning, stacklevel=3)

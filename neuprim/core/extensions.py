@@ -25,37 +25,37 @@ from neuprim.core.task import Loss, SceneSpec, TaskSpec
 from neuprim.core.validation import Option, Range, validate_value
 from neuprim.core.volumes.density_truth import DensityGridSource
 
+__all__ = ["ExportJob", "ExportReport", "Exporter", "Inspector", "StoredModel", "TrainedModel"]
+__all__ += ["LossExtension", "SceneExtension"]
+
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """A run's model and what is known about it.
+    """The model of a run with its task, scene and settings.
 
     Attributes:
-        directory: of the run.
-        header: of ``model.safetensors``: background, colour space, data source, iterations, ...
-        scene: settings of the scene that it was fitted to.
-        settings: how the run renders.
+        header: header of ``model.safetensors``: background, colour space, data source, iterations, ...
         dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` if its files are gone.
-        volume: opens the voxel files of the scene; None for scenes without. Raises as ``dataset``.
+        volume: opens the voxel files of the scene, None for scenes without; raises as ``dataset``.
     """
 
-    directory: Path
-    task: TaskSpec
-    model: Primitives
+    directory: Path  # directory of the run
+    task: TaskSpec  # the task of the run
+    model: Primitives  # the trained model
     header: Mapping[str, Any]
-    scene: Mapping[str, Any]
-    settings: RenderSettings
+    scene: Mapping[str, Any]  # settings of the scene
+    settings: RenderSettings  # render settings of the run
     dataset: Callable[[], Dataset]
     volume: Callable[[], DensityGridSource | None] = lambda: None
 
     @property
     def world(self) -> World:
-        """The transform between the scene and the user's files, in whose coordinates everything is exported."""
+        """Transform between scene and world; exports are in coordinates of the world, those of the user's files."""
         return World.of(self.header, str(self.directory))
 
     @property
     def channels(self) -> Channels:
-        """The channels of its colours."""
+        """Channels of the model's colours."""
         return read_stored_channels(self.directory, self.header, self.task, self.model.colour.channels)
 
 
@@ -64,25 +64,25 @@ class ExportJob:
     """One call of ``neuprim export``.
 
     Attributes:
-        out: the file to write, or the folder to make; files beside it count, too. It has the final name but lies in a
-            private folder. Its content is moved to its place afterwards if nothing is in the way, so an exporter need
-            not handle ``--force``, and one that fails leaves nothing behind.
-        options: every option of the exporter: the user's value as a number or boolean if it is one, or the default.
+        out: file to write or folder to create, in a private folder; files next to it count, too. neuprim moves
+            everything to its place afterwards. An exporter need not handle ``--force``, and leaves nothing if it fails.
+        options: value of every option: the user's, as a number or boolean if it is one, or the default.
         conditions: condition name -> text, already checked; empty unless the exporter takes conditions.
-        progress: called with (text, fraction 0..1).
+        progress: function to call with (text, fraction 0..1).
     """
 
-    run: TrainedModel
+    run: TrainedModel  # the model to export
     out: Path
     options: Mapping[str, Any] = field(default_factory=dict)
     conditions: Mapping[str, str] = field(default_factory=dict)
     progress: Callable[[str, float], None] = lambda text, fraction: None
 
     def frames(self, several: bool = False, names: Collection[str] | None = None) -> list[dict[str, Tensor]]:
-        """Return the task's conditions of each frame that the user named; one frame unless ``several``.
+        """Return the conditions of each frame that the user asked for; one frame unless ``several``.
 
         Args:
-            names: of the conditions that what is written depends on; None: all of the task's. Others are refused.
+            several: whether more than one frame is allowed.
+            names: conditions that the export depends on; None for all of the task. Others are refused.
         """
         specs = [spec for spec in self.run.task.conditions if names is None or spec.name in names]
         for name in self.conditions:
@@ -96,12 +96,12 @@ class ExportJob:
         return value
 
     def count(self, name: str, low: int, high: int) -> int | None:
-        """Return an option that is a whole number, as :meth:`number`."""
+        """Return an option that is a whole number from ``low`` to ``high``, or None; raises ConfigError otherwise."""
         value: int | None = validate_value(self.options[name], Annotated[int, Range(low, high)] | None, name)
         return value
 
     def choice(self, name: str, *offered: str) -> str:
-        """Return an option that is one of those offered; raises ConfigError otherwise."""
+        """Return an option that is one of the values ``offered``; raises ConfigError otherwise."""
         return str(validate_value(self.options[name], Literal[offered], name))
 
     def flag(self, name: str) -> bool:
@@ -111,13 +111,13 @@ class ExportJob:
 
 @dataclass(frozen=True)
 class ExportReport:
-    """What was written, and what it lost.
+    """Files that an exporter wrote, and what the format lost.
 
     Attributes:
-        files: in order; each is :attr:`ExportJob.out`, in it, or beside it.
+        files: files in order; each is :attr:`ExportJob.out`, in it, or next to it.
         lossless: whether importing restores the model exactly.
-        errors: named numbers of the export against the model, e.g. ``{"psnr": 31.2}``; empty where none is defined.
-        notes: one line each, for the user (conventions, frames, what is left out).
+        errors: errors of the export against the model by name, e.g. ``{"psnr": 31.2}``; may be empty.
+        notes: lines for the user: conventions, frames, what is left out.
     """
 
     files: tuple[Path, ...]
@@ -128,41 +128,34 @@ class ExportReport:
 
 @dataclass(frozen=True)
 class StoredModel:
-    """A whole model out of a file.
+    """A model as a lossless format stores it; its values are unchecked."""
 
-    Attributes:
-        header: as of ``model.safetensors``; unchecked.
-        tensors: name -> (N, ...) float32 array; unchecked.
-        config: text of ``config.yaml``; unchecked.
-    """
-
-    header: Mapping[str, Any]
-    tensors: Mapping[str, np.ndarray]
-    config: str
+    header: Mapping[str, Any]  # header of model.safetensors
+    tensors: Mapping[str, np.ndarray]  # name -> (N, ...) float32 array
+    config: str  # text of config.yaml
 
 
 @dataclass(frozen=True)
 class Exporter:
-    """A format of ``neuprim export --format NAME``; group ``neuprim.exporters``.
+    """An export format, ``neuprim export --format NAME``; entry-point group ``neuprim.exporters``.
 
     Attributes:
-        options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
         write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format
             cannot hold.
-        conditions: whether it takes values of the task's conditions (``time=0.5``).
+        options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
         read: for lossless formats, ``neuprim import``: reads what ``write`` wrote from an untrusted file; raises
             :class:`~neuprim.core.errors.DataError`. It is chosen by the file's suffix, which is the exporter's name.
         default: name of the file or folder in ``RUN_DIR/export``; "" for the exporter's name with the first suffix.
-        suffixes: what the name of its one file may end in, as ``(".glb", ".ply")``; other names and folders are
-            refused. Empty: it takes any name, also that of a folder.
+        suffixes: allowed suffixes of its one file, e.g. ``(".glb", ".ply")``; other names and folders are refused.
+            Empty: any name, also of a folder.
     """
 
-    api: int
-    name: str
-    summary: str
+    api: int  # the API_VERSION it was written for
+    name: str  # what the user types after --format
+    summary: str  # one line for help texts
     write: Callable[[ExportJob], ExportReport]
     options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
-    conditions: bool = False
+    conditions: bool = False  # whether it accepts conditions of the task, such as --time 0.5
     read: Callable[[Path], StoredModel] | None = None
     default: str = ""
     suffixes: tuple[str, ...] = ()
@@ -170,52 +163,46 @@ class Exporter:
 
 @dataclass(frozen=True)
 class Inspector:
-    """A way of showing a density in ``neuprim inspect --show NAME``; group ``neuprim.inspectors``.
+    """A way to show a density, ``neuprim inspect --show NAME``; entry-point group ``neuprim.inspectors``.
 
     Attributes:
         layers: a :class:`~neuprim.inspect.field.InspectionFrame` -> a list of layers of :mod:`neuprim.inspect.layers`,
-            which a window, a picture, a film and a page draw; called once per frame and panel.
-        shows: "sigma" for the extinction on the frame's grid, shown a second time for the ground truth if there is
-            one; "model" for the primitives; "primitive" for a single one, with a camera of its own; "both" for what
-            needs the ground truth.
+            which windows, pictures, films and pages draw; called once per frame and panel.
+        shows: "sigma": the extinction on the frame's grid, with a second panel for the ground truth if there is one;
+            "model": the primitives; "primitive": a single one, with its own camera; "both": needs the ground truth.
     """
 
-    api: int
-    name: str
-    summary: str
+    api: int  # the API_VERSION it was written for
+    name: str  # what the user types after --show
+    summary: str  # one line for help texts
     layers: Callable[[Any], Sequence[Any]]
     shows: Literal["sigma", "model", "primitive", "both"] = "sigma"
 
 
 @dataclass(frozen=True)
 class SceneExtension:
-    """A scene for a task of another package; group ``neuprim.scenes``, under the entry-point name ``TASK.SCENE``.
+    """A scene for a task of another package; entry point ``TASK.SCENE`` of the group ``neuprim.scenes``."""
 
-    Attributes:
-        task: name of the task.
-        config_package: importable package that holds ``scene/TASK/NAME.yaml``.
-    """
-
-    api: int
-    task: str
-    scene: SceneSpec
-    config_package: str
+    api: int  # the API_VERSION it was written for
+    task: str  # name of the task
+    scene: SceneSpec  # the scene
+    config_package: str  # importable package with scene/TASK/NAME.yaml
 
 
 @dataclass(frozen=True)
 class LossExtension:
-    """A training loss for any task, chosen by ``train.loss=NAME``; group ``neuprim.losses``.
+    """A training loss for any task, ``train.loss=NAME``; entry-point group ``neuprim.losses``.
 
     Attributes:
-        make: the settings under ``train``, and this loss's options as "options" -> the loss.
-        options: name -> (default, one line of help), set as ``task.options.NAME`` while the loss is chosen; as
+        make: (settings under ``train``, with the options of the loss as "options") -> the loss.
+        options: name -> (default, one line of help), typed as ``task.options.NAME``; as
             :attr:`~neuprim.core.task.TaskSpec.options`.
         uses: the settings of :data:`neuprim.core.train.settings.OPTIONAL` under ``train`` that ``make`` reads.
     """
 
-    api: int
-    name: str
-    summary: str
+    api: int  # the API_VERSION it was written for
+    name: str  # what the user types after train.loss=
+    summary: str  # one line for neuprim tasks
     make: Callable[[Mapping[str, Any]], Loss]
     options: Mapping[str, Option] = field(default_factory=dict)
     uses: tuple[str, ...] = ()

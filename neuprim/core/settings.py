@@ -9,6 +9,8 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.validation import Range, nonempty_text, validate_fields
 
 SortOrder = Literal["center", "entry"]
+__all__ = ["MetricsSettings", "RenderSettings"]
+
 DeviceChoice = Literal["auto", "cpu", "cuda"]
 
 
@@ -60,7 +62,7 @@ class RenderSettings:
 
     @property
     def near_plane(self) -> float:
-        """``near`` as a number; raises ConfigError where it is still "auto"."""
+        """``near`` as a number; raises ConfigError if it is "auto"."""
         if self.near == "auto":
             raise ConfigError("renderer.near=auto: nothing has decided it here; expected a positive distance")
         return self.near

@@ -1,4 +1,4 @@
-"""The interface of a task: its conditions, fields, scenes, loss and presets. The core runs every task alike."""
+"""The interface of a task: its conditions, fields, scenes, loss and presets."""
 
 from __future__ import annotations
 
@@ -17,19 +17,21 @@ from neuprim.core.render.layer_frame import LayerSpec
 from neuprim.core.validation import Option
 from neuprim.core.volumes.density_truth import DensityGridSource
 
+__all__ = ["API_VERSION", "Chunk", "Chunks", "Display", "Illuminate", "Loss", "SceneSpec", "Supervision", "TaskSpec"]
+
 API_VERSION = 1
-"""Version of the interfaces in ``neuprim.core``; a plugin names the one it was written for."""
+"""Version of the plugin interfaces in ``neuprim.core``; a plugin declares the version it was written for."""
 
 
 @dataclass(frozen=True)
 class Supervision:
-    """What a loss gets besides the two images.
+    """What a loss gets besides the rendered and the true image.
 
     Attributes:
-        view: name, camera and conditions of the frame.
+        view: name, camera and conditions of the view.
         mask: (H, W) bool of the pixels that count, None for all; where it is False, ``rendered`` equals ``truth``.
-        alpha: (H, W) coverage 0..1 of the true image, which lies over this step's background; None for an opaque
-            photograph.
+        alpha: (H, W) coverage 0..1 of the true image, which is composited over the background of this step; None for
+            an opaque photograph.
         progress: used fraction of the budget, 0..1.
     """
 
@@ -40,28 +42,28 @@ class Supervision:
 
 
 Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, dict[str, float]]]
-"""(rendered (H, W, C), ground truth (H, W, C), :class:`Supervision`) -> (scalar loss with gradient, named numbers for
-the log)."""
+"""Function (rendered (H, W, C), truth (H, W, C), :class:`Supervision`) -> (scalar with gradient, named numbers for the
+log)."""
 
 Display = Callable[[Tensor], Tensor]
-"""(H, W, C) colours in the data set's own colour space -> (H, W, 3) sRGB values 0..1, each pixel by itself."""
+"""Function (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, pixel by pixel."""
 
 Illuminate = Callable[[Environment, int, Mapping[str, Any]], Illumination]
-"""(environment, number of lights that approximate it, "data" of the model's header: :attr:`TaskSpec.facts`) -> frames
-to add up."""
+"""Function (environment, number of lights that approximate it, :attr:`TaskSpec.facts` of the model) -> frames whose sum
+is the image."""
 
 
 @dataclass(frozen=True)
 class Chunk:
-    """A part of a scene that is fitted as a run of its own.
+    """A part of a scene that is trained as a run of its own.
 
     Attributes:
-        name: valid as a folder's name.
-        settings: dotted key -> value of the settings that differ from the whole run's: ``{"scene.span": "0:20"}``.
-        primitives, steps: its shares of the whole run's; those of all chunks add up to 1.
+        settings: dotted key -> value of the settings that differ from the whole run: ``{"scene.span": "0:20"}``.
+        primitives: share of the primitives of the whole run; the shares of all chunks add up to 1.
+        steps: share of the steps of the whole run; the shares of all chunks add up to 1.
     """
 
-    name: str
+    name: str  # name of the chunk, valid as the name of a folder
     settings: Mapping[str, Any]
     primitives: float
     steps: float
@@ -69,11 +71,11 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Chunks:
-    """How a scene is fitted in chunks.
+    """The chunks of a scene that is trained in chunks.
 
     Attributes:
-        parts: two or more.
-        join: the models of all parts, in their order, on the CPU -> one model of the whole scene.
+        parts: the chunks, two or more.
+        join: function (models of all parts, in their order, on the CPU) -> one model of the whole scene.
     """
 
     parts: tuple[Chunk, ...]
@@ -88,11 +90,11 @@ class SceneSpec:
         name: what the user types after ``scene=``.
         summary: one line for ``neuprim tasks``.
         load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
-        volume: for scenes made of voxel files: (scene settings, context) -> the files, without rendering anything.
-        truth: for scenes whose images are rendered frame by frame: (scene settings, context, what another process
-            knows of them or None) -> that work; see :class:`~neuprim.core.data.dataset.DatasetImages`.
-        chunks: for scenes that can be fitted in chunks, by their setting ``chunks``: (the run's configuration with the
-            command line's keys, context) -> the chunks, or None if one run is better.
+        volume: for scenes of voxel files: (scene settings, context) -> the files; renders nothing.
+        truth: for scenes that render their images frame by frame: (scene settings, context,
+            :attr:`~neuprim.core.data.dataset.DatasetImages.known` of another process or None) -> that work.
+        chunks: for scenes with a setting ``chunks``: (configuration of the run by the keys of the command line,
+            context) -> the chunks, or None if one run is better.
     """
 
     name: str
@@ -111,13 +113,13 @@ class TaskSpec:
         api: the :data:`API_VERSION` it was written for.
         name: what the user types after ``task=``.
         config_package: importable package with ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and ``preset/NAME/*.yaml``.
-        build: (model settings, dataset) -> the density and colour fields. Of the settings in
-            :data:`neuprim.core.train.settings.OPTIONAL` it gets those that ``uses`` lists, and the task's options as
-            "options".
-        loss: loss settings -> the training loss, which ``train.loss`` may replace. It gets ``train`` and "options".
+        build: (model settings, dataset) -> the density field and the colour field. Of the settings in
+            :data:`neuprim.core.train.settings.OPTIONAL` it gets those that ``uses`` lists, and the options of the task
+            as "options".
+        loss: (settings under ``train``, options of the task as "options") -> the loss; ``train.loss`` may replace it.
         check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for settings that the task does
             not have, before any data is loaded.
-        conditions: that its fields depend on, such as the time.
+        conditions: the conditions that the fields depend on, such as the time.
         fields: class name -> field class, so that a saved model can be rebuilt from its header.
         example: makes a tiny data set for :mod:`neuprim.conformance`, for tasks whose fields need more than posed
             images and conditions within their ranges. Images of about 10 x 10 pixels are enough.
@@ -139,10 +141,10 @@ class TaskSpec:
             each view and as means in ``metrics.json``. Images are in the data set's colour space over its background.
             ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of the mean over views weighted by ``pixels_NAME``;
             ``pixels_NAME`` becomes a sum; all others become plain means over the views that have them.
-        diagnose: (data set, model) -> further JSON-able numbers for ``metrics.json``, such as errors against what is
-            known of the scene.
-        clips: films to make of the test views, or of views kept for films.
-        facts: JSON-able facts that drawing a model may need without its data; kept in the model's header under "data",
+        diagnose: (data set, model) -> further JSON-able numbers for ``metrics.json``, such as errors against the
+            ground truth of a volume.
+        clips: films to make of test views or of other views of the data set.
+        facts: JSON-able values that rendering needs without the data; stored in the model's header under "data",
             with "up" and "center".
         orbit: (data set, number of frames) -> views circling the scene, with every condition of the task.
         tunable_settings: (what ``build`` gets) -> settings that trade quality for speed or size, with the values worth
@@ -152,9 +154,9 @@ class TaskSpec:
 
     api: int
     name: str
-    summary: str
+    summary: str  # one line for neuprim tasks
     config_package: str
-    scenes: tuple[SceneSpec, ...]
+    scenes: tuple[SceneSpec, ...]  # the scenes of the task
     build: Callable[[Mapping[str, Any], Dataset], tuple[DensityField, ColourField]]
     loss: Callable[[Mapping[str, Any]], Loss]
     conditions: tuple[ConditionSpec, ...] = ()
@@ -176,9 +178,9 @@ class TaskSpec:
     tunable_settings: Callable[[Mapping[str, Any]], Mapping[str, Sequence[Any]]] = lambda model: {}
 
     def parameter_names(self) -> set[str]:
-        """Return the names of the parameters that the task's fields have at any settings.
+        """Return the names of all parameters that the fields of the task can have.
 
-        Fields that cannot be made without settings are left out.
+        Fields whose constructor requires settings are left out.
         """
         names = set()
         for cls in (self.fields or {}).values():
@@ -189,5 +191,5 @@ class TaskSpec:
         return names
 
     def scene(self, name: str) -> SceneSpec:
-        """Return the scene of that name; raises KeyError if there is none."""
+        """Return the scene of this name; raises KeyError if there is none."""
         return {s.name: s for s in self.scenes}[name]

@@ -26,11 +26,13 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 
 from neuprim.core.errors import ConfigError, cut_error_text, nearest
 
+__all__ = ["Accepts", "Option", "Range", "Unbounded", "validate_choices", "validate_settings"]
+
 T = TypeVar("T")
 
 Option = tuple[Any, str] | tuple[Any, str, Any]
-"""An option of a task or loss: its default, one line of help, and perhaps its type, as on a settings dataclass, where
-bounds or choices matter; without one, values get the type of the default."""
+"""An option of a task or loss: its default, one line of help, and optionally its type with bounds or choices, as on a
+settings dataclass. Without a type, values are converted to the type of the default."""
 
 _KINDS = {
     bool: "true or false",
@@ -50,14 +52,12 @@ _KINDS = {
 class Range:
     """Bounds of a number: ``Annotated[float, Range(above=0, at_most=1)]``."""
 
-    # the lowest and highest value
-    at_least: float | None = None
-    at_most: float | None = None
-    # instead of these, bounds that are themselves refused
-    above: float | None = None
-    below: float | None = None
-    also: tuple[float, ...] = ()  # values beyond the bounds that have a meaning of their own, e.g. 0 for "none"
-    says: str = ""  # what is expected, where it is more than the bounds ("degrees from 1 to 120")
+    at_least: float | None = None  # lowest value
+    at_most: float | None = None  # highest value
+    above: float | None = None  # instead of at_least: a bound that is itself refused
+    below: float | None = None  # instead of at_most: a bound that is itself refused
+    also: tuple[float, ...] = ()  # further values with a meaning of their own, e.g. 0 for "none"
+    says: str = ""  # what messages say is expected, if not only the bounds ("degrees from 1 to 120")
 
     def accepts(self, value: Any) -> bool:
         return value in self.also or not (
@@ -68,7 +68,7 @@ class Range:
         )
 
     def words(self, kind: str) -> str:
-        """E.g. "0, or a whole number of at least 2"."""
+        """Return the bounds as text for messages, e.g. "0, or a whole number of at least 2"."""
         low = _format_bound(self.at_least if self.above is None else self.above)
         high = _format_bound(self.at_most if self.below is None else self.below)
         if low and high and self.above is self.below is None:
@@ -91,10 +91,10 @@ def _format_bound(value: float | None) -> str:
 
 @dataclass(frozen=True)
 class Accepts:
-    """What no bounds can say: a test of the converted value, and in words what passes it."""
+    """Any other requirement on a value: ``Annotated[str, Accepts(str.islower, "lower-case text")]``."""
 
-    test: Callable[[Any], bool]
-    says: str
+    test: Callable[[Any], bool]  # test of the converted value
+    says: str  # what messages say is expected
 
     def accepts(self, value: Any) -> bool:
         return self.test(value)
@@ -105,9 +105,9 @@ class Accepts:
 
 @dataclass(frozen=True)
 class Unbounded:
-    """Why a number has no bounds: every finite one has a meaning."""
+    """Marks a number for which every finite value has a meaning."""
 
-    why: str
+    why: str  # the reason
 
 
 def nonempty_text(says: str) -> Accepts:
@@ -119,14 +119,14 @@ def nonempty_text(says: str) -> Accepts:
 
 
 def validate_settings(cls: type[T], values: object, where: str = "") -> T:
-    """An instance of the settings dataclass ``cls``.
+    """Return an instance of the settings dataclass ``cls``; its types are checked, and values converted.
 
     Args:
-        values: field name -> value, as read from YAML or the command line; absent fields keep their defaults.
+        values: field name -> value, as read from YAML or the command line; missing fields get their defaults.
         where: dotted key of this group, for messages; empty at the root.
 
     Raises:
-        ConfigError: one line for an unknown or missing key, or a value that its field does not take.
+        ConfigError: one line for an unknown or missing key, or a value that its field does not accept.
     """
     if isinstance(values, cls):
         return values
@@ -148,12 +148,12 @@ def validate_settings(cls: type[T], values: object, where: str = "") -> T:
 
 
 def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
-    """Refuse what a group of free settings must not hold; the values that pass are of the types offered as they are.
+    """Raise ConfigError for a setting that is not offered, or a value that is not of its type.
 
     Args:
-        found: what the user and the preset set.
+        found: the settings of user and preset.
         where: dotted name of the group, for messages.
-        offered: name -> type, as on a settings dataclass; or a tuple of the values to choose from.
+        offered: name -> type, as on a settings dataclass, or a tuple of the allowed values.
     """
     validate_setting_names(found, offered, where)
     for key, value in found.items():

@@ -30,42 +30,39 @@ _OUTSIDE = 0.002  # part of the absorption that may lie outside a model's box, a
 
 @dataclass(frozen=True)
 class InspectionFrame:
-    """One frame. The extinction on its grid is computed at first use.
+    """One frame of a model for inspectors; the extinction on its grid is computed at first use.
 
     Attributes:
-        title: the conditions in words, e.g. "time 0.5".
-        scene_from_index, shape: of the grid, whose axes are the scene's.
+        scene_from_index: (4, 4) transform of the grid, whose axes are those of the scene.
         top: largest extinction shown, 1/scene unit; the same for all frames.
-        gain: factor on a volume's opacity; the same for all frames.
-        focus: (3,) middle of the matter of all frames, scene units.
-        channels: of the model's colours.
-        levels: of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of ``top``.
+        gain: factor on the opacity of a volume; the same for all frames.
+        focus: (3,) centre of the matter of all frames, scene units.
+        levels: extinctions of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of ``top``.
         primitive: row of the primitive to show alone; None for the one that absorbs most.
         truth: computes (X, Y, Z) float32 ground truth on the grid; None if there is none.
         numbers: errors of the model against the ground truth.
-        device: that computes the extinction on the grid.
         side: "model", or "truth" for a panel that shows the ground truth instead.
     """
 
-    model: Primitives
-    conditions: Conditions
-    title: str
+    model: Primitives  # the model
+    conditions: Conditions  # conditions of the frame
+    title: str  # the conditions as text, e.g. "time 0.5"
     scene_from_index: Tensor
-    shape: tuple[int, int, int]
+    shape: tuple[int, int, int]  # number of grid points along each axis
     top: float
     gain: float
     focus: tuple[float, ...] = (0.0, 0.0, 0.0)
-    channels: Channels = field(default_factory=Channels)
+    channels: Channels = field(default_factory=Channels)  # channels of the model's colours
     levels: tuple[float, ...] = ()
     primitive: int | None = None
     truth: Callable[[], np.ndarray] | None = None
-    truth_name: str = ""
+    truth_name: str = ""  # name of the ground truth
     numbers: Mapping[str, float] | None = None
     side: str = "model"
     _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
     def of_side(self, side: str) -> InspectionFrame:
-        """Return the same frame showing its "model" or its "truth"; the grids are shared."""
+        """Return the frame for the panel of the "model" or the "truth"; both share their grids."""
         return replace(self, side=side)
 
     @property
@@ -75,23 +72,23 @@ class InspectionFrame:
 
     @property
     def origin(self) -> np.ndarray:
-        """(3,) the first grid point."""
+        """Position of the first grid point, (3,), scene units."""
         return np.asarray(self.scene_from_index[:3, 3].numpy())
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) corners of the box that the grid's cells fill, scene units."""
+        """Corners of the box that the cells of the grid fill, (2, 3), scene units."""
         low = self.origin - self.step / 2
         return np.stack([low, low + self.step * np.array(self.shape)])
 
     @property
     def scale(self) -> Scale:
-        """Colours of extinctions, the same for all frames."""
+        """Colour scale of the extinction, the same for all frames."""
         return Scale(0.0, self.top, title="extinction", unit="1/scene unit")
 
     @property
     def sigma(self) -> np.ndarray:
-        """(X, Y, Z) float32 extinction of the model, each primitive clamped at 0 from below, or of the truth."""
+        """Extinction of the model, each primitive clamped at 0 from below, or of the truth, (X, Y, Z) float32."""
         if self.side not in self._grids:
             if self.side == "model":
                 grid = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
@@ -104,7 +101,7 @@ class InspectionFrame:
 
     @property
     def difference(self) -> np.ndarray:
-        """(X, Y, Z) float32 model minus truth."""
+        """Extinction of the model minus that of the truth, (X, Y, Z) float32."""
         return self.of_side("model").sigma - self.of_side("truth").sigma
 
     @cached_property
@@ -115,22 +112,22 @@ class InspectionFrame:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """(M,) int64 rows of the model that are active in this frame, in the order of :attr:`geometry`."""
+        """Rows of the active primitives in the model, (M,) int64, in the order of :attr:`geometry`."""
         return np.arange(self.model.count) if self.active.rows is None else self.active.rows.numpy()
 
     @property
     def geometry(self) -> Geometry:
-        """Where the M active primitives are, float32."""
+        """Ellipsoids of the M active primitives, float32."""
         return self.active.geometry
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """(M,) float64 total absorption of each active primitive; see :func:`measure_absorption`."""
+        """Total absorption of each active primitive, (M,) float64: extinction times volume."""
         return measure_absorption(self.active)
 
     @cached_property
     def colours(self) -> np.ndarray:
-        """(M, 3) float32 display-referred colours at the primitives' centres, seen from the first viewpoint."""
+        """Display-referred colours at the primitives' centres, (M, 3) float32, seen from the first viewpoint."""
         low, high = self.box
         center = torch.from_numpy((low + high) / 2).float()
         eye = center + torch.tensor([1.0, -1.6, 0.7]) * float(np.linalg.norm(high - low))
@@ -140,7 +137,7 @@ class InspectionFrame:
         return np.asarray(self.channels.display_rows(rgb.float().clamp_min(0)).numpy())
 
     def chosen_position(self) -> int:
-        """Return the position in :attr:`rows` of the primitive to show alone.
+        """Return the index in :attr:`rows` of the primitive to show alone.
 
         Raises:
             ConfigError: there is no such primitive, or it is not active in this frame.
@@ -214,7 +211,7 @@ def describe_inspected_conditions(conditions: Conditions) -> str:
 
 
 def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
-    """Return the (2, 3) box of ``--box``; raise ConfigError unless it has six numbers and a volume."""
+    """Return the (2, 3) box of the six numbers of ``--box``; raise ConfigError if it has no volume."""
     if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
         given = ",".join(f"{x:g}" for x in numbers)
         raise ConfigError(f"--box {given}: expected the lower and the upper corner, as -1,-1,-1,1,1,1")

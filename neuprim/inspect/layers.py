@@ -14,71 +14,59 @@ from typing import Any, Literal, get_args
 import matplotlib
 import numpy as np
 
+__all__ = ["Ellipsoids", "InspectionGrid", "Isosurfaces", "Mesh", "Painted"]
+__all__ += ["Points", "Scale", "Slices", "Text", "Volume"]
+
 
 @dataclass(frozen=True)
 class Scale:
-    """The colours of numbers; numbers beyond an end have the colour of that end.
+    """A colour scale for numbers; numbers beyond an end have the colour of that end.
 
     Attributes:
-        low, high: its ends; give all frames the same, so that colours mean the same.
-        colours: name of a colour map of matplotlib.
-        title, unit: what the numbers are, for the bar, e.g. "extinction" and "1/scene unit"; no bar without a title.
+        title: name of the quantity for the colour bar, e.g. "extinction"; no bar if empty.
+        unit: unit of the quantity for the colour bar, e.g. "1/scene unit".
     """
 
-    low: float
-    high: float
-    colours: str = "inferno"
+    low: float  # number at the lower end; use the same scale for all frames
+    high: float  # number at the upper end
+    colours: str = "inferno"  # name of a colour map of matplotlib
     title: str = ""
     unit: str = ""
 
     @property
     def label(self) -> str:
-        """For example "extinction [1/scene unit]"."""
+        """Label of the colour bar, e.g. "extinction [1/scene unit]"."""
         return f"{self.title} [{self.unit}]" if self.unit else self.title
 
 
 @dataclass(frozen=True, eq=False)
 class InspectionGrid:
-    """Numbers at the points of a regular grid along the scene's axes; drawn as one of the three kinds below.
+    """Numbers on a regular grid along the scene's axes; base class of volumes, slices and isosurfaces."""
 
-    Attributes:
-        values: (X, Y, Z).
-        origin: (3,) position of ``values[0, 0, 0]``, scene units.
-        spacing: distance of neighbours, scene units.
-    """
-
-    values: np.ndarray
-    origin: np.ndarray
-    spacing: float
-    scale: Scale
+    values: np.ndarray  # (X, Y, Z) numbers
+    origin: np.ndarray  # (3,) position of values[0, 0, 0], scene units
+    spacing: float  # distance of neighbouring points, scene units
+    scale: Scale  # colours of the numbers
 
     @property
     def box(self) -> np.ndarray:
-        """(2, 3) float64 corners of the box that the grid's cells fill."""
+        """Corners of the box that the cells of the grid fill, (2, 3) float64, scene units."""
         low = np.asarray(self.origin, np.float64) - self.spacing / 2
         return np.stack([low, low + self.spacing * np.array(self.values.shape)])
 
 
 @dataclass(frozen=True, eq=False)
 class Volume(InspectionGrid):
-    """A cloud: over a length h it hides 1 - exp(-|value| depth h) of what is behind.
+    """A cloud, with opacity 1 - exp(-|value| depth h) over a length h."""
 
-    Attributes:
-        depth: optical depth per scene unit of the value 1; ``frame.gain`` for extinction.
-    """
-
-    depth: float = 1.0
+    depth: float = 1.0  # optical depth of the value 1 per scene unit; frame.gain for extinction
 
 
 @dataclass(frozen=True, eq=False)
 class Slices(InspectionGrid):
-    """Three planes across the axes.
+    """Three planes perpendicular to the axes."""
 
-    Attributes:
-        through: (3,) the point that they share, scene units; None for the middle of the grid.
-    """
-
-    through: np.ndarray | None = None
+    through: np.ndarray | None = None  # (3,) common point of the planes, scene units; None for the centre of the grid
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,7 +74,7 @@ class Isosurfaces(InspectionGrid):
     """Surfaces of equal value, closed as if values were 0 outside the grid.
 
     Attributes:
-        levels: their values, at least one. A page shows one surface with a slider, which starts at the lowest level.
+        levels: values of the surfaces, at least one. Pages show one surface with a slider, from the lowest level on.
     """
 
     levels: tuple[float, ...] = ()
@@ -94,64 +82,47 @@ class Isosurfaces(InspectionGrid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Painted:
-    """The colours of a shape's parts: numbers on a scale, or colours, or neither (white).
+    """Colours of a layer: numbers on a scale, colours, or neither (white); base class of shapes."""
 
-    Attributes:
-        values: (N,) one number per vertex, point or ellipsoid; with ``scale``.
-        colours: (N, 3) colours, or (3,) for all.
-        opacity: 0..1.
-    """
-
-    values: np.ndarray | None = None
-    scale: Scale | None = None
-    colours: np.ndarray | None = None
-    opacity: float = 1.0
+    values: np.ndarray | None = None  # (N,) numbers, one per vertex, point or ellipsoid; with scale
+    scale: Scale | None = None  # colours of values
+    colours: np.ndarray | None = None  # (N, 3) colours, or (3,) for all
+    opacity: float = 1.0  # opacity 0..1
 
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoids(Painted):
-    """N solid ellipsoids, the most important first: a page shows a limited number.
+    """N solid ellipsoids, the most important first, as pages show a limited number.
 
     Attributes:
-        centres: (N, 3) scene units.
         axes: (N, 3, 3) semi-axes as vectors, ``axes[n, k]`` the k-th, scene units.
     """
 
-    centres: np.ndarray
+    centres: np.ndarray  # (N, 3) centres, scene units
     axes: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Painted):
-    """Triangles, shaded smoothly where they share vertices.
+    """Triangles, shaded smoothly where they share vertices."""
 
-    Attributes:
-        vertices: (N, 3) scene units.
-        faces: (F, 3) integers, rows of ``vertices``.
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray
+    vertices: np.ndarray  # (N, 3) positions, scene units
+    faces: np.ndarray  # (F, 3) integers: rows of vertices
 
 
 @dataclass(frozen=True, eq=False)
 class Points(Painted):
-    """Balls of one size on the screen.
+    """Points, drawn as balls of one size on the screen."""
 
-    Attributes:
-        centres: (N, 3) scene units.
-        size: diameter in pixels.
-    """
-
-    centres: np.ndarray
-    size: float = 8.0
+    centres: np.ndarray  # (N, 3) positions, scene units
+    size: float = 8.0  # diameter in pixels
 
 
 @dataclass(frozen=True)
 class Text:
     """Lines of text in a corner of the picture."""
 
-    text: str
+    text: str  # lines, separated by line breaks
     corner: Literal["upper_right", "lower_right"] = "lower_right"
 
 

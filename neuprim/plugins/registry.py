@@ -26,6 +26,8 @@ if TYPE_CHECKING:  # these modules import torch, which listing does not need
 
 T = TypeVar("T")
 
+__all__ = ["FoundScene", "PluginError", "UnknownPlugin", "find_registered_scene", "load_task"]
+
 BUILT_IN = "neuprim"
 """The distribution whose plugins are the built-in ones."""
 
@@ -260,7 +262,7 @@ PLUGIN_GROUPS: tuple[PluginGroup[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS,
 
 
 def load_task(name: str) -> TaskSpec:
-    """Load the task that ``NAME`` or ``PACKAGE:NAME`` chooses. Raises as :meth:`PluginGroup.load`."""
+    """Return the task ``NAME`` or ``PACKAGE:NAME``; raises UnknownPlugin, or PluginError if it is broken."""
     return TASKS.load(name)
 
 
@@ -282,22 +284,17 @@ def list_scene_names(task: PluginInfo) -> list[str]:
 
 @dataclass(frozen=True)
 class FoundScene:
-    """A scene of a task, from the task's own package or another.
+    """A scene of a task, from the task's own package or another."""
 
-    Attributes:
-        config_package: the package that holds its ``scene/TASK/NAME.yaml``.
-        added_by: the plugin that adds it; None for the task's own.
-    """
-
-    spec: SceneSpec
-    config_package: str
-    added_by: PluginInfo | None = None
+    spec: SceneSpec  # the scene
+    config_package: str  # the package with scene/TASK/NAME.yaml
+    added_by: PluginInfo | None = None  # the plugin that adds the scene; None for the task's own
 
 
 def find_registered_scene(task: TaskSpec, word: str) -> FoundScene:
-    """Find the scene that ``NAME`` or ``PACKAGE:NAME`` chooses; a bare name means the task's own, if it has that one.
+    """Return the scene ``NAME`` or ``PACKAGE:NAME`` of a task; a bare name means the task's own scene if it has one.
 
-    Raises as :meth:`PluginGroup.load`.
+    Raises UnknownPlugin, or PluginError if the plugin is broken.
     """
     package, name = split_plugin_name(word)
     own = {scene.name: scene for scene in task.scenes}

@@ -23,6 +23,8 @@ from neuprim.plugins.attribution import attribute_errors, find_plugin_source
 from neuprim.plugins.registry import EXPORTERS, PluginError, UnknownPlugin
 from neuprim.runs.open import COMPRESSED, Progress, StoredRun, ignore_progress, load_run, open_run
 
+__all__ = ["export_run", "import_run_directory"]
+
 # ---------------------------------------------------------------- export
 
 
@@ -34,15 +36,17 @@ def export_run(
     overwrite: bool = False,
     progress: Progress = ignore_progress,
 ) -> ExportReport:
-    """Write a run's model in a format: whole, or not at all, and over files that exist only with ``overwrite``.
+    """Write a run's model in the export format ``name``; the files are complete or absent.
+
+    They are in ``RUN_DIR/export`` unless ``out`` is given. Only ``overwrite`` replaces existing files.
 
     Args:
         words: ``KEY=VALUE`` options of the exporter, and conditions of the task as ``--NAME TEXT`` or ``--NAME=TEXT``.
         progress: called with (text, fraction 0..1).
 
     Raises:
-        NeuprimError: no such run, format or option, something that the format cannot hold, files in its way, or an
-        exporter that crashed.
+        NeuprimError: run, format or option do not exist, the format cannot hold the model, files exist already, or the
+            exporter crashed.
     """
     run_dir = run.directory if isinstance(run, StoredRun) else run
     try:
@@ -133,14 +137,15 @@ def _parse_run_export_option(text: str) -> Any:
 
 
 def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path:
-    """Make a run directory of a file that a lossless exporter or ``neuprim compress`` wrote; returns ``out``.
+    """Create a run directory from a file of a lossless exporter or of ``neuprim compress``; return it.
 
-    It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``, so that it renders,
-    is measured and exports like the run that it came from.
+    It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``. Commands accept it
+    like the original run.
 
     Raises:
         ConfigError: ``out`` exists and is not empty, or no format reads such files.
-        DataError, CheckpointError: the file is damaged or foreign.
+        DataError: the file is damaged or foreign.
+        CheckpointError: the model in the file is damaged.
     """
     if not path.is_file():
         raise DataError(f"{path}: no such file")

@@ -46,42 +46,44 @@ _TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM = 10_000, 20, 2.0, 
 steps and seconds, and steps before the clock starts."""
 
 
+__all__ = ["Evaluated", "Finishing", "Fitted", "Note", "Preparing", "Step", "fit"]
+
 # ---------------------------------------------------------------- events
 
 
 @dataclass(frozen=True)
 class Preparing:
-    """Work before the training loop; ``fraction`` of it done, 0..1."""
+    """Event: work before the training loop."""
 
     text: str
-    fraction: float = 0.0
+    fraction: float = 0.0  # done fraction of the work, 0..1
 
 
 @dataclass(frozen=True)
 class Step:
-    """One training step; ``progress`` is the used fraction of the budget, 0..1."""
+    """Event: one training step."""
 
     report: StepReport
-    progress: float
+    progress: float  # used fraction of the budget, 0..1
 
 
 @dataclass(frozen=True)
 class Evaluated:
-    """A new point of the held-out curve: mean PSNR of a few held-out views, dB."""
+    """Event: a new point of the held-out curve."""
 
-    psnr: float
+    psnr: float  # mean PSNR of a few held-out views, dB
 
 
 @dataclass(frozen=True)
 class Finishing:
-    """Work after the training loop."""
+    """Event: work after the training loop."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Note:
-    """Something the user should know; it stays on the screen."""
+    """Event: a line of text for the user, which stays on the screen."""
 
     text: str
 
@@ -103,35 +105,31 @@ TrainerFactory = Callable[[Job, Dataset, Loss], Trainer]
 
 @dataclass(frozen=True)
 class Fitted(Job):
-    """A job with its data and the trainer of its model; after :func:`fit` at the end of the budget.
-
-    Attributes:
-        split: which views are measured: "test", or "train, held out" where training views replace the test views.
-    """
+    """A trained model with its configuration, data and trainer; what :func:`fit` returns."""
 
     dataset: Dataset
     channels: Channels
     trainer: Trainer
     lpips: Lpips | None = None
-    split: str = "test"
+    split: str = "test"  # views to measure: "test", or "train, held out" if training views replace the test views
 
     @property
     def model(self) -> Primitives:
-        """The model as it is now, on the device of its training."""
+        """Current model, on the device of the training."""
         return self.trainer.model
 
     @property
     def training(self) -> dict[str, Any]:
-        """Steps done and seconds that they took, as ``metrics.json`` has them."""
+        """Number of steps and seconds of training, as in ``metrics.json``."""
         return {"iterations": self.trainer.step, "train_seconds": self.trainer.elapsed}
 
     def unlock_bands(self) -> None:
-        """Set the fields to the end of a budget, with every band of colour in use."""
+        """Set the fields to the end of the budget, with all bands of spherical harmonics in use."""
         for field in (self.model.density, self.model.colour):
             field.set_progress(1.0)
 
     def metrics(self) -> dict[str, Any]:
-        """Measure the content of ``metrics.json``; the model's size is that of its tensors."""
+        """Measure the held-out views; return the content of ``metrics.json``."""
         self.unlock_bands()
         views = measure_views(self.model, self.task, self.dataset, self.config.renderer, self.lpips)
         size = 4 * sum(value.numel() for value in self.model.params.values())
@@ -139,13 +137,15 @@ class Fitted(Job):
 
 
 def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset | None = None) -> Fitted:
-    """Train a configuration to the end of its budget, in memory.
+    """Train a configuration to the end of its budget, in memory, without files.
 
     Args:
+        config: the configuration.
+        events: function that is called with every event.
         dataset: the scene of the configuration, if it is loaded already.
 
     Raises:
-        NeuprimError: the input is at fault, or numbers are not finite.
+        NeuprimError: the input is wrong, or numbers are not finite.
     """
     with find_config_plugins(config).attribute_errors():
         return train_to_end(prepare_training(config, events, dataset), events)

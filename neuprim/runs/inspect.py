@@ -37,6 +37,8 @@ from neuprim.plugins.registry import INSPECTORS, PluginError
 from neuprim.runs.fit import Events, Note, ignore_run_event
 from neuprim.runs.open import StoredRun, open_run
 
+__all__ = ["InspectRequest", "inspect_run"]
+
 FILMS = (".webp", ".gif", ".mp4")
 OUTPUTS = (".png", *FILMS, ".html", ".vdb")
 """What ``--out`` may end in."""
@@ -47,30 +49,28 @@ _DEPTH = 6.0  # optical depth that a volume is shown with where it is deepest
 
 @dataclass(frozen=True)
 class InspectRequest:
-    """Arguments of ``neuprim inspect``.
+    """What to show of a run's density, as the arguments of ``neuprim inspect``.
 
     Attributes:
-        show: names of inspectors.
-        conditions: name -> text, as ``{"time": "0:1"}``.
-        grid: points along the longest side of the box.
-        box: (2, 3) in the coordinates of the run's data; None: around the ground truth, or what the model absorbs.
-        levels: of isosurfaces, 1/scene unit.
-        primitive: row of the one to show alone.
-        against: ground truth, an OpenVDB file or folder, or "scene".
-        up: "x", "y" or "z"; None: the scene's setting, or z.
-        overwrite: whether files that exist may be replaced.
+        conditions: name -> text, e.g. ``{"time": "0:1"}``.
+        grid: number of points along the longest side of the box.
+        box: (2, 3) box in the coordinates of the run's data; None for the ground truth's, or the model's extent.
+        levels: extinctions of isosurfaces, 1/scene unit.
+        against: ground truth: an OpenVDB file or folder, or "scene".
+        up: upward axis, "x", "y" or "z"; None for the scene's setting, or z.
+        overwrite: whether existing files may be replaced.
     """
 
-    run: Path | StoredRun
-    show: Sequence[str] = ("volume",)
+    run: Path | StoredRun  # run directory, or a loaded run
+    show: Sequence[str] = ("volume",)  # names of inspectors
     conditions: Mapping[str, str] = field(default_factory=dict)
     grid: int = 128
     box: np.ndarray | None = None
     levels: tuple[float, ...] = ()
-    primitive: int | None = None
+    primitive: int | None = None  # row of the primitive to show alone
     against: str | None = None
-    out: Path | None = None
-    size: tuple[int, int] | None = None
+    out: Path | None = None  # file to write; None to open a window
+    size: tuple[int, int] | None = None  # (width, height) of pictures, pixels
     up: str | None = None
     overwrite: bool = False
 
@@ -78,16 +78,16 @@ class InspectRequest:
 def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> list[Path]:
     """Show a run's density in a window, or write files and return them.
 
-    Several frames become numbered files for .png and .vdb, an animation for .webp, .gif and .mp4, and a slider in a
-    page or a window.
+    Several frames become numbered files (.png, .vdb), an animation (.webp, .gif, .mp4), or a slider in a page or a
+    window.
 
     Args:
-        events: gets notes about what is shown: the ground truth, errors of each frame, the grid, warnings.
+        events: function that is called with notes: ground truth, errors of each frame, grid, warnings.
 
     Raises:
-        ConfigError, DataError, CheckpointError: invalid arguments or files, or files in the way.
-        PluginError: an inspector returned what cannot be drawn.
-        BackendUnavailable: pyvista is missing, VTK cannot draw here, or there is no display and no ``out``.
+        NeuprimError: arguments or files are wrong, or files exist already.
+        PluginError: an inspector returned something that cannot be shown.
+        BackendUnavailable: pyvista is missing, VTK cannot render here, or there is no display and no ``out``.
     """
     kind = "" if request.out is None else request.out.suffix.lower()
     if request.out is not None and kind not in OUTPUTS:

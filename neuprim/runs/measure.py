@@ -41,6 +41,8 @@ from neuprim.runs.open import StoredRun, load_dataset, load_run, model_file, mov
 from neuprim.runs.render_config import estimate_run_file_bytes, parse_run_rendering
 from neuprim.version import __version__
 
+__all__ = ["ViewMetrics", "evaluate_run", "measure_views", "render_image"]
+
 _VISIBLE_PSNR = 20 * math.log10(255)
 """dB: errors below one of 255 levels are not visible, and the black image of an empty frame has no error at all."""
 
@@ -50,18 +52,17 @@ class ViewMetrics:
     """Metrics of one view.
 
     Attributes:
-        psnr, ssim: in the data set's colour space.
-        seconds: of the forward pass alone.
+        seconds: time of the forward pass.
         black: PSNR of an image of the background alone.
-        more: further numbers by name, see the module and :attr:`~neuprim.core.task.TaskSpec.metrics`: ``psnr_gain`` of
-            opaque photographs; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
-            ``psnr_black_image_mask`` of an image without anything on it.
-        empty: the model is not in the view; the image is the background alone.
+        more: further metrics by name: those of :attr:`~neuprim.core.task.TaskSpec.metrics`; ``psnr_gain`` of opaque
+            photographs; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
+            ``psnr_black_image_mask`` of an empty image.
+        empty: whether the image is the background alone, because the model is not in the view.
     """
 
     name: str
-    psnr: float
-    ssim: float
+    psnr: float  # PSNR in the data set's colour space, dB
+    ssim: float  # SSIM in the data set's colour space
     seconds: float
     black: float = -math.inf
     more: dict[str, float] = field(default_factory=dict)
@@ -69,7 +70,7 @@ class ViewMetrics:
 
 
 def render_image(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
-    """Render one view without gradients: (H, W, C) on the CPU."""
+    """Return the (H, W, C) image of one view on the CPU, without gradients."""
     with torch.no_grad():
         return render(model, view.camera, view.conditions, settings, background).rgb.cpu()
 
@@ -108,12 +109,12 @@ def measure_views(
     on_view: Callable[[int, View, Tensor, Tensor], None] | None = None,
     render_view: Callable[[Primitives, View, Tensor], Tensor] | None = None,
 ) -> list[ViewMetrics]:
-    """Measure every view of the test split, composited over the data set's background.
+    """Return the metrics of every view of the test split, composited over the data set's background.
 
     Args:
-        lpips: is measured too, if given.
-        on_view: called as ``on_view(index, view, rendered, truth)`` for each, for example to keep pictures.
-        render_view: (model, view, background) -> image, in place of :func:`render_image` with the settings.
+        lpips: LPIPS to measure, too.
+        on_view: function that is called with (index, view, rendered, truth), for example to write pictures.
+        render_view: function (model, view, background) -> image, instead of :func:`render_image`.
     """
     draw = render_view or (lambda model, view, background: render_image(model, view, settings, background))
     result = []
@@ -198,12 +199,12 @@ def _table_metrics(rendered: Tensor, truth: Tensor, channels: Channels, lpips: L
 def evaluate_run(
     run: Path | StoredRun, lpips: str | Path | None = None, overrides: Sequence[str] = ()
 ) -> dict[str, Any]:
-    """Measure a run's last checkpoint again, from disk alone; the same numbers as the run's own.
+    """Measure a finished run again from its files; return the content of ``metrics.json``.
 
     Args:
-        lpips: weights for LPIPS; None for those that the run names.
-        overrides: of a render configuration (:mod:`neuprim.runs.render_config`); ``model_bytes`` is the size of the
-            run's file with these changes.
+        lpips: file or folder with weights for LPIPS; None for the run's own.
+        overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`; ``model_bytes`` is the size
+            of the model with them.
     """
     run = load_run(run)
     config = parse_run_rendering(overrides, run.config.renderer, run.model)

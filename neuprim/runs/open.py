@@ -39,6 +39,8 @@ from neuprim.plugins.attribution import attribute_errors
 from neuprim.plugins.provenance import warn_of_other_provenance
 from neuprim.plugins.registry import PluginError
 
+__all__ = ["StoredRun", "load_dataset", "load_run", "open_run", "read_metrics"]
+
 COMPRESSED = "model.neuprim"
 """A run's model in few bits, as ``neuprim compress`` writes it."""
 
@@ -60,21 +62,16 @@ def ignore_progress(text: str, fraction: float) -> None:
 
 @dataclass(frozen=True)
 class StoredRun(Job):
-    """A finished run in a directory. ``task`` reads positions in the coordinates of the data's files.
-
-    Attributes:
-        header: of the model file.
-        scene_task: the same task, which reads positions in the coordinates of the model.
-    """
+    """A finished run. ``task`` reads positions in the coordinates of the data's files."""
 
     directory: Path
     model: Primitives
-    header: dict[str, Any]
-    scene_task: TaskSpec
+    header: dict[str, Any]  # header of the model file
+    scene_task: TaskSpec  # the task, which reads positions in the coordinates of the model
 
     @property
     def world(self) -> World:
-        """The transform between the coordinates of the model and those of the data's files."""
+        """Transform between the coordinates of the model and those of the data's files."""
         return World.of(self.header, str(model_file(self.directory)))
 
 
@@ -85,7 +82,7 @@ def model_file(run_dir: Path) -> Path:
 
 
 def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
-    """Load the configuration, task and model of a run directory; a run that is loaded already is returned as it is.
+    """Return configuration, task and model of a run directory; a loaded run is returned unchanged.
 
     Warns if another version of neuprim or of the task's package made the run.
 
@@ -93,7 +90,8 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
         named: whether warnings name the file; not for a directory that the user does not know.
 
     Raises:
-        CheckpointError, ConfigError: names the file that is missing or damaged.
+        CheckpointError: a file is missing or damaged.
+        ConfigError: ``config.yaml`` is wrong.
     """
     if isinstance(run, StoredRun):
         return run
@@ -123,10 +121,10 @@ def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContex
 
 
 def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
-    """Load the data set of a job. That of a stored run lies as it did for the model, whatever was added to its files.
+    """Return the data set of a run, with the coordinates of the stored model.
 
     Raises:
-        NeuprimError: the loader refuses its files or settings, or it crashed.
+        NeuprimError: the files or settings are wrong, or the loader crashed.
     """
     context = make_run_scene_context(job.config, progress)
     if isinstance(job, StoredRun):
@@ -141,9 +139,9 @@ def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
 
 
 def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> TrainedModel:
-    """Open the model of a run for exporters and inspectors; its scene is loaded only when asked for.
+    """Return the model of a run for exporters and inspectors; its scene is loaded only on demand.
 
-    Raises as :func:`load_run`.
+    Raises the errors of :func:`load_run`.
     """
     stored = load_run(run)
     config = stored.config
@@ -173,10 +171,10 @@ def move_to_render_device(model: Primitives, settings: RenderSettings, view: Vie
 
 
 def read_metrics(run_dir: Path) -> dict[str, Any]:
-    """Read ``metrics.json`` of a run.
+    """Return the content of ``metrics.json`` of a run.
 
     Raises:
-        DataError: missing or damaged.
+        DataError: the file is missing or damaged.
     """
     path = run_dir / "metrics.json"
     try:

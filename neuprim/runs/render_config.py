@@ -45,6 +45,8 @@ from neuprim.version import __version__
 
 _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0, at most 1")]
 
+__all__ = ["RenderConfig", "parse_run_rendering"]
+
 _MOST_LIGHTS = 128
 _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # those of sRGB: x and y of red, green, blue, white
 
@@ -66,19 +68,15 @@ def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -
 
 @dataclass(frozen=True)
 class RenderConfig:
-    """How to draw a model.
+    """A render configuration: how to render a finished model."""
 
-    Attributes:
-        resolution: factor of width and height, above 0 and at most 1.
-        reduced: ("density" or "colour", setting) -> its smaller value.
-    """
-
-    settings: RenderSettings = field(default_factory=RenderSettings)
-    resolution: float = 1.0
+    settings: RenderSettings = field(default_factory=RenderSettings)  # overrides renderer.KEY=VALUE
+    resolution: float = 1.0  # factor on width and height, above 0 and at most 1; override resolution=0.5
+    # reduced settings of fields: ("density" or "colour", name) -> smaller value; override colour.degree=1
     reduced: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     def to_overrides(self, defaults: RenderSettings) -> tuple[str, ...]:
-        """Return overrides that :func:`parse_run_rendering` reads back, over default settings."""
+        """Return the overrides that :func:`parse_run_rendering` parses to this configuration."""
         before = dataclasses.asdict(defaults)
         values = dataclasses.asdict(self.settings)
         words = [
@@ -90,20 +88,20 @@ class RenderConfig:
         return (*words, *(f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()))
 
     def prepare_model(self, model: Primitives) -> Primitives:
-        """Return the model to draw, with reduced fields; itself if nothing changes."""
+        """Return the model with reduced fields; itself if nothing changes."""
         for (kind, name), value in self.reduced.items():
             model = reduce_model(model, kind, name, value)
         return model
 
     def scale_view(self, view: View) -> View:
-        """Return the view at the resolution to draw."""
+        """Return the view at the resolution to render."""
         if self.resolution == 1.0:
             return view
         size = (max(1, round(self.resolution * side)) for side in (view.camera.width, view.camera.height))
         return replace(view, camera=view.camera.resized(*size))
 
     def upsample(self, image: Tensor, camera: AnyCamera) -> Tensor:
-        """Return an image at the camera's own size, (H, W, C)."""
+        """Return an image scaled to the size of the camera, (H, W, C)."""
         size = (camera.height, camera.width)
         if image.shape[:2] == size:
             return image
@@ -113,10 +111,11 @@ class RenderConfig:
     def render_view(
         self, model: Primitives, view: View, background: Tensor, on_alpha: Callable[[Tensor], None] = lambda alpha: None
     ) -> Tensor:
-        """Render a view of a model from :meth:`prepare_model`, without gradients: (H, W, C) on the CPU.
+        """Return the (H, W, C) image of a view on the CPU, without gradients.
 
         Args:
-            on_alpha: called with the image's alpha.
+            model: the result of :meth:`prepare_model`.
+            on_alpha: function that is called with the alpha of the image.
         """
         small = self.scale_view(view)
         with torch.no_grad():
@@ -126,7 +125,10 @@ class RenderConfig:
 
 
 def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, model: Primitives) -> RenderConfig:
-    """Parse overrides of the rendering of a model, over default settings.
+    """Return the render configuration of overrides such as ``renderer.samples=2`` and ``resolution=0.5``.
+
+    Args:
+        defaults: settings that the overrides do not name.
 
     Raises:
         ConfigError: an unknown key or setting, a reduction that the model's fields lack, or an invalid value.

@@ -28,6 +28,8 @@ from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device, refuse_run_results
 from neuprim.runs.render_config import RunExrLayers, parse_run_rendering
 
+__all__ = ["RenderRequest", "render_run"]
+
 SPACES = WORLD, SCENE = ("world", "scene")
 """Whose coordinates a file of cameras has, after ``--space``."""
 
@@ -42,24 +44,24 @@ and npy."""
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What to render of a run.
+    """What to render of a run, as the arguments of ``neuprim render``.
 
     Attributes:
-        camera: "orbit", "test" or a file of cameras (see :mod:`neuprim.core.cameras.camera_files`).
-        size: (width, height) in pixels; None for that of the cameras.
-        format: one of :data:`FORMATS`. None: the suffix of ``out`` decides; otherwise views that differ in a condition
-            become a WebP animation and others PNGs.
-        out: a file or folder; None for a folder in the run's ``frames``.
-        frames: of an orbit.
+        camera: "orbit", "test" (the held-out views) or a file of cameras.
+        size: (width, height) in pixels; None for the size of the cameras.
+        format: "png", "exr", "npy", "webp", "gif" or "mp4". None: the suffix of ``out`` decides; otherwise views that
+            differ in a condition become a WebP animation and others PNGs.
+        out: file or folder to write; None for a folder in the run's ``frames``.
+        frames: number of views of an orbit.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: of an animation; None for what the cameras' file says, or what makes it last four seconds, at 5 to 30.
-        environment: light from all around instead of the task's light.
-        overrides: of a render configuration (:mod:`neuprim.runs.render_config`).
-        layers: of an OpenEXR file, separated by commas; None for all but a layer per light.
-        datatype: of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
-        space: of cameras of a file, lights, and what is written of cameras and depths: "world", the coordinates of the
-            data's files, or "scene", those of the model, for volumes their unit box.
-        overwrite: replace pictures of the run's report.
+        fps: frames per second; None for those of the cameras' file, or for about four seconds, at 5 to 30.
+        environment: environment map that replaces the task's light.
+        overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`.
+        layers: layers of an OpenEXR file, separated by commas; None for all but a layer per light.
+        datatype: type of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
+        space: coordinates of cameras in files, lights and depths: "world", those of the data's files, or "scene", those
+            of the model.
+        overwrite: whether to replace pictures of the run's report.
     """
 
     camera: str
@@ -83,16 +85,15 @@ def render_run(
     notify: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
 ) -> list[Path]:
-    """Render a run's model: one file per view, or one animation of several views; returns the files.
+    """Render images of a run, as one file per view or one animation; return the files.
 
     Args:
-        notify: called with lines for the user, e.g. what the model never saw.
-        progress: called with (text, fraction 0..1) while images are rendered.
+        notify: function that is called with lines for the user, e.g. about conditions beyond the training data.
+        progress: function that is called with (text, fraction 0..1).
 
     Raises:
-        DataError, ConfigError, CheckpointError: bad cameras, conditions, or run directory; no image shows anything of
-        the model.
-        BackendUnavailable: a format whose package is missing.
+        NeuprimError: cameras, conditions or run directory are wrong, or no image shows anything of the model.
+        BackendUnavailable: the package of a format is missing.
     """
     run = load_run(run)
     session = _RunRenderSession(run, request, notify, progress)

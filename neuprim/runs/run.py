@@ -42,6 +42,8 @@ from neuprim.runs.training import (
 CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
 """In a run's directory: the record, and the runs of the chunks."""
 
+__all__ = ["run"]
+
 JOINT_SHARE = 0.2
 """Share of the budget in which the joined model is trained as one, so that primitives on both sides of a boundary adapt
 to each other. More of it makes the result worse."""
@@ -61,21 +63,22 @@ def run(
     group: ProcessGroup | None = None,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> Path:
-    """Fit, measure and report; returns the run directory.
+    """Train, measure and write the report; return the run directory.
 
-    Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second one stops at
-    once.
+    Ctrl-C finishes the step, writes a checkpoint and a report, and raises KeyboardInterrupt; a second Ctrl-C stops
+    immediately.
 
     Args:
-        between: called between training steps, see :data:`~neuprim.runs.training.BetweenSteps`.
-        group: the processes that train this model, each of which calls this with the same configuration; the first one
-            alone writes files. None for one process.
-        launcher: where the chunks of a scene are fitted, if it is fitted in chunks.
+        config: the configuration.
+        events: function that is called with every event.
+        between: function (trained model, event) to call between steps; setting the event stops like Ctrl-C.
+        group: processes that train this model together, each of which calls this function; the first one writes files.
+        launcher: where to train the chunks of a scene, if it is trained in chunks.
 
     Raises:
-        NeuprimError: the input is at fault, another process is at work there, or numbers are not finite; what was on
-            disk before is intact.
-        RankError: another rank ended; what was trained is in the checkpoint.
+        NeuprimError: the input is wrong, another process uses the directory, or numbers are not finite; existing files
+            are intact.
+        RankError: another rank ended; the checkpoint has the last state.
     """
     directory, preview = config.output_dir, RunPreview(events, between)
     first = group is None or group.is_first

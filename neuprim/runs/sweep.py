@@ -27,6 +27,8 @@ from neuprim.runs.launch.jobs import JobResult, JobStatus, LaunchJob
 from neuprim.runs.launch.launcher import LAUNCH_FOLDER, OnStatus, check_launcher, ignore_status, launch_jobs
 from neuprim.runs.open import lock_run_directory, model_file
 
+__all__ = ["run_sweep"]
+
 SWEEP_FILE = "sweep.json"
 """In a sweep's directory."""
 
@@ -265,16 +267,22 @@ def run_sweep(
     settings: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     on_status: OnStatus = ignore_status,
 ) -> tuple[LaunchRecord, list[JobResult | None]]:
-    """Fit all configurations of a sweep, each in its own directory, and compare them.
+    """Train all configurations of a sweep, each in its own directory, and write the page that compares them.
 
-    Runs that are done already are kept, and with ``resume`` the others go on. One that fails does not stop the others.
+    Finished runs are kept; with ``resume`` the others continue. A failed run does not stop the others.
 
     Args:
-        configs: as :func:`~neuprim.config.compose_all` gives them, all in one directory.
-        words: what the sweep was asked for.
+        configs: configurations of :func:`~neuprim.config.compose_all`, all in one directory.
+        words: overrides of the sweep.
+        settings: where to train, and how many runs at a time.
+        on_status: function that is called with (index of the run, status).
 
-    Returns, raises and calls ``on_status`` as :func:`launch_missing_runs`; another process at work in the sweep's
-    directory is a ConfigError.
+    Returns:
+        the record of the sweep, and a result for each configuration; None for runs that Ctrl-C prevented.
+
+    Raises:
+        NeuprimError: the launcher cannot work here, or another process uses the directory.
+        OSError: the record cannot be written.
     """
     folder, keys = configs[0].output_dir.parent, set(swept_override_keys(words))
     runs = []

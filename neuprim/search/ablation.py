@@ -60,6 +60,8 @@ from neuprim.search.trials import NOT_TRAINED_WITH, Outcome, Trial, TrialFailed,
 
 TRIALS = "trials"  # folder of the models
 
+__all__ = ["run_ablation"]
+
 _PACES, _TRAINING = 0.2, 0.5
 """Shares of the budget for measuring step times, and, of the rest, for training single changes."""
 
@@ -80,16 +82,16 @@ def run_ablation(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> tuple[Path, TradeoffRecord]:
-    """Train, measure, and write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
+    """Train models with other settings and measure them; write ``tradeoff.json``, ``.html`` and ``front.png``.
 
-    Returns the folder of the set and its record. A larger budget adds what did not fit.
+    Returns the folder and its record. The same call with a larger budget adds models.
 
     Args:
         request: its overrides are those of ``neuprim run``.
         launcher: where models are trained; they are measured here.
 
     Raises:
-        NeuprimError: invalid overrides, no such knob, data that cannot be read, or a folder that holds something else.
+        NeuprimError: overrides, settings, data or folder are wrong.
     """
     models = _compose_ablation_set(request, launcher)
     folder, centre, task = models.folder, models.centre, load_config_task(models.centre)

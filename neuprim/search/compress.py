@@ -34,6 +34,8 @@ from neuprim.runs.training import count_run_finetune_steps, make_run_finetune_tr
 from neuprim.search.model_quality import SearchQuality
 from neuprim.search.pruning_cuts import mask_pruned_numbers
 
+__all__ = ["CompressRequest", "Compression", "StoredParameter", "compress_run"]
+
 Progress = Callable[[str, float], None]
 
 DEFAULT_TOLERANCE = 0.1  # dB that training views may lose
@@ -52,21 +54,22 @@ _FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the m
 
 @dataclass(frozen=True)
 class CompressRequest:
-    """What to compress.
+    """What to compress, as the arguments of ``neuprim compress``.
 
-    Unless a level or bits are given, training views decide how coarse every number may be, within ``tolerance``.
-    Without the run's data the level is :data:`~neuprim.core.compression.quantizers.DEFAULT_LEVEL`.
+    Without level and bits, the PSNR of training views decides how many bits every number gets, within ``tolerance``.
+    Without the run's data as well, a default level is used.
 
     Attributes:
-        level: 1 (nearly lossless) to 5 (very small), see :data:`neuprim.core.compression.quantizers.LEVELS`.
+        level: 1 (nearly lossless) to 5 (very small).
         bits: overrides NAME=BITS of a level.
-        out: the file; None for ``model.neuprim`` in the run directory.
+        out: the file to write; None for ``model.neuprim`` in the run directory.
         overwrite: whether an existing file may be replaced.
-        seconds: of fine-tuning for few bits, about; steps: so many instead, for the same file on every machine.
-        tolerance: dB that training views may lose; neither with a level nor with bits.
+        seconds: approximate time of fine-tuning for few bits.
+        steps: steps of fine-tuning instead of ``seconds``; the result is then the same on every machine.
+        tolerance: PSNR that training views may lose, dB; not together with level or bits.
     """
 
-    run_dir: Path
+    run_dir: Path  # the run directory
     level: int | None = None
     bits: Sequence[str] = ()
     out: Path | None = None
@@ -85,42 +88,36 @@ class CompressRequest:
 
 
 class StoredParameter(NamedTuple):
-    """A parameter's bits per number, as text, its bytes in float32 and in the file."""
+    """Size of one parameter in a compressed file."""
 
-    name: str
-    bits: str
-    before: int
-    after: int
+    name: str  # name of the parameter
+    bits: str  # bits per number, as text
+    before: int  # bytes in float32
+    after: int  # bytes in the file
 
 
 @dataclass(frozen=True)
 class Compression:
-    """Result of compressing.
+    """Result of compression."""
 
-    Attributes:
-        before: bytes of the numbers in float32; after: bytes of the file.
-        measured: "psnr" and "ssim" -> means over test views before and after; empty without the run's data.
-        seconds: of training, encoding and writing; steps: of training.
-    """
-
-    file: Path
+    file: Path  # the compressed file
     parameters: tuple[StoredParameter, ...]
-    before: int
-    after: int
-    measured: dict[str, tuple[float, float]]
-    seconds: float
-    steps: int
-    notes: tuple[str, ...]
+    before: int  # bytes of the numbers in float32
+    after: int  # bytes of the file
+    measured: dict[str, tuple[float, float]]  # "psnr", "ssim" -> means of test views before and after; {} without data
+    seconds: float  # time of training, encoding and writing
+    steps: int  # steps of training
+    notes: tuple[str, ...]  # lines for the user
 
 
 def compress_run(request: CompressRequest, progress: Progress = lambda text, fraction: None) -> Compression:
-    """Write a run's model as a compressed file, atomically, and measure the loss where the run's data are available.
+    """Write a run's model as a compressed file; measure the loss of quality if the run's data are available.
 
-    Fine-tuning renders every image from quantized numbers (straight-through gradients). The trained or the untrained
-    model is written, whichever training views prefer.
+    Fine-tuning renders every image from quantised numbers (straight-through gradients). The file has the fine-tuned
+    model only if its training views are better.
 
     Raises:
-        NeuprimError: no such run, level or parameter, numbers that cannot be stored, or an existing file.
+        NeuprimError: run, level or parameter do not exist, numbers cannot be stored, or the file exists already.
     """
     run_dir = request.run_dir
     if request.tolerance is not None and request.by_level:

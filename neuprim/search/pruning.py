@@ -36,6 +36,8 @@ MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
 """Rounds of fine-tuning, unless a round would be longer than these steps; least steps of a round. Every round ends at
 the rates of the run's end, so that evaluated models are as well trained."""
 
+__all__ = ["PruneRequest", "Pruning", "prune_run"]
+
 _PATIENCE = 2.0  # a model that lost at most this many tolerances is trained for another round before it is taken back
 
 _FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
@@ -235,17 +237,18 @@ class ModelShrinker:
 
 @dataclass(frozen=True)
 class PruneRequest:
-    """What to prune.
+    """What to prune, as the arguments of ``neuprim prune``.
 
     Attributes:
-        tolerance: dB that training views may lose.
-        seconds: of fine-tuning, about; steps: so many instead, for the same model on every machine.
+        tolerance: PSNR that training views may lose, dB.
+        seconds: approximate time of fine-tuning.
+        steps: steps of fine-tuning instead of ``seconds``; the result is then the same on every machine.
         out: the new run directory; None for the run's name with "-pruned".
         overwrite: whether existing files may be replaced.
         hold_out: n > 1: leave every n-th training view out of training and decisions; 0: none.
     """
 
-    run_dir: Path
+    run_dir: Path  # the run directory
     tolerance: float = 0.1
     seconds: float = 60.0
     steps: int | None = None
@@ -256,34 +259,33 @@ class PruneRequest:
 
 @dataclass(frozen=True)
 class Pruning:
-    """Result of pruning; the content of ``pruned.json``, but for ``run_dir``.
+    """Result of pruning; ``pruned.json`` has the same content without ``run_dir``.
 
     Attributes:
-        run_dir: the new run; None where nothing could be removed, and nothing was written.
-        before, after: primitives, numbers, bytes, psnr and ssim of the test views, frames_per_second.
+        run_dir: the new run directory; None if nothing could be removed, and nothing was written.
+        before: numbers of the original: primitives, numbers, bytes, psnr and ssim of test views, frames_per_second.
         reduced: reductions of fields, as in ``model.reduced``.
-        kept: unit -> share of the primitives that have it.
-        judged_psnr: dB of the deciding training views, before and after.
+        judged_psnr: PSNR of the deciding training views before and after, dB.
     """
 
     run_dir: Path | None
-    steps: int
-    seconds: float
+    steps: int  # steps of fine-tuning
+    seconds: float  # time of pruning
     before: dict[str, float]
-    after: dict[str, float]
+    after: dict[str, float]  # the same numbers of the pruned model
     reduced: tuple[str, ...]
-    kept: dict[str, float]
+    kept: dict[str, float]  # unit -> share of the primitives that have it
     judged_psnr: tuple[float, float]
-    stages: tuple[PruningStage, ...]
+    stages: tuple[PruningStage, ...]  # the rounds of pruning
 
 
 def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction: None) -> Pruning:
-    """Remove primitives, units and parts of fields as far as training views allow, with fine-tuning in between.
+    """Prune a run with fine-tuning, as far as the PSNR of training views allows; write the result as a new run.
 
-    Test views are measured before and after; they decide nothing.
+    It removes primitives, units such as neurons, and parts of fields. Test views are only measured.
 
     Raises:
-        NeuprimError: no such run, data that cannot be read, or existing files.
+        NeuprimError: the run does not exist, its data cannot be read, or files exist already.
     """
     final = request.out or request.run_dir.with_name(f"{request.run_dir.resolve().name}-pruned")
     if final.exists() and not final.is_dir():

@@ -48,6 +48,8 @@ from neuprim.search.tradeoff_record import (
 _IMAGES, _TIMES, _COMBINED = 0.45, 0.65, 0.85
 """Shares of the budget by which images and times of single changes, and combinations should be done."""
 
+__all__ = ["measure_tradeoff"]
+
 _COMBINATIONS = 24
 
 
@@ -89,10 +91,10 @@ def measure_tradeoff(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> TradeoffRecord:
-    """Measure, and write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
+    """Measure how render settings trade quality for speed; write ``tradeoff.json``, ``.html`` and ``front.png``.
 
     Raises:
-        NeuprimError: no such run or knob, no test views, invalid overrides, or a damaged record.
+        NeuprimError: run or setting do not exist, there are no test views, or overrides or the record are wrong.
     """
     folder = request.out or run_dir / TRADEOFF_FOLDER
     if request.out and folder.is_dir() and any(folder.iterdir()) and not (folder / TRADEOFF_FILE).exists():

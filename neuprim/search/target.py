@@ -49,6 +49,8 @@ from neuprim.search.target_record import (
 )
 from neuprim.search.trials import NOT_TRAINED_WITH
 
+__all__ = ["run_target"]
+
 _FIRST_SHARE = 0.05  # share of the squared error at which the search for coarse numbers begins
 
 _MAX_TUNING, _MIN_TUNING = 3, 600
@@ -67,17 +69,20 @@ def run_target(
     clock: Callable[[], float] = time.monotonic,
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
 ) -> TargetRecord:
-    """Find and train the smallest model; leaves a run directory with ``target.json`` and ``model.neuprim``.
+    """Find and train the smallest model that reaches a target, or the best one within limits.
+
+    The directory of ``config`` becomes a run directory with ``target.json`` and ``model.neuprim``.
 
     Args:
-        config: its primitives are the first size tried, its iterations the most of a run.
+        config: the run; its primitives are the first size to try, its iterations the upper bound.
+        target: quality to reach, and limits of size and speed.
         budget: seconds of search, training and measuring; compiling kernels does not count.
-        clock: seconds, monotonic.
-        launcher: where trainings run.
+        clock: function that returns monotonic seconds.
+        launcher: where to train.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C; the same call with ``resume`` continues.
-        NeuprimError: invalid input, or a budget in which nothing can be trained.
+        NeuprimError: the input is wrong, or the budget is too small for any training.
     """
     _check_target_config(config)
     record = _resume_target_search(config, {**target.given_settings(), "budget": budget})

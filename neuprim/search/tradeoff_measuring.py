@@ -31,6 +31,8 @@ from neuprim.search.model_quality import EvalView, choose_trial_views, fill_mask
 from neuprim.search.tradeoff_record import TRADEOFF_FILE, TradeoffPoint, TradeoffRecord
 from neuprim.version import __version__
 
+__all__ = ["TradeoffRequest"]
+
 _MAX_CACHED = 1 << 29  # bytes of prepared models that are kept between rounds
 _PER_REFERENCE = 6  # points per drawing of the reference in a round
 _WARM_UP_SIZE = 16  # pixels of the side of a first image, so that compiling and loading are no part of a frame's time
@@ -244,14 +246,14 @@ def _warm_up_tradeoff_renderer(draw: Renderer, view: View) -> None:
 
 @dataclass(frozen=True)
 class TradeoffRequest:
-    """What to measure.
+    """What to measure, as the arguments of ``neuprim tradeoff``.
 
     Attributes:
-        words: overrides of the reference configuration, over how the run draws; of trained models, those of the centre.
-        budget: seconds, about; points that do not fit are left out.
-        views: evaluation views, evenly spread.
-        repeats: rounds of timing.
-        knobs: names of the settings to change; empty for all.
+        words: overrides of the reference: render settings of a run, or all settings of models to train.
+        budget: approximate seconds; measurements that do not fit are left out.
+        views: number of held-out views to measure, evenly spread.
+        repeats: number of timings.
+        knobs: names of the settings to vary; empty for all.
         lpips: weights for LPIPS; None for those of the run.
         out: folder of the results; None for the one that follows from the run, or from task and scene.
     """

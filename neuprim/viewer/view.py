@@ -25,6 +25,8 @@ from neuprim.viewer.server import ViewerServer
 from neuprim.viewer.session import RenderQueue, Session
 from neuprim.viewer.viewer_scene import ViewerScene, Viewpoint, open_viewer_scene
 
+__all__ = ["view_run"]
+
 _POLL_SECONDS = 0.25  # between checks whether the viewer is to end
 _UPDATE_SECONDS = 0.5  # between updates of a page's numbers
 _PAUSE_SECONDS = 0.1  # between checks of a paused training
@@ -40,13 +42,14 @@ def view_run(
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     end: threading.Event | None = None,
 ) -> None:
-    """Show a finished run in the browser until ``end`` is set, or Ctrl-C.
+    """Show a finished run in the browser until ``end`` is set or Ctrl-C.
 
     Args:
-        on_open: called with the address of the page, with its token.
+        on_open: function that is called with the address of the page, including its token.
 
     Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged, or the wrong setting.
+        CheckpointError: a file is missing or damaged.
+        ConfigError: a setting is wrong.
     """
     end = end or threading.Event()
     queue, scene = RenderQueue(), open_viewer_scene(run_dir, warn, progress)

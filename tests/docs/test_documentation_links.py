@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
-import re
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +11,6 @@ import yaml
 from tests.docs.pages import PAGES, ROOT, anchors, links, name_of
 
 SITE = yaml.safe_load((ROOT / "mkdocs.yml").read_text(encoding="utf-8"))
-DIRECTIVE = re.compile(r"^::: ([\w.]+)$", re.MULTILINE)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=name_of)
@@ -44,10 +41,3 @@ def test_every_picture_is_shown() -> None:
     shown = {(page.parent / target).resolve() for page in PAGES for target in links(page)}
     pictures = {p for p in (ROOT / "docs" / "pictures").iterdir() if p.name != Path(SITE["theme"]["favicon"]).name}
     assert pictures <= shown
-
-
-def test_every_module_of_the_reference_exists() -> None:
-    names = [name for page in PAGES for name in DIRECTIVE.findall(page.read_text(encoding="utf-8"))]
-    assert len(names) > 30 and len(set(names)) == len(names)
-    for name in names:
-        assert importlib.import_module(name).__doc__, name

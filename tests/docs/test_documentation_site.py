@@ -16,13 +16,17 @@ for package in ("mkdocs", "material", "mkdocstrings"):
     pytest.importorskip(package)
 
 
-@pytest.fixture(scope="module")
-def hooks() -> Any:
-    spec = importlib.util.spec_from_file_location("documentation_hooks", ROOT / "docs" / "hooks.py")
+def load(name: str) -> Any:
+    spec = importlib.util.spec_from_file_location(f"documentation_{name}", ROOT / "docs" / f"{name}.py")
     assert spec is not None and spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(module)
     return module
+
+
+@pytest.fixture(scope="module")
+def hooks() -> Any:
+    return load("hooks")
 
 
 def page(uri: str) -> Any:
@@ -56,3 +60,18 @@ def test_a_page_that_loads_from_the_network_is_a_warning(hooks: Any, caplog: pyt
         assert caplog.messages == []
         hooks.on_post_page('<script src="https://a.b/c.js">', page("a.md"))
     assert len(caplog.messages) == 1 and "a.md would load" in caplog.messages[0]
+
+
+def test_comments_of_fields_become_entries() -> None:
+    import griffe
+
+    comments = load("field_comments")
+    text = "A box.\n\nAttributes:\n    b: second,\n        on two lines.\n"
+    merged = comments.merge_entries(text, {"c": "third", "a": "first"}, ["a", "b", "c"])
+    assert merged == "A box.\n\nAttributes:\n    a: first\n    b: second,\n        on two lines.\n    c: third\n"
+    assert comments.merge_entries("A box.", {"a": "first"}, ["a"]) == "A box.\n\nAttributes:\n    a: first\n"
+    extensions = griffe.load_extensions(comments.FieldComments)
+    package = griffe.GriffeLoader(search_paths=[ROOT], extensions=extensions).load("neuprim")
+    shown = package["core.render.output.RenderOutput"].docstring.parse("google")[-1].value
+    assert [entry.name for entry in shown] == ["rgb", "alpha", "depth"]
+    assert shown[2].description.startswith("(H, W) weighted mean camera-z") and "None without" in shown[2].description

@@ -36,6 +36,8 @@ from neuprim.core.cameras.pinhole import (
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.io.json_reader import JsonReader
 
+__all__ = ["read_camera_file", "read_cameras"]
+
 _MAX_BYTES = 64 * 1024 * 1024
 _USD_SCRIPT = Path(__file__).with_name("usd_stage.py")  # run, never imported
 _VIEWER_NOTE = (
@@ -45,11 +47,16 @@ _VIEWER_NOTE = (
 
 
 def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
-    """Read the cameras of JSON files (``frames``, or ``camera_path`` of nerfstudio's viewer), USD stages and COLMAP
-    models.
+    """Read the cameras of a JSON file, a USD stage or a COLMAP model.
 
-    ``FILE#/PRIM`` chooses one camera of a stage; ``size`` is (width, height) where the file names none. Raises
-    DataError for a missing or wrong field, and BackendUnavailable if the package that reads the format is missing.
+    JSON files have ``frames``, or ``camera_path`` of nerfstudio's viewer. ``FILE#/PRIM`` chooses one camera of a stage.
+
+    Args:
+        size: (width, height) for files that do not have it.
+
+    Raises:
+        DataError: a field is missing or wrong.
+        BackendUnavailable: the package that reads the format is missing.
     """
     text, hash_, prim = str(path).partition("#")
     path, prim = (Path(text), prim) if hash_ and not path.exists() else (path, "")
@@ -73,7 +80,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
 
 
 def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
-    """Return names and cameras of :func:`read_camera_file`."""
+    """Return (name, camera) pairs of a file that :func:`read_camera_file` reads."""
     return list(read_camera_file(path, size).named)
 
 

@@ -18,38 +18,38 @@ from neuprim.core.errors import DataError
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole view; lengths in pixels."""
+    """A pinhole camera with an image size; lengths are in pixels."""
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes; float64 unless it carries gradients of another dtype
-    fx: float
-    fy: float
-    cx: float  # the principal point may lie outside of the image
-    cy: float
-    width: int
-    height: int
+    fx: float  # focal length in x
+    fy: float  # focal length in y
+    cx: float  # principal point in x; may lie outside of the image
+    cy: float  # principal point in y
+    width: int  # width of the image
+    height: int  # height of the image
 
     @property
     def position(self) -> Tensor:
-        """(3,) camera centre in scene units."""
+        """Camera centre, (3,), scene units."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     @property
     def K(self) -> Tensor:
-        """(3, 3) intrinsics, float64."""
+        """Intrinsics, (3, 3) float64, pixels."""
         return torch.tensor([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]], dtype=torch.float64)
 
     def resized(self, width: int, height: int) -> Camera:
-        """Return the same view sampled on another pixel grid."""
+        """Return the same view with another image size."""
         sx, sy = width / self.width, height / self.height
         return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def reduced(self, factor: int) -> Camera:
-        """Return the view with pixels ``factor`` times as large; remainders at the right and bottom are cut off."""
+        """Return the camera with pixels ``factor`` times as large; remainders at right and bottom are cut off."""
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
     def strided(self, stride: int, column: int, row: int) -> Camera:
-        """Return the view of every ``stride``-th pixel in x and y, from (``column``, ``row``) on: their rays."""
+        """Return the camera of every ``stride``-th pixel in x and y, from (``column``, ``row``) on; same rays."""
         cx, cy = ((c - first - 0.5) / stride + 0.5 for c, first in ((self.cx, column), (self.cy, row)))
         width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
         return Camera(self.viewmat, self.fx / stride, self.fy / stride, cx, cy, width, height)
@@ -61,12 +61,12 @@ class Camera:
         return torch.stack([self.fx * x / z + self.cx, self.fy * y / z + self.cy], dim=-1), z
 
     def sees(self, points: Tensor) -> Tensor:
-        """(N,) bool: points in front of the camera and inside its image."""
+        """Return (N,) bool: which points (N, 3) lie in front of the camera and inside its image."""
         pixels, z = self.project(points)
         return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
 
     def validate(self, where: str) -> Camera:
-        """Return self, or raise DataError naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
+        """Return self; raise DataError naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
             found = f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
@@ -93,7 +93,7 @@ def check_viewmat(viewmat: Tensor, where: str) -> None:
 
 
 def opengl_to_viewmat(c2w: Tensor) -> Tensor:
-    """World-to-camera OpenCV matrix of an OpenGL/Blender camera-to-world one (x right, y up, z backward)."""
+    """Return the (4, 4) world-to-camera OpenCV matrix of a camera-to-world matrix of OpenGL or Blender."""
     c2w = c2w.double()
     flip = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0], dtype=torch.float64))
     c2w_cv = c2w @ flip
@@ -104,7 +104,7 @@ def opengl_to_viewmat(c2w: Tensor) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """(4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target``; ``up`` is up in the image."""
+    """Return the (4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target``, ``up`` up."""
     eye, target, up = eye.double(), target.double(), up.double()
     z = target - eye
     z = z / z.norm()
@@ -119,7 +119,7 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
 
 
 def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
-    """``count`` cameras on a circle around ``center``, ``elevation`` radians above the plane normal to ``up``."""
+    """Return ``count`` cameras on a circle around ``center``, ``elevation`` radians above its horizontal plane."""
     up = (up / up.norm()).double()
     helper = torch.tensor([1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0], dtype=torch.float64)
     a = torch.linalg.cross(up, helper)
@@ -144,10 +144,10 @@ FRAME_RATES = (0.1, 240.0)  # least and most frames per second of a film, as ``-
 class CameraViews:
     """Cameras of a file, in order."""
 
-    named: tuple[tuple[str, Camera], ...]  # with their names
-    times: tuple[float, ...] | None = None  # in the file's own unit
-    fps: float | None = None  # of their film
-    notes: tuple[str, ...] = ()  # lines for the user on conventions, and on what cannot be drawn
+    named: tuple[tuple[str, Camera], ...]  # (name, camera) pairs
+    times: tuple[float, ...] | None = None  # time of each camera, in the file's own unit
+    fps: float | None = None  # frames per second, if the file names them
+    notes: tuple[str, ...] = ()  # lines for the user on conventions, and on what cannot be rendered
 
 
 def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
@@ -188,16 +188,15 @@ _UNIT = 1e-6  # how far from 1 a direction's length may be: float32 rounding pas
 
 @dataclass(frozen=True)
 class RayCamera:
-    """A view whose rays all leave one point, each in its own direction, backwards (z < 0) too.
+    """A camera with one direction per pixel, such as a fisheye or a panorama; only the reference backend renders it.
 
-    Distances along the ray take the place of depths: for ``near``, depth images and the order of primitives. Images
-    therefore differ from a pinhole's where a near plane cuts chords. Only the reference backend draws these cameras.
-    A zero vector marks a pixel without a ray. Raises DataError for no rigid transform, or directions not of unit
-    length.
+    All rays start at one point; they may point backwards (z < 0). Distances along the rays replace depths: for
+    ``near``, depth images and the order of primitives. Images therefore differ from those of a pinhole where a near
+    plane cuts chords. Raises DataError for no rigid transform, or directions not of unit length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes
-    directions: Tensor  # (H, W, 3) unit vectors in camera axes, float64 for full accuracy
+    directions: Tensor  # (H, W, 3) unit vectors in camera axes, float64 for full accuracy; zero for no ray
 
     def __post_init__(self) -> None:
         check_viewmat(self.viewmat, "RayCamera.viewmat")
@@ -221,12 +220,12 @@ class RayCamera:
 
     @property
     def position(self) -> Tensor:
-        """(3,) camera centre in scene units."""
+        """Camera centre, (3,), scene units."""
         return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3]
 
     @classmethod
     def fisheye(cls, width: int, height: int, viewmat: Tensor, fov_degrees: float = 180.0) -> RayCamera:
-        """Make an equidistant fisheye, whose ``fov_degrees``, at most 360, span the shorter side.
+        """Return an equidistant fisheye whose shorter side spans ``fov_degrees``, at most 360.
 
         Pixels beyond 180 degrees off the axis have no ray. Raises DataError for an impossible size or field of view.
         """
@@ -244,7 +243,7 @@ class RayCamera:
 
     @classmethod
     def equirectangular(cls, width: int, height: int, viewmat: Tensor) -> RayCamera:
-        """Make a full panorama: columns are longitudes -180..180 degrees, rows latitudes from 90 (up, -y) to -90."""
+        """Return a full panorama: columns are longitudes -180..180 degrees, rows latitudes 90 (up, -y) to -90."""
         _check_ray_camera_size("equirectangular", width, height)
         y, x = _pixel_centre_grid(width, height)
         longitude, latitude = (x / width - 0.5) * (2 * math.pi), (0.5 - y / height) * math.pi
@@ -253,7 +252,7 @@ class RayCamera:
 
 
 AnyCamera = Camera | RayCamera
-"""What the renderer and the colour fields accept; both have ``viewmat``, ``position``, ``width`` and ``height``."""
+"""Any camera that can be rendered; both kinds have ``viewmat``, ``position``, ``width`` and ``height``."""
 
 
 def _check_ray_camera_size(name: str, width: int, height: int) -> None:

@@ -14,6 +14,8 @@ from torch import Tensor
 from neuprim.core.cameras.pinhole import Camera, RayCamera
 from neuprim.core.errors import DataError
 
+__all__ = ["World"]
+
 _ROTATION = 1e-6  # how far a matrix over its scale may be from a rotation
 
 _Camera = TypeVar("_Camera", Camera, RayCamera)
@@ -21,24 +23,24 @@ _Camera = TypeVar("_Camera", Camera, RayCamera)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Scene coordinates from those of the user's files, the *world*: a rotation, one scale and an offset.
+    """Transform between the world of the user's files and the scene: a rotation, one scale and an offset.
 
-    Everything inside is in scene units, mostly float32. Coordinates of the user (cameras, lights, boxes, exported
-    positions) are in the world, float64, and are converted by this class alone.
+    Models are in scene units, mostly float32. Coordinates that users give or get (cameras, lights, boxes, exported
+    positions) are world coordinates in float64.
     """
 
     scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))  # (4, 4) float64
 
     @staticmethod
     def at(origin: Sequence[float]) -> World:
-        """The world whose point ``origin`` is the scene's origin, with the same axes and units."""
+        """Return the world whose point ``origin`` is the scene's origin, with the same axes and units."""
         matrix = torch.eye(4, dtype=torch.float64)
         matrix[:3, 3] = -torch.tensor(origin, dtype=torch.float64)
         return World(matrix)
 
     @cached_property
     def identity(self) -> bool:
-        """Whether scene and world are the same."""
+        """Whether scene and world coordinates are equal."""
         return torch.equal(self.scene_from_world, torch.eye(4, dtype=torch.float64))
 
     @cached_property
@@ -48,13 +50,13 @@ class World:
 
     @cached_property
     def rotation(self) -> Tensor | None:
-        """(3, 3) the scene's axes from the world's; None where they are the same."""
+        """Rotation from world to scene axes, (3, 3); None if the axes are equal."""
         turn = self.scene_from_world[:3, :3] / self.scale
         return None if bool((turn - torch.eye(3, dtype=torch.float64)).abs().max() < 1e-12) else turn
 
     @cached_property
     def inverse(self) -> World:
-        """The other direction: its "scene" is this world."""
+        """The inverse transform: its "scene" is this world."""
         back = torch.eye(4, dtype=torch.float64)
         back[:3, :3] = torch.linalg.inv(self.scene_from_world[:3, :3])
         back[:3, 3] = -back[:3, :3] @ self.scene_from_world[:3, 3]
@@ -62,21 +64,21 @@ class World:
 
     @property
     def world_from_scene(self) -> Tensor:
-        """(4, 4) float64."""
+        """Inverse of ``scene_from_world``, (4, 4) float64."""
         return self.inverse.scene_from_world
 
     def scene_points(self, points: Tensor) -> Tensor:
-        """Convert (..., 3) world points to float64 scene points; the identity returns the same tensor."""
+        """Return (..., 3) world points as float64 scene points; the identity returns the same tensor."""
         if self.identity:
             return points
         return points.double() @ self.scene_from_world[:3, :3].T + self.scene_from_world[:3, 3]
 
     def world_points(self, points: Tensor) -> Tensor:
-        """Convert (..., 3) scene points to world points; the identity returns the same tensor."""
+        """Return (..., 3) scene points as world points; the identity returns the same tensor."""
         return self.inverse.scene_points(points)
 
     def scene_camera(self, camera: _Camera) -> _Camera:
-        """Return the view of the scene that equals the view ``camera`` of the world."""
+        """Return the camera in scene coordinates of a camera in world coordinates."""
         if self.identity:
             return camera
         view, back = camera.viewmat.detach().double(), self.world_from_scene
@@ -86,15 +88,15 @@ class World:
         return replace(camera, viewmat=moved)
 
     def world_camera(self, camera: _Camera) -> _Camera:
-        """The same view of the world as ``camera`` has of the scene."""
+        """Return the camera in world coordinates of a camera in scene coordinates."""
         return self.inverse.scene_camera(camera)
 
     def world_box(self, box: np.ndarray) -> np.ndarray:
-        """(2, 3) box around a box of the scene, on the world's axes."""
+        """Return the (2, 3) box on the world's axes around a box of the scene."""
         return self.inverse.scene_box(box)
 
     def scene_box(self, box: np.ndarray) -> np.ndarray:
-        """(2, 3) box around a box of the world, on the scene's axes."""
+        """Return the (2, 3) box on the scene's axes around a box of the world."""
         if self.identity:
             return box
         corners = np.stack(np.meshgrid(*np.asarray(box, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
@@ -102,12 +104,12 @@ class World:
         return np.stack([moved.min(0), moved.max(0)])
 
     def to_json(self) -> dict[str, Any]:
-        """The "world" of a model's header, exact when read back."""
+        """Return the entry "world" of a model's header, exact when read back."""
         return {"scene_from_world": self.scene_from_world.tolist()}
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """Read the "world" of a model's header; the identity where there is none. Raises DataError if damaged."""
+        """Return the world of a model's header, the identity if it has none; raises DataError if damaged."""
         record = header.get("world")
         if record is None:
             return World()

@@ -2,28 +2,20 @@
 
 from neuprim.core.data.dataset import (
     Clip,
+    Correction,
     Dataset,
+    DatasetImages,
     DataSource,
     Pixels,
     PointCloud,
     PointSamples,
     PointSupervision,
+    SceneContext,
     StartingPoints,
     View,
     ViewSet,
     camera_extent,
 )
 
-__all__ = [
-    "Clip",
-    "DataSource",
-    "Dataset",
-    "Pixels",
-    "PointCloud",
-    "PointSamples",
-    "PointSupervision",
-    "StartingPoints",
-    "View",
-    "ViewSet",
-    "camera_extent",
-]
+__all__ = ["Clip", "Correction", "DataSource", "Dataset", "DatasetImages", "Pixels", "PointCloud", "PointSamples"]
+__all__ += ["PointSupervision", "SceneContext", "StartingPoints", "View", "ViewSet", "camera_extent"]

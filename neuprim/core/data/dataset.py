@@ -25,8 +25,8 @@ if TYPE_CHECKING:
     from neuprim.core.volumes.density_truth import DensityGridPlacement
 
 DataSource = Literal["real", "generated", "simulated"]
-"""Photographs or captures ("real"), our own ray-cast scenes ("generated"), stand-ins for data not given
-("simulated")."""
+"""Origin of a data set: photographs or captures ("real"), ray-cast scenes of neuprim ("generated"), or simulated data
+in place of data that were not available ("simulated")."""
 
 
 @exact_kernel
@@ -38,39 +38,39 @@ def _composite_pixels(rgb, alpha, out, background):  # type: ignore[no-untyped-d
 
 
 Correction = Literal["pose", "offset", "factor"]
-"""Of a camera; of a position in scene units, which it moves; of a strength, which it multiplies."""
+"""What training learns of an uncertain input: a camera's pose, an offset of a position (scene units), or a factor."""
 
 
 @dataclass(frozen=True)
 class View:
-    """One frame without its pixels."""
+    """A view without its pixels: name, camera and conditions."""
 
     name: str  # unique within its split; used for file names and reports
     camera: Camera
-    conditions: Conditions = field(default_factory=dict)  # what else it depends on: time, light, ...
+    conditions: Conditions = field(default_factory=dict)  # further inputs of the image: time, light, ...
 
 
 @dataclass(frozen=True)
 class Pixels:
-    """One frame's pixels."""
+    """The pixels of a view."""
 
     rgb: Tensor  # (H, W, C) float32; with alpha it is premultiplied
     alpha: Tensor | None = None  # (H, W) float32 coverage 0..1, or None for an opaque photograph
     mask: Tensor | None = None  # (H, W) bool of pixels that count, or None for all
 
     def to(self, device: torch.device) -> Pixels:
-        """Copy to another device without waiting for it."""
+        """Return a copy on another device; does not wait for it."""
         alpha, mask = (None if x is None else hardware.copy_to_device(x, device) for x in (self.alpha, self.mask))
         return Pixels(hardware.copy_to_device(self.rgb, device), alpha, mask)
 
     def strided(self, step: int, column: int, row: int) -> Pixels:
-        """Copy every ``step``-th pixel in x and y, the first at (``column``, ``row``)."""
+        """Return every ``step``-th pixel in x and y, from (``column``, ``row``) on."""
         chosen = slice(row, None, step), slice(column, None, step)
         alpha, mask = (None if x is None else x[chosen].contiguous() for x in (self.alpha, self.mask))
         return Pixels(self.rgb[chosen].contiguous(), alpha, mask)
 
     def over(self, background: Tensor) -> Tensor:
-        """Composite over a (C,) colour: (H, W, C). Opaque pixels are returned unchanged."""
+        """Return the (H, W, C) image composited over a (C,) colour; opaque pixels are returned unchanged."""
         rgb, alpha = self.rgb, self.alpha  # in this order: stored images convert both at once
         if alpha is None:
             return rgb
@@ -83,16 +83,18 @@ class Pixels:
 
 
 class ViewSet(ABC):
-    """Posed images of one split. ``pixels`` reads on demand and caches compact (uint8 or half) copies."""
+    """The posed images of one split; base class for your own views. ``len(views)`` is their number."""
 
     @abstractmethod
     def __len__(self) -> int: ...
 
     @abstractmethod
-    def view(self, index: int) -> View: ...
+    def view(self, index: int) -> View:
+        """Return a view without its pixels."""
 
     @abstractmethod
-    def pixels(self, index: int) -> Pixels: ...
+    def pixels(self, index: int) -> Pixels:
+        """Return the pixels of a view; reads them on demand and may cache them."""
 
 
 class ViewSubset(ViewSet):
@@ -117,25 +119,25 @@ class ViewSubset(ViewSet):
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points where matter probably is."""
+    """Points where training may start primitives."""
 
     means: Tensor  # (N, 3) scene units; right after reading a file, float64 world units (see within)
     colors: Tensor  # (N, C) in the data set's colour space
-    conditions: Mapping[str, Tensor] = field(default_factory=dict)  # (N,) values of observation, e.g. "time" -> 0..1
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)  # (N,) when each was observed, e.g. "time" -> 0..1
     axes: Tensor | None = None  # (N, 3) semi-axes of ellipsoids
-    quats: Tensor | None = None  # (N, 4) their rotations wxyz
+    quats: Tensor | None = None  # (N, 4) rotations wxyz of the ellipsoids
     alphas: Tensor | None = None  # (N,) opacities 0..1 at the centres
     deviations: Tensor | None = None  # (N, 3) standard deviations of Gaussians, instead of axes
     steps: Mapping[str, float] = field(default_factory=dict)  # condition -> distance of neighbouring frames, if known
 
     def rows(self, index: Tensor) -> PointCloud:
-        """Select points by (M,) int64 or (N,) bool ``index``."""
+        """Return the points at (M,) int64 or (N,) bool ``index``."""
         values = {name: getattr(self, name) for name in ("means", "colors", "axes", "quats", "alphas", "deviations")}
         chosen = {name: value[index] for name, value in values.items() if value is not None}
         return replace(self, **chosen, conditions={n: value[index] for n, value in self.conditions.items()})
 
     def within(self, world: World) -> PointCloud:
-        """Convert world to scene coordinates; positions are subtracted in float64."""
+        """Return the points in scene coordinates; positions are converted in float64."""
         means = world.scene_points(self.means).float()
         scale, quats = world.scale, self.quats
         axes, deviations = (x if x is None or scale == 1.0 else x * scale for x in (self.axes, self.deviations))
@@ -148,46 +150,46 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Clip:
-    """Views that make a film in this order."""
+    """A film of views, in this order."""
 
     name: str
     views: Sequence[int]  # indices into source
-    fps: float = 12.0
+    fps: float = 12.0  # frames per second
     source: ViewSet | None = None  # None for the test split
 
 
 StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
-"""(training views, count, generator) -> at most ``count`` distinct starting points; the only randomness is the
-generator's."""
+"""Function (training views, count, generator) -> at most ``count`` distinct points; random numbers come from the
+generator alone."""
 
 
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """A scene to fit. Create instances; subclasses are refused."""
+    """A scene to train on: views, starting points, and what is known about it. Subclasses are refused."""
 
     name: str  # shown in reports
-    train: ViewSet
-    test: ViewSet
-    start: StartingPoints
+    train: ViewSet  # training views
+    test: ViewSet  # held-out views
+    start: StartingPoints  # function that returns the starting points
     extent: float  # size in scene units (camera_extent), the unit of learning rates and size limits
     background: Tensor  # (C,) colour that evaluation composites over
-    channels: int = 3
+    channels: int = 3  # C, channels of the images
     color_space: Literal["srgb", "linear"] = "srgb"  # "srgb" as stored in PNG
-    data_source: DataSource = "real"
+    data_source: DataSource = "real"  # for reports
     random_background: bool = False  # whether training composites random colours (needs alpha)
     downsampling: str = "none"  # for reports, e.g. "images_4" or "200x200 from 800x800 by area"
-    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))  # (3,) for orbits
-    center: Tensor = field(default_factory=lambda: torch.zeros(3))  # (3,) that the cameras look at, for orbits
+    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))  # (3,) upward direction, for orbits
+    center: Tensor = field(default_factory=lambda: torch.zeros(3))  # (3,) point that the cameras look at, for orbits
     bounds: Tensor | None = None  # (2, 3) lower and upper corner of a box around everything, scene units, if known
-    exposure: float = 1.0  # divisor that was applied to the linear values of the files
+    exposure: float = 1.0  # number by which the linear values of the files were divided
     world: World = field(default_factory=World)  # transform between the scene and the user's files
-    placement: DensityGridPlacement | None = None  # the voxel files the scene was made from, if any
+    placement: DensityGridPlacement | None = None  # placement of the scene's voxel files, if it has any
     largest: float | None = None  # largest extinction, 1/scene unit, if known; primitives stay below it
-    points: PointSupervision | None = None  # for ``train.supervision=voxels`` and ``both``
-    # what of the training views is known only roughly, and learned with the model: "camera", names of conditions
+    points: PointSupervision | None = None  # known points, for train.supervision=voxels and both
+    # inputs of training views that are uncertain and learned with the model: "camera", names of conditions
     refine: Mapping[str, Correction] = field(default_factory=dict)
-    extra: object = None  # further knowledge in a class of the task, e.g. pixel classes; tasks accept None
+    extra: object = None  # further data in a class of the task, e.g. pixel classes; tasks accept None
 
     def __init_subclass__(cls) -> None:
         raise TypeError(
@@ -200,7 +202,7 @@ class Dataset:
         return self.start(self.train, count, generator)
 
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
-        """Draw ``count`` mid-grey points, uniform in :attr:`bounds`; raise ConfigError without bounds."""
+        """Return ``count`` mid-grey points, uniform in :attr:`bounds`; raise ConfigError without bounds."""
         if self.bounds is None:
             found = f"{self.name} does not say which box its matter fills"
             raise ConfigError(f"model.init.points=box: {found}; expected matter")
@@ -209,10 +211,10 @@ class Dataset:
         return PointCloud(means, torch.full((count, self.channels), 0.5))
 
     def orbit(self, frames: int) -> list[View]:
-        """Make views on a circle at the mean distance and elevation of the training cameras.
+        """Return views on a circle at the mean distance and elevation of the training cameras.
 
-        The views look outward where the training cameras do. Scalar conditions run from their least to their greatest
-        training value; others keep the value of the first view.
+        They look outward if the training cameras do. Scalar conditions run from their lowest to their highest training
+        value; others keep the value of the first view.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
         far = find_outliers(torch.stack([c.position for c in cameras]))
@@ -246,26 +248,26 @@ class Dataset:
 
 @dataclass(frozen=True)
 class PointSamples:
-    """True values at M points of one frame."""
+    """Ground truth of a volume at M points of one frame."""
 
-    name: str  # of the frame, for logs
-    conditions: Conditions  # of the frame, shared by all points
+    name: str  # name of the frame, for logs
+    conditions: Conditions  # conditions of the frame, shared by all points
     points: Tensor  # (M, 3) float32, scene units
     sigma: Tensor  # (M,) float32 extinction, 1/scene unit
     source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
-    sigma_scale: float  # typical value inside matter, by which errors are divided
-    source_scale: float = 1.0
+    sigma_scale: float  # typical sigma inside matter, by which its errors are divided
+    source_scale: float = 1.0  # typical source inside matter, by which its errors are divided
     components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)  # grid -> (M,) part of sigma, scale
 
 
 class PointSupervision(ABC):
-    """Points to learn from, see :attr:`Dataset.points`."""
+    """Base class of sources of known points, see :attr:`Dataset.points`."""
 
     components: tuple[str, ...] = ()  # names of the source grids in PointSamples.components
 
     @abstractmethod
     def draw(self, count: int, generator: torch.Generator) -> PointSamples:
-        """Draw ``count`` points of one frame; the only randomness is ``generator``."""
+        """Return ``count`` points of one frame; random numbers come from ``generator`` alone."""
 
 
 def hold_out_views(dataset: Dataset, every: int) -> Dataset:
@@ -285,12 +287,12 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
 
 
 class DatasetImages(ABC):
-    """Images of a scene that are rendered frame by frame, possibly by several processes."""
+    """Base class of images that a scene renders frame by frame, perhaps in several processes."""
 
-    frames: Sequence[str]  # names, in order
+    frames: Sequence[str]  # names of the frames, in order
     key: str  # hash of everything the images depend on; all processes must agree on it
     place: str  # folder or URL of the images
-    known: Mapping[str, Any]  # plain values that save other processes repeated work; passed to the scene's ``truth``
+    known: Mapping[str, Any]  # plain values that save other processes repeated work; passed to the scene's truth
 
     @abstractmethod
     def missing(self) -> list[int]:
@@ -298,35 +300,36 @@ class DatasetImages(ABC):
 
     @abstractmethod
     def begin(self) -> None:
-        """Prepare the place, before the first frame is made."""
+        """Prepare the place, before the first frame is rendered."""
 
     @abstractmethod
     def make(self, frame: int, tell: Callable[[str], None]) -> None:
-        """Make a frame unless it exists. Writes are atomic, so processes may overlap.
+        """Render a frame unless it exists. Writes are atomic, so processes may overlap.
 
-        Raises DataError: the source cannot be read, or the place cannot be written.
+        Raises DataError if the source cannot be read or the place cannot be written.
 
         Args:
-            tell: receives a line while the place is unavailable.
+            frame: index of the frame.
+            tell: function to call with a line of text while the place is unavailable.
         """
 
     @abstractmethod
     def complete(self) -> None:
-        """Write what is due when all frames exist."""
+        """Finish the data set; called when all frames exist."""
 
 
 @dataclass(frozen=True)
 class SceneContext:
-    """What a loader gets besides the settings of its scene."""
+    """What a scene's loader gets besides its settings."""
 
-    seed: int  # for generated scenes
-    cache_dir: Path  # for generated data, keyed by everything they depend on
-    progress: Callable[[str, float], None] = lambda text, fraction: None  # of long work: text, fraction 0..1
-    world: World | None = None  # of the model that the scene is loaded for again; None lets the scene choose
+    seed: int  # seed for generated scenes
+    cache_dir: Path  # folder for generated data, by a key of everything they depend on
+    progress: Callable[[str, float], None] = lambda text, fraction: None  # to call with (text, fraction 0..1)
+    world: World | None = None  # transform of the model that the scene is loaded for; None lets the scene choose
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Radius of the cameras' bounding sphere about their mean without outliers, times 1.1; 1.0 if zero."""
+    """Return 1.1 times the largest distance of a camera from their mean, without outliers; 1.0 if it is 0."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     positions = positions[~find_outliers(positions)]
     radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1

@@ -17,15 +17,17 @@ from neuprim.core.errors import DataError
 from neuprim.core.model.fields import ConditionSpec
 from neuprim.core.volumes.density_truth import DensityGridPlacement
 
+__all__ = ["DatasetError", "check_dataset_views", "get_extra"]
+
 Extra = TypeVar("Extra")
 
 
 class DatasetError(DataError):
-    """A loader broke a promise of :class:`~neuprim.core.data.dataset.Dataset`."""
+    """A loader returned a data set that breaks the rules of :class:`~neuprim.core.data.dataset.Dataset`."""
 
 
 def check_dataset_views(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
-    """Check members, all views without pixels, and the pixels of the first view of both splits."""
+    """Raise DatasetError unless members, all views, and the pixels of both splits' first view are valid."""
     _check_dataset_values(dataset)
     for split in ("train", "test"):
         views: ViewSet = getattr(dataset, split)
@@ -93,7 +95,7 @@ def check_point_samples(samples: PointSamples, dataset: Dataset) -> None:
 
 
 def get_extra(dataset: Dataset, kind: type[Extra]) -> Extra | None:
-    """Return ``dataset.extra``; raise DatasetError if it is neither None nor of class ``kind``."""
+    """Return ``dataset.extra``; raise DatasetError if it is neither None nor an instance of ``kind``."""
     if dataset.extra is not None:
         _check_dataset_instance(f"{dataset.name}: extra", dataset.extra, kind, ", or None")
     return dataset.extra  # type: ignore[return-value]

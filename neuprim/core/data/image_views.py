@@ -25,18 +25,20 @@ from neuprim.core.errors import ConfigError, DataError, warn_once
 from neuprim.core.io.images import ImageInfo, read_image, read_mask_image, srgb_to_linear
 from neuprim.core.model.fields import Conditions
 
+__all__ = ["Distortion", "FisheyeDistortion", "ImageFrame", "ImageViews", "Mask", "RadialDistortion", "find_masks"]
+
 
 class Distortion(ABC):
-    """A lens. Instances are hashable, so that views with the same lens share a resampling grid."""
+    """Base class of lens distortions; hashable, so that views with the same lens share a resampling grid."""
 
     @abstractmethod
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        """(M, 2) photographed pixels of (M, 2) directions (x/z, y/z), float64; pixel centres at +0.5."""
+        """Return (M, 2) pixels of the photograph for (M, 2) directions (x/z, y/z), float64; centres at +0.5."""
 
 
 @dataclass(frozen=True)
 class RadialDistortion(Distortion):
-    """OpenCV's model: radius times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and tangential terms p1, p2."""
+    """OpenCV's lens model: radius times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and tangential terms p1, p2."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -56,7 +58,7 @@ class RadialDistortion(Distortion):
 
 @dataclass(frozen=True)
 class FisheyeDistortion(Distortion):
-    """OpenCV's fisheye: the angle t to the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)."""
+    """OpenCV's fisheye lens: the angle t to the axis becomes the radius t (1 + k1 t^2 + k2 t^4 + k3 t^6 + k4 t^8)."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -113,18 +115,20 @@ def resample_image(image: Tensor, source: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Mask:
-    """An image file whose zero pixels do not count; if ``inverted``, the other pixels do not."""
+    """A mask file: pixels of value zero are ignored."""
 
     path: Path
-    inverted: bool = False
+    inverted: bool = False  # ignore the other pixels instead
 
 
 def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
-    """Find the mask of every image file and report how many there are.
+    """Return the mask of every image file, None without; warns how many there are.
 
     ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP, nerfstudio). Of
     ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` beside the image (instant-ngp) is inverted.
-    ``images`` is the folder of the images; None takes the first part of their paths if it begins with "images".
+
+    Args:
+        images: folder of the images; None for the first part of their paths if it begins with "images".
     """
     masks = [_find_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
@@ -168,12 +172,12 @@ _LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
 
 @dataclass(frozen=True)
 class ImageFrame:
-    """An image file and its pose."""
+    """An image file with its camera, lens and conditions."""
 
     name: str  # unique within its split
     path: Path
-    camera: Camera  # the undistorted view at the size of the file
-    info: ImageInfo
+    camera: Camera  # undistorted camera at the size of the file
+    info: ImageInfo  # what image_info returns
     mask: Mask | None = None
     distortion: Distortion | None = None  # lens of the photograph; None for a pinhole
     conditions: Conditions = field(default_factory=dict)  # time, light, ...; empty for static scenes
@@ -264,11 +268,12 @@ class StoredPixels(Pixels):
 
 
 class ImageViews(ViewSet):
-    """One split of image files, cached as uint8 (PNG, JPEG) or half (OpenEXR) up to ``cache_bytes``. Thread-safe.
+    """Views of image files: decoded on demand, masked, undistorted, reduced and cached. Thread-safe.
 
-    Images are reduced by ``downsample``, cutting remainders off; ``to_linear`` converts sRGB files to linear light
-    first.
-    Raises ConfigError if an image is smaller than the factor.
+    Args:
+        downsample: factor by which images are reduced; remainders are cut off. ConfigError if an image is smaller.
+        cache_bytes: size of the cache, which holds uint8 (PNG, JPEG) or half (OpenEXR).
+        to_linear: convert sRGB files to linear light first.
     """
 
     def __init__(
@@ -300,13 +305,13 @@ class ImageViews(ViewSet):
         return self._frames[index].path
 
     def pixels(self, index: int) -> Pixels:
-        """Read a view; raises DataError if the file is missing, damaged or changed, or its mask leaves nothing."""
+        """Return the pixels of a view; DataError if the file is missing, damaged or changed, or wholly masked."""
         return StoredPixels(replace(self._load_image(range(len(self))[index]), scale=self.scale))
 
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode all images, cache what fits, and return errors of bad ones; ``empty`` allows transparent images."""
+        """Decode and cache all images; return the errors of bad ones. ``empty`` allows transparent images."""
 
         def fault(index: int) -> DataError | None:
             try:

@@ -14,6 +14,8 @@ from neuprim.core.data.dataset import PointCloud, ViewSet, dataset_axes_meet, da
 from neuprim.core.data.starting_points import count_seeing_views, hull_surface, ray_starting_points
 from neuprim.core.errors import ConfigError
 
+__all__ = ["initial_points"]
+
 _FPS_WORK = 5e8  # distances that exact farthest-point sampling may evaluate (1.5 s); above, a grid thins the points
 _COLOR_VIEWS = 100
 _CHUNK = 20_000
@@ -23,10 +25,13 @@ _ROUNDS = 8  # times that a box is filled, for points that cameras see
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a static scene.
 
-    Given points win. Cameras that do not look at one point start along their rays. Otherwise data with alpha use the
-    surface of the visual hull, and data without use a box around the focus. Inferred points are seen by at least two
-    cameras. Raises ConfigError: ``count`` is not positive; DataError: the alpha masks have no common volume, or an
-    image is damaged.
+    These are the given ``points`` if there are any. Otherwise they are inferred, each seen by at least two cameras:
+    along the rays if the cameras do not look at one point, else on the visual hull for images with alpha, else in a
+    box around the focus.
+
+    Raises:
+        ConfigError: ``count`` is not positive.
+        DataError: the alpha masks have no common volume, or an image is damaged.
     """
     check_point_count(count)
     if points is not None:

@@ -23,6 +23,9 @@ from neuprim.core.validation import Range, nonempty_text, validate_fields
 
 Background = Literal["auto", "white", "black", "random"]
 
+__all__ = ["FolderSettings", "SceneDetails", "assemble_dataset", "find_data_folder", "find_image"]
+__all__ += ["split_every_nth", "unique_view_names"]
+
 EveryNth = Annotated[int, Range(at_least=2)]  # every n-th image is held out
 HoldOut = Annotated[int, Range(at_least=2, also=(0,))]  # the same, or 0 where a split of its own is there to test on
 SplitName = Annotated[str, nonempty_text("the name in transforms_NAME.json")]
@@ -33,10 +36,10 @@ class FolderSettings:
     """Settings that all loaders of folders with posed images share."""
 
     path: Annotated[Path, nonempty_text("the data set's folder")]  # folder of the data set, ``~`` allowed
-    # "auto" (white for data with alpha, else black), "white", "black", or "random" (random while training, white for
+    # "auto" (white for data with alpha, else black), "white", "black", or "random" (random in training, white in
     # evaluation)
     background: Background = "auto"
-    downsample: Annotated[int, Range(at_least=1)] = 1  # integer factor, area filter on premultiplied values
+    downsample: Annotated[int, Range(at_least=1)] = 1  # integer factor by which images are reduced (area filter)
     preload: bool = True  # decode all images at once, so that damaged files are found before training
     strict: bool = False  # refuse a damaged view; otherwise it is left out with a warning
 
@@ -45,7 +48,7 @@ class FolderSettings:
 
 
 def find_data_folder(path: str | Path) -> Path:
-    """Return the existing folder of the ``path`` setting, ``~`` expanded; raises DataError if there is none."""
+    """Return the folder of the setting ``path``, ``~`` expanded; raises DataError if it does not exist."""
     expected = "expected the data set's folder (scene.path)"
     try:
         folder = Path(path).expanduser()
@@ -105,7 +108,7 @@ class MissingFiles(DataError):
 
 
 def find_image(folder: Path, text: str) -> Path | None:
-    """Find the image ``name`` below ``folder``: as written, with a usual suffix, or in another case; else None."""
+    """Return the image ``text`` below ``folder``: as written, with a usual suffix, or in another case; else None."""
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
@@ -153,7 +156,7 @@ def missing_dataset_files_error(where: str, names: Sequence[str], hint: str = ""
 
 
 def unique_view_names(paths: Iterable[str], where: str) -> list[str]:
-    """Return a file name per image path: its stem, or the whole path with ``_`` for ``/`` if stems repeat.
+    """Return a view name per image path: its stem, or the whole path with ``_`` for ``/`` if stems repeat.
 
     Raises DataError if a path occurs twice.
     """
@@ -174,7 +177,7 @@ def _drop_image_suffix(text: str) -> str:
 
 
 def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Return (the others, every n-th beginning with the first)."""
+    """Return (training, test) frames: every n-th, beginning with the first, is a test frame."""
     return [f for i, f in enumerate(frames) if i % n], list(frames[::n])
 
 
@@ -182,15 +185,15 @@ def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFra
 class SceneDetails:
     """What a format knows about a scene besides its images."""
 
-    up: Tensor | None = None  # (3,) upward direction; None takes the mean of the cameras' own
+    up: Tensor | None = None  # (3,) upward direction; None for the mean of the cameras' own
     points: PointCloud | None = None  # starting points of the format, float64 in the coordinates of the file
     prefix: str = ""  # reduction that the files already have, e.g. "images_4"
     start: StartingPoints | None = None  # None takes points, else infers them from images at rest (initial_points)
     to_linear: bool = False  # convert sRGB files to linear light
     exposure: float | Callable[[ImageViews], float] = 1.0  # divisor of linear values, perhaps from the training views
-    extra: object = None  # of the Dataset
+    extra: object = None  # Dataset.extra
     positions: Sequence[str] = ()  # conditions that are positions, float64 in the coordinates of the file
-    home: Path | None = None  # the data set's folder, where it is not the one that ``where`` names
+    home: Path | None = None  # folder of the data set, if it is not the one that where names
 
 
 def assemble_dataset(
@@ -202,10 +205,14 @@ def assemble_dataset(
     context: SceneContext,
     details: SceneDetails = SceneDetails(),
 ) -> Dataset:
-    """Make a data set of two splits of image files; errors name the file or folder ``where``.
+    """Return a data set of two splits of image files.
 
-    Raises DataError: an empty split, mixed kinds of images, most images damaged, or any with ``settings.strict``;
-    ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
+    Args:
+        where: file or folder that errors name.
+
+    Raises:
+        DataError: an empty split, mixed kinds of images, most images damaged, or one with ``settings.strict``.
+        ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
     """
     _check_dataset_splits(where, train, test, settings)
     both = [*train, *test]

@@ -20,6 +20,8 @@ from torch import Tensor
 from neuprim.core.errors import DataError
 from neuprim.core.io.files import checked_atomic_path
 
+__all__ = ["ExrChannel", "exr_channels", "read_exr", "write_exr", "write_exr_layers"]
+
 MAX_PIXELS = 64 * 2**20
 """Most pixels of an image (8192 x 8192). Larger ones are refused before pixel memory is allocated."""
 
@@ -86,7 +88,7 @@ def is_exr(path: Path, required: bool = False) -> bool:
 
 
 def exr_channels(path: Path) -> tuple[str, ...]:
-    """Names of all channels of an OpenEXR file, alphabetically; raises DataError as :func:`read_exr_layout`."""
+    """Return the names of all channels of an OpenEXR file, in alphabetical order; raises DataError."""
     is_exr(path, required=True)
     return tuple(_read_exr_header(path)[0])
 
@@ -136,7 +138,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
 
 
 def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tensor:
-    """(H, W, C) float16 or float32 values of the named channels, as stored, all finite; or DataError."""
+    """Return (H, W, C) float16 or float32 values of channels, as stored; raises DataError, also if not finite."""
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = [np.array(file.channels()[name].pixels) for name in names]
@@ -162,14 +164,14 @@ def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tenso
 
 @dataclass(frozen=True)
 class ExrChannel:
-    """One channel to write: (H, W) finite numbers, stored as 32-bit or 16-bit floats."""
+    """One channel to write."""
 
-    values: Tensor
-    half: bool = False
+    values: Tensor  # (H, W) finite numbers
+    half: bool = False  # store 16-bit instead of 32-bit floats
 
 
 def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str] | None = None) -> None:
-    """Write (H, W, 3 or 4) *linear* values with premultiplied alpha, or (H, W, C) of channels ``names``."""
+    """Write (H, W, 3 or 4) linear values with premultiplied alpha, or (H, W, C) values of channels ``names``."""
     error = None if names is None else exr_channel_name_error(names)
     if error:
         raise DataError(f"{path}: names{error}")
@@ -184,11 +186,11 @@ def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str]
 def write_exr_layers(
     path: Path, channels: Mapping[str, ExrChannel], attributes: Mapping[str, Any] | None = None
 ) -> None:
-    """Write an image of several layers as one OpenEXR file; atomic.
+    """Write an image of several layers as one OpenEXR file.
 
     Args:
-        channels: by name with the layer's prefix, all of one size, finite, and at most 65504 where half.
-        attributes: of the file's header: text, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
+        channels: channels by name, with the prefix of their layer; all of one size, and at most 65504 if half.
+        attributes: header attributes: text, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:

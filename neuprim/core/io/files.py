@@ -20,11 +20,13 @@ from neuprim.core.io.json_reader import load_json
 if TYPE_CHECKING:
     import numpy as np
 
+__all__ = ["atomic_path", "cache_directory", "write_json", "write_text"]
+
 T = TypeVar("T")
 
 
 def cache_directory() -> Path:
-    """The user's cache folder for this project; ``NEUPRIM_CACHE_DIR`` overrides the platform's convention."""
+    """Return the folder for caches; ``NEUPRIM_CACHE_DIR`` overrides the platform's convention."""
     if os.environ.get("NEUPRIM_CACHE_DIR"):
         return Path(os.environ["NEUPRIM_CACHE_DIR"])
     if sys.platform == "win32":
@@ -38,7 +40,7 @@ def cache_directory() -> Path:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Yield a temporary file that replaces ``path`` when the block succeeds; an OSError names ``path``."""
+    """Return a context with a temporary file that replaces ``path`` when the block succeeds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary: Path | None = None
     try:
@@ -74,7 +76,7 @@ def checked_atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text atomically."""
+    """Write UTF-8 text; the file is complete or unchanged."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
@@ -109,7 +111,7 @@ def read_json_record(path: Path, what: str, instead: str, version: int, parse: C
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write strict JSON (no NaN) atomically."""
+    """Write strict JSON (no NaN); the file is complete or unchanged."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 

@@ -47,19 +47,23 @@ _PNG_KINDS = {0: "grey", 2: "RGB", 3: "palette", 4: "grey with alpha", 6: "RGBA"
 _EXIF_ORIENTATION = 0x0112
 
 
+__all__ = ["FrameSpool", "ImageInfo", "image_info", "linear_to_srgb", "read_image", "read_mask_image"]
+__all__ += ["srgb_to_linear", "write_animation", "write_png", "write_webp"]
+
+
 @dataclass(frozen=True)
 class ImageInfo:
-    """What a file's header says."""
+    """Size and channels of an image file, from its header."""
 
     width: int
     height: int
     channels: int  # 3 (RGB), 4 (RGBA), or the number of named channels
-    linear: bool  # OpenEXR: linear light, premultiplied alpha; the others: sRGB, straight alpha
-    orientation: int = 1  # EXIF's, 1 to 8; pixels are read as stored whatever it says
+    linear: bool  # True for OpenEXR: linear light, premultiplied alpha; else sRGB, straight alpha
+    orientation: int = 1  # orientation of EXIF, 1 to 8; reading ignores it
 
 
 def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
-    """Read size and channels of an image from its header; arguments and errors as in :func:`read_image`."""
+    """Return size and channels of an image; reads its header alone. Arguments and errors as :func:`read_image`."""
     if is_exr(path, required=channels is not None):
         names, width, height = read_exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
@@ -68,11 +72,15 @@ def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
 
 
 def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequence[str] | None = None) -> Tensor:
-    """(H, W, 3 or 4) pixels as stored: uint8 sRGB with straight alpha, or linear premultiplied float (OpenEXR).
+    """Return (H, W, 3 or 4) pixels: uint8 sRGB with straight alpha, or premultiplied linear floats (OpenEXR).
 
     Args:
-        size: expected (width, height).
-        channels: names of OpenEXR channels to read instead of R, G, B(, A), in this order, as (H, W, C).
+        path: PNG, JPEG, WebP or OpenEXR file.
+        size: expected (width, height); None for any.
+        channels: names of OpenEXR channels to read as (H, W, C), instead of R, G, B(, A).
+
+    Raises:
+        DataError: the file is missing, damaged, of another size or format, or too large.
     """
     with refuse_image_file_beyond_memory(path):
         if is_exr(path, required=channels is not None):
@@ -86,7 +94,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
 
 
 def read_mask_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """(H, W) bool from a PNG, JPEG or WebP: True where any colour channel is not zero; raises as read_image."""
+    """Return (H, W) bool of a PNG, JPEG or WebP: True where a colour channel is not 0. Errors as read_image."""
     with refuse_image_file_beyond_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
         _check_image_size(path, image.width, image.height, size)
@@ -188,14 +196,14 @@ def pillow_image(path: Path, image: Tensor) -> Image.Image:
 
 
 def write_png(path: Path, image: Tensor) -> None:
-    """Write (H, W, 3 or 4) sRGB values, float 0..1 (clamped, rounded) or uint8, with straight alpha; atomic."""
+    """Write (H, W, 3 or 4) sRGB values, float 0..1 (clamped, rounded) or uint8, straight alpha, as a PNG."""
     picture = pillow_image(path, image)
     with checked_atomic_path(path) as temporary:
         picture.save(temporary, format="PNG")
 
 
 def write_webp(path: Path, image: Tensor) -> None:
-    """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments and errors as in :func:`write_png`; atomic."""
+    """Write (H, W, 3 or 4) sRGB values as a still WebP; arguments as of :func:`write_png`."""
     picture = pillow_image(path, image)
     with checked_atomic_path(path) as temporary:
         picture.save(temporary, format="WEBP", quality=90)
@@ -213,19 +221,19 @@ def encode_webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> st
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:
-    """Convert sRGB (IEC 61966-2-1) to linear light; any shape, differentiable, not clamped, linear below 0."""
+    """Return sRGB values (IEC 61966-2-1) as linear light; any shape, differentiable, unclamped, linear below 0."""
     curve = ((values.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def linear_to_srgb(values: Tensor) -> Tensor:
-    """Convert linear light to sRGB (IEC 61966-2-1); any shape, differentiable also at 0, not clamped."""
+    """Return linear light as sRGB values (IEC 61966-2-1); any shape, differentiable also at 0, unclamped."""
     curve = 1.055 * values.clamp_min(0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(values <= 0.0031308, values * 12.92, curve)
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
-    """Write (H, W, 3 or 4) sRGB frames as an endless animation; the suffix picks the format; atomic.
+    """Write (H, W, 3 or 4) sRGB frames as an endless animation: WebP, GIF or MP4 by the suffix.
 
     GIF rounds frame times to hundredths of a second. MP4 is H.264 with even sizes (an odd last row or column is
     repeated), RGB only. Raises DataError for frames, suffix or rate, and BackendUnavailable for MP4 without the package
@@ -243,7 +251,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
 
 
 class FrameSpool:
-    """Collect frames of one size in a nameless temporary file in ``folder``, then write them as an animation."""
+    """Collects frames in a temporary file in ``folder``, then writes them as an animation; needs little memory."""
 
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)
@@ -252,7 +260,7 @@ class FrameSpool:
         self.count = 0
 
     def add(self, frame: Tensor) -> None:
-        """Append (H, W, 3) sRGB values, float 0..1 or uint8."""
+        """Append a frame of (H, W, 3) sRGB values, float 0..1 or uint8; all have one size."""
         image = pillow_image(Path(f"frame {self.count} of a film"), frame)
         if image.size != (self._size or image.size):
             raise DataError(f"frame {self.count} of a film is {image.size}; expected {self._size}, as the first")
@@ -262,7 +270,7 @@ class FrameSpool:
         self.count += 1
 
     def write(self, path: Path, fps: float) -> None:
-        """Write the same file as :func:`write_animation` (WebP or GIF) and close the spool; raises as that."""
+        """Write the file that :func:`write_animation` would write (WebP or GIF), and close the spool."""
         _check_animation_rate(path, self.count, fps)
         self._pages.finalize()
         self._file.seek(0)

@@ -22,7 +22,7 @@ _MAX_NAMED = 6  # views in one line; metrics.json names all
 
 
 def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both images as detached float64 (H, W, C) on the CPU, or raise DataError or NonFiniteError."""
+    """Return both images as detached float64 (H, W, C) on the CPU; raises DataError or NonFiniteError."""
     first, second = _check_images(rendered, truth)
     return first.double(), second.double()
 
@@ -50,9 +50,11 @@ def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """Peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; ``math.inf`` where the images are equal.
+    """Return the peak signal-to-noise ratio in dB, ``10 log10(peak^2 / MSE)``; ``math.inf`` for equal images.
 
-    ``mask``: (H, W) bool of pixels that count; ``peak``: the value that counts as full signal.
+    Args:
+        mask: (H, W) bool of the pixels that count; None for all.
+        peak: value of full signal.
     """
     first, second = _check_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -72,7 +74,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
 
 def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """:func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``: without exposure."""
+    """Return :func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``."""
     first, second = comparable_images(rendered, truth)
     counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
     square = first[counted].square().sum(0)
@@ -81,11 +83,10 @@ def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak:
 
 
 def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
-    """Structural similarity, the mean over pixels and channels, in -1..1 and 1 for equal images.
+    """Return the structural similarity (SSIM), mean over pixels and channels, from -1 to 1 for equal images.
 
-    An 11x11 Gaussian window of sigma 1.5, K1 = 0.01, K2 = 0.03, and only positions where the window lies inside the
-    image ("valid", as in Wang et al. 2004). For smaller images it shrinks to the largest odd size. ``peak``: the data
-    range L. Equal to kornia's in float64.
+    The window is Gaussian, 11x11, sigma 1.5, K1 = 0.01, K2 = 0.03, and lies inside the image (Wang et al. 2004). For
+    smaller images it shrinks to the largest odd size. ``peak`` is the data range L. Equal to kornia in float64.
     """
     first, second = _check_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -102,10 +103,10 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
 
 
 def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
-    """Structural similarity as the tools of 3D Gaussian splatting count it, for comparing with their tables.
+    """Return the structural similarity as the tools of 3D Gaussian splatting compute it, to compare with their tables.
 
-    As :func:`ssim` of values 0 to 1, but every pixel has a whole window, and beyond the image both are black. The mean
-    is mostly higher. Nothing is quantised, as those tools do.
+    It differs from :func:`ssim` of values 0 to 1: every pixel has a whole window, and images are black outside. The
+    mean is mostly higher. Unlike those tools, it does not quantise images.
     """
     first, second = _check_images(rendered, truth)
     border = (0, 0, *(SSIM_WINDOW // 2,) * 4)
@@ -113,12 +114,12 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
 
 
 def metric_to_json(key: str, value: float) -> dict[str, float | bool | None]:
-    """Return the entries for ``value`` under ``key``: infinity becomes ``null`` and ``<key>_infinite: true``."""
+    """Return JSON entries of a metric: infinity becomes ``null`` and ``KEY_infinite: true``."""
     return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
 
 
 def mean_metrics(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
-    """JSON-able means of numbers by name over the views that have them, by the rules of ``TaskSpec.metrics``."""
+    """Return JSON-able means of metrics over views, by the rules of ``TaskSpec.metrics``."""
     result: dict[str, Any] = {}
     for name in sorted({key for v in views for key in v}):
         having = [v for v in views if name in v]
@@ -134,7 +135,7 @@ def mean_metrics(views: Sequence[Mapping[str, float]]) -> dict[str, Any]:
 
 
 def metric_from_json(entries: Mapping[str, object], key: str) -> float | None:
-    """The number that :func:`metric_to_json` stored under ``key``; None where it is missing, not a number or NaN."""
+    """Return the number that :func:`metric_to_json` stored; None if it is missing, not a number or NaN."""
     if entries.get(f"{key}_infinite") is True:
         return math.inf
     value = entries.get(key)

@@ -21,6 +21,8 @@ from torch.nn.functional import conv2d, max_pool2d
 from neuprim.core.errors import BackendUnavailable, DataError
 from neuprim.core.metrics.image import comparable_images
 
+__all__ = ["Lpips", "flip", "flip_available"]
+
 
 class _Layer(NamedTuple):
     """A convolution with its rectifier."""
@@ -65,22 +67,21 @@ _SUFFIXES = (".pth", ".pt", ".safetensors")
 
 @dataclass(frozen=True)
 class Lpips:
-    """The distance, version 0.1, with one set of weights."""
+    """The LPIPS distance (version 0.1) with one set of weights; call it with two (H, W, 3) images."""
 
     network: str  # "alex" or "vgg"
-    # of the convolutions, in order
-    weights: tuple[Tensor, ...]
-    biases: tuple[Tensor, ...]
-    linear: tuple[Tensor, ...]  # (C,) per tap: how much each of its channels counts
+    weights: tuple[Tensor, ...]  # weights of the convolutions, in order
+    biases: tuple[Tensor, ...]  # biases of the convolutions
+    linear: tuple[Tensor, ...]  # (C,) weights of the channels of each compared layer
 
     @property
     def least(self) -> int:
-        """The smallest side of an image that it can be asked about."""
+        """Smallest side of an image, pixels."""
         return _LEAST[self.network]
 
     @staticmethod
     def load(path: str | Path) -> Lpips:
-        """Read weights of a file, or of all of a folder's together, without running code; or raise DataError."""
+        """Return the distance with weights of a file, or of a folder's files together; raises DataError."""
         where = Path(path)
         files = sorted(f for f in where.iterdir() if f.suffix in _SUFFIXES) if where.is_dir() else [where]
         if not files:
@@ -88,12 +89,11 @@ class Lpips:
         return _lpips_of_weights({key: value for file in files for key, value in _read_weights(file).items()}, where)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> float:
-        """The distance as published: of (H, W, 3) values clamped to 0..1 and mapped to -1..1; DataError below
-        :attr:`least`."""
+        """Return the distance as published, of (H, W, 3) values clamped to 0..1 and mapped to -1..1."""
         return self._distance(*(2.0 * image - 1.0 for image in self._images(rendered, truth)))
 
     def unmapped(self, rendered: Tensor, truth: Tensor) -> float:
-        """The distance as the tools of 3D Gaussian splatting take it: of values 0 to 1 as they are."""
+        """Return the distance as the tools of 3D Gaussian splatting compute it: values 0 to 1 are not mapped."""
         return self._distance(*self._images(rendered, truth))
 
     def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:
@@ -176,12 +176,12 @@ PIXELS_PER_DEGREE = 67.0  # the authors' default: a 0.7 m wide screen of 3840 pi
 
 
 def flip_available() -> bool:
-    """Whether the package ``flip-evaluator`` is installed."""
+    """Return whether the package ``flip-evaluator`` is installed."""
     return find_spec("flip_evaluator") is not None
 
 
 def flip(rendered: Tensor, truth: Tensor) -> float:
-    """Mean LDR-FLIP of two (H, W, 3) display-referred sRGB images, clamped to 0..1: 0 for equal ones to 1."""
+    """Return the mean LDR-FLIP of two (H, W, 3) sRGB images, clamped to 0..1; from 0 for equal images to 1."""
     try:
         from flip_evaluator import evaluate
     except ImportError as error:

@@ -36,6 +36,8 @@ from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 from neuprim.core.model.tensors import field_number_fault
 from neuprim.core.validation import Range
 
+__all__ = ["CosineDensity", "cosine_density", "split_cosine"]
+
 OMEGA0 = 30.0  # SIREN boost: multiplies the whole phase
 
 GAIN_LIMIT = 20.0
@@ -52,16 +54,17 @@ DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "mod
 
 
 class CosineDensity(DensityField):
-    """See the module; 5K + 1 parameters, and one for the gain.
+    """Density field of the neural primitive: K cosine neurons and an offset (method: "Density").
+
+    It lowers to :class:`~neuprim.core.model.fields.Cosine` and has 5K + 1 parameters, and one for the gain.
+    ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``; "paper" draws the offset
+    as the authors do, which leaves half of all chords without a gradient. Raises ValueError for other arguments.
 
     Args:
         neurons: K, 0 to 16.
-        omega0: a positive number.
-        edge: p, 0, 1 or 2.
-        gain: whether there is a log_gain, of its own learning rate.
-
-    ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``; "paper" draws the offset
-    as the authors do, which leaves half of all chords without a gradient. Raises ValueError for other arguments.
+        omega0: factor on the phases, above 0.
+        edge: p: 0 for a hard edge, 1 or 2 for a soft one.
+        gain: whether a parameter log_gain multiplies the density by its exponential.
     """
 
     init_settings = ("mode", "alpha")
@@ -132,7 +135,7 @@ class CosineDensity(DensityField):
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Neurons."""
+        """Return the neurons."""
         return tuple(PrunableUnit(f"neuron {k}", {"W1": (k,), "b1": (k,), "w2": (k,)}) for k in range(self.neurons))
 
     def script(self) -> str:
@@ -171,7 +174,7 @@ def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> 
 
 
 def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> Tensor:
-    """Unclamped world density (M,), 1/scene unit, of a lowered cosine field at (M, 3) points of primitives ``prim``."""
+    """Return the density (M,), 1/scene unit, unclamped, of a cosine form at points (M, 3) of primitives ``prim``."""
     m = geometry.length_scale[prim]
     local = (x - geometry.means[prim]) / m[:, None]
     phase = form.omega0 * ((form.W1[prim] * local[:, None, :]).sum(-1) + form.b1[prim])
@@ -195,11 +198,11 @@ def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
 def split_cosine(
     params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0, edge: int = 0
 ) -> dict[str, Tensor]:
-    """Children that continue their parents' f: W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m.
+    """Return the tensors of children that continue their parents' f.
 
-    With a hard edge c = r, and sigma goes on unchanged. A soft edge fades within a child where its parent's does not:
-    c = r V/2V' then, V = s_1 s_2 s_3, and both children have as much of the weight (1 - |y|^2)^p as their parent. In
-    float64, so that the field changes by no more than the final rounding.
+    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m. With a hard edge c = r and sigma does not
+    change. A soft edge also fades inside a child: c = r V/2V', V = s_1 s_2 s_3, so that both children together have the
+    weight (1 - |y|^2)^p of their parent. Computed in float64, so that the field changes only by the final rounding.
     """
     r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]

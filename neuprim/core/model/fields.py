@@ -18,7 +18,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.cameras.world import World
-from neuprim.core.model.forms import (  # noqa: F401 - the forms are part of this interface
+from neuprim.core.model.forms import (
     Constant,
     Cosine,
     CustomColour,
@@ -37,45 +37,48 @@ from neuprim.core.model.sh import lowest_band_colors
 if TYPE_CHECKING:
     from neuprim.core.settings import RenderSettings
 
+__all__ = ["ColourField", "ConditionSpec", "Conditions", "DensityField", "Field", "read_script"]
+__all__ += ["Constant", "Cosine", "CustomColour", "CustomDensity", "LoweredColour", "LoweredDensity", "RayNet"]
+__all__ += ["Shade", "Shading"]
+
 Conditions = Mapping[str, Tensor]
-"""Condition name ("time", "light", a plugin's "wavelength") -> value for one frame."""
+"""Values of one frame by the name of the condition, e.g. ``{"time": tensor(0.5)}``."""
 
 
 @dataclass(frozen=True)
 class ConditionSpec:
-    """A quantity a frame depends on besides its camera; command-line flags derive from these.
+    """An input of every frame besides its camera, such as the time; commands have a flag ``--NAME`` for it.
 
     Attributes:
-        name: of the flag, and the key in a frame's conditions.
-        range: lowest and highest value of every element. Numbers that are not finite are refused; beyond the range
-            there is a warning, or with ``strict`` a refusal.
-        parse: the text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
-            :class:`~neuprim.core.errors.ConfigError`. Where ``shape`` is ``()``, lists and ranges are parsed before
-            (:mod:`neuprim.core.conditions`).
-        sweep: a text of ``--NAME TEXT`` that animates the condition, for the commands a report offers; empty: none.
-        in_frames: (text, count) -> the text that means the same in so many frames, if it does not say how many.
-        place: for positions: ``parse`` of a text in the world of the user's files, (text, world) -> scene units.
+        name: name of the flag, and the key in a frame's conditions.
+        range: lowest and highest value of every element. Values beyond it give a warning; values that are not finite
+            are refused.
+        parse: text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
+            :class:`~neuprim.core.errors.ConfigError`. For numbers, neuprim parses lists and ranges before.
+        sweep: a text that animates the condition, for the commands that reports suggest; empty for none.
+        in_frames: (text, count) -> text of the same animation in ``count`` frames; None if the text says how many.
+        place: for positions: ``parse`` with the world of the user's files, (text, world) -> scene units.
         of_scene: (scene settings) -> whether the views of a scene have the condition.
     """
 
     name: str
-    shape: tuple[int, ...]
-    unit: str
+    shape: tuple[int, ...]  # shape of the value, () for a number
+    unit: str  # unit of the value, for help texts
     range: tuple[float, float]
     parse: Callable[[str], list[Tensor]]
-    strict: bool = False
+    strict: bool = False  # whether values beyond the range are refused
     sweep: str = ""
     in_frames: Callable[[str, int], str | None] = lambda text, count: None
     place: Callable[[str, World], list[Tensor]] | None = None
     of_scene: Callable[[Mapping[str, Any]], bool] = lambda scene: True
 
     def within(self, world: World) -> ConditionSpec:
-        """The condition of a model in ``world``: users write positions in the coordinates of their files."""
+        """Return the condition for a model in ``world``: users write positions in the coordinates of their files."""
         place = self.place
         return self if place is None or world.identity else replace(self, parse=lambda text: place(text, world))
 
     def given(self, value: Tensor, world: World) -> Tensor:
-        """A value as users write and read it: float64 world coordinates of a position."""
+        """Return a value as users write it: a position is in float64 world coordinates."""
         return value if self.place is None else world.world_points(value)
 
 
@@ -83,50 +86,51 @@ class ConditionSpec:
 
 
 class Field(ABC):
-    """Per-primitive parameters with a meaning; ``init_settings``: keys of ``model.init`` that initialisers read."""
+    """Base class of density and colour fields: parameters of each primitive, and their meaning."""
 
-    init_settings: tuple[str, ...] = ()
+    init_settings: tuple[str, ...] = ()  # keys of model.init that start values read
 
     @abstractmethod
     def parameters(self) -> list[ParameterSpec]:
-        """The field's tensors, in storage order."""
+        """Return the specifications of the field's tensors, in storage order."""
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
-        """JSON-able constructor arguments; ``type(self)(**settings)`` rebuilds the field from a checkpoint header."""
+        """Return the constructor's arguments, JSON-able; ``type(self)(**settings)`` rebuilds the field from a file."""
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        """The parameters that it has at any settings; a preset may give rates for all of them."""
+        """Return all parameters that the field can have; presets may give learning rates for them."""
         return cls().parameters()
 
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
         """Receive the used fraction of the budget, 0..1, before every training step; e.g. to unlock SH bands."""
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Compute rows of children created inside their parents, which continue the parents' field.
+        """Return the tensors of children, created inside their parents, that continue the parents' field.
 
         Args:
-            params: this field's tensors, one row per child, gathered from the parents.
-            old, new: the parents' and the children's geometry, one row per child.
+            params: this field's tensors of the parents, one row per child.
+            old: geometry of the parents, one row per child.
+            new: geometry of the children.
         """
         return dict(params)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Return settings that a fitted model can reduce, smaller values descending: ``{"degree": (2, 1, 0)}``."""
+        """Return the settings that can be reduced after training, with smaller values: ``{"degree": (2, 1, 0)}``."""
         return {}
 
     def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
-        """Return the field and tensors closest to this one's with one of :meth:`reductions` applied.
+        """Return the closest field and tensors with one of :meth:`reductions` applied.
 
-        "means" is among the tensors where the primitives' centres (N, 3) change with it.
+        The tensors include "means" (N, 3) if the centres of the primitives change.
         """
         raise NotImplementedError(
             f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it"
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """List disjoint sets of numbers that single primitives can do without."""
+        """Return disjoint sets of numbers that pruning may set to zero in single primitives."""
         return ()
 
     def canonicalize(self, params: Params) -> dict[str, Tensor]:
@@ -137,8 +141,8 @@ class Field(ABC):
         return dict(params)
 
     def script(self) -> str | None:
-        """JavaScript that folds conditions into the closed form, for web pages (docs/plugin_reference.md); None: not
-        shown there."""
+        """Return the JavaScript that lowers the field on web pages (docs/plugin_reference.md); None: they cannot show
+        it."""
         return None
 
 
@@ -152,22 +156,23 @@ def prunable_units_of_model(density: DensityField, colour: ColourField) -> dict[
 
 
 def read_script(package: str, name: str) -> str:
-    """Read a field's JavaScript beside its module, ``read_script(__package__, "density.js")``."""
+    """Return a field's JavaScript from a file beside its module: ``read_script(__package__, "density.js")``."""
     return resources.files(package).joinpath(name).read_text(encoding="utf-8")
 
 
 class DensityField(Field):
-    """How much light a point absorbs.
+    """Base class of density fields: the extinction sigma inside each primitive, 1/scene unit.
 
-    ``exact_split``: children continue their parent's sigma inside their own support. Where a family is too small for
-    that, such as Gaussians, they must hold their parent's mass, the integral of sigma over space.
+    Attributes:
+        exact_split: whether children continue their parent's sigma inside their own support. If not, as for Gaussians,
+            they must hold their parent's mass, the integral of sigma over space.
     """
 
     exact_split: bool = True
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> LoweredDensity:
-        """The frame's closed form."""
+        """Return the closed form of the density in one frame."""
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
@@ -175,7 +180,7 @@ class DensityField(Field):
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """Rows whose density is ``factor`` (rows,) times as large everywhere (a clone in place halves both copies)."""
+        """Return the tensors of a density ``factor`` (N,) times as large everywhere."""
 
     def components(self, params: Params) -> dict[str, Tensor]:
         """Return name -> (N,) share, 0..1, of each primitive's extinction that comes from a source grid.
@@ -190,7 +195,7 @@ class DensityField(Field):
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return (M,) ascending int64 rows of primitives that can absorb anything; None: all."""
+        """Return the (M,) int64 rows, ascending, of primitives that can absorb anything; None: all."""
         return None
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
@@ -198,32 +203,33 @@ class DensityField(Field):
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """How fresh primitives look like Gaussians of opacities ``alphas`` (N,): standard deviations from
-        middle to edge, and opacities through the middle, (N,) each. By default an ellipsoid of constant density.
+        """Return size and opacity of new primitives that resemble Gaussians of opacities ``alphas`` (N,).
+
+        (N,) standard deviations from centre to edge, and (N,) opacities through the centre, here of a constant density.
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
 
 class ColourField(Field):
-    """What colour a primitive sends towards the camera."""
+    """Base class of colour fields: the colour that each primitive sends to the camera."""
 
-    channels: int
+    channels: int  # number of channels of the images
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """Return (N, C) and (N, B, C) or None for :func:`neuprim.core.model.sh.sh_colors`, or None."""
+        """Return ``dc`` (N, C) and ``rest`` of :func:`~neuprim.core.model.sh.sh_colors`; None without harmonics."""
         return None
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """(N, C) the part of the colour, 0 or more, that depends on neither direction nor light: what voxels teach."""
+        """Return the (N, C) part of the colour, at least 0, that depends on neither direction nor light, or None."""
         found = self.harmonics(params, conditions)
         return None if found is None else lowest_band_colors(found[0])
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
-        """The frame's closed form."""
+        """Return the closed form of the colour in one frame."""
 
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading | None:
-        """What else the frame's colours are multiplied by; images for it are drawn with the frame's settings."""
+        """Return further factors on the colours of a frame, such as shadows; None for none."""
         return None

@@ -30,15 +30,10 @@ from neuprim.core.model.tensors import (
 
 @dataclass(frozen=True)
 class Cosine(PrimitiveTensors):
-    """f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2, density (1 - |y|^2)^p f/m inside the ellipsoid |y| < 1.
+    """Density of a cosine network: sigma(x) = (1 - |y|^2)^p f(x~) / m inside the ellipsoid |y| < 1, 0 outside.
 
-    p = 0 is the paper's; 1 and 2 have a soft edge (:mod:`neuprim.core.model.edge`). ``first + second`` is a sum of
-    densities.
-
-    Attributes:
-        W1: (N, K, 3), b1: (N, K), w2: (N, K), b2: (N,) or (N, 1); K = 0 to :data:`MOST_UNITS`.
-        omega0: multiplies the whole phase.
-        edge: p, 0, 1 or 2.
+    f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu) / m, m = max semi-axis. p = 0 is the hard
+    edge of the paper; 1 and 2 are soft (:mod:`neuprim.core.model.edge`). ``first + second`` is the sum of densities.
     """
 
     shapes: ClassVar[Shapes] = {
@@ -48,12 +43,12 @@ class Cosine(PrimitiveTensors):
         "b2": (("N", 1), ("N",)),
     }
 
-    W1: Tensor
-    b1: Tensor
-    w2: Tensor
-    b2: Tensor
-    omega0: float = 30.0
-    edge: int = 0
+    W1: Tensor  # (N, K, 3) frequencies, K from 0 to 256
+    b1: Tensor  # (N, K) phases
+    w2: Tensor  # (N, K) amplitudes
+    b2: Tensor  # (N,) or (N, 1) offsets
+    omega0: float = 30.0  # factor on the whole phase
+    edge: int = 0  # p: 0, 1 or 2
 
     def fault(self, sizes: Sizes) -> str | None:
         if type(self.edge) is not int or self.edge not in EDGES:
@@ -89,18 +84,18 @@ class Cosine(PrimitiveTensors):
         )
 
     def primitive_rows(self, index: Tensor | slice) -> Cosine:
-        """Those of some primitives, (M,) int64 or first:end, without gradient."""
+        """Return the form of some primitives, (M,) int64 or first:end, without gradient."""
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
     def scaled(self, factors: Tensor) -> Cosine:
-        """sigma times (N,) factors, at least 0."""
+        """Return the form of sigma times (N,) factors, at least 0."""
         factors = factors.to(self.b2)
         w2, b2 = self.w2 * factors[:, None], self.b2 * factors.reshape(self.b2.shape)
         return Cosine(self.W1, self.b1, w2, b2, self.omega0, self.edge)
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """(M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, whatever their length."""
+        """Return (M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, for any length."""
         prim = pairs.prim
         W1 = self.W1.double()[prim]
         phase = self.omega0 * ((W1 * pairs.local[:, None, :]).sum(-1) + self.b1.double()[prim])
@@ -114,10 +109,11 @@ class Cosine(PrimitiveTensors):
 
 @dataclass(frozen=True)
 class CustomDensity(PrimitiveTensors):
-    """Any other density, as torch code per ray-primitive pair; the reference backend renders it.
+    """Any other density, as PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
-    ``line_integral(prim, origin, direction, t0, t1)`` takes (M,) rows, (M, 3) ray origins and unit directions and (M,)
-    chord ends in scene units, and returns the (M,) optical depths.
+    Attributes:
+        line_integral: (prim, origin, direction, t0, t1) -> (M,) optical depths, from (M,) rows, (M, 3) ray origins and
+            unit directions, and (M,) ends of the chords, scene units.
     """
 
     edge: ClassVar[int] = 0
@@ -127,13 +123,13 @@ class CustomDensity(PrimitiveTensors):
         return labelled_fault("line_integral", function_fault(self.line_integral))
 
     def primitive_rows(self, index: Tensor | slice) -> CustomDensity:
-        """That of some primitives, (M,) int64 or first:end."""
+        """Return the form of some primitives, (M,) int64 or first:end."""
         if isinstance(index, slice):
             return CustomDensity(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
         return CustomDensity(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
     def scaled(self, factors: Tensor) -> CustomDensity:
-        """sigma times (N,) factors, at least 0."""
+        """Return the form of sigma times (N,) factors, at least 0."""
 
         def line_integral(prim: Tensor, *ray: Tensor) -> Tensor:
             found = self.line_integral(prim, *ray)
@@ -142,11 +138,12 @@ class CustomDensity(PrimitiveTensors):
         return CustomDensity(line_integral)
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Integrals of sigma along chords as the code returns them, unchecked."""
+        """Return the integrals of sigma along chords as the code computes them, unchecked."""
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
 
 LoweredDensity = Cosine | CustomDensity
+"""What :meth:`DensityField.lower` returns."""
 
 
 # ---------------------------------------------------------------- closed forms of colour
@@ -154,16 +151,13 @@ LoweredDensity = Cosine | CustomDensity
 
 @dataclass(frozen=True)
 class Constant(PrimitiveTensors):
-    """One colour per primitive and view: rgb (N, C), any channel count.
-
-    ``ambient`` (N, C), if given, is added once the factors per primitive of :class:`Shading` have multiplied ``rgb``.
-    """
+    """One colour per primitive and view, of any number of channels C."""
 
     per_primitive: ClassVar[bool] = True
     shapes: ClassVar[Shapes] = {"rgb": (("N", "C"),)}
 
-    rgb: Tensor
-    ambient: Tensor | None = None
+    rgb: Tensor  # (N, C) colours
+    ambient: Tensor | None = None  # (N, C) colours to add after the factors of Shading have multiplied rgb; None for 0
 
     @property
     def channels(self) -> int:
@@ -173,35 +167,36 @@ class Constant(PrimitiveTensors):
         return {"colors": self.rgb}  # as users know it
 
     def shaded(self, factors: Tensor | None) -> Constant:
-        """``rgb`` times (N,) factors, at least 0, and ``ambient``; None: 1."""
+        """Return ``rgb`` times (N,) factors, at least 0, plus ``ambient``; None: factors of 1."""
         rgb = self.rgb if factors is None else self.rgb * factors.to(self.rgb)[:, None]
         return Constant(rgb if self.ambient is None else rgb + self.ambient)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """(M, C) float64 colours that are seen along chords."""
+        """Return the (M, C) float64 colours that rays see along chords."""
         return self.rgb.double()[pairs.prim]
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """(N, C) colours at the centres of the primitives, seen from ``position`` (3,)."""
+        """Return the (N, C) colours at the centres of the primitives, seen from ``position`` (3,)."""
         return self.rgb
 
     @property
     def flat(self) -> Tensor:
-        """(N, C) colours, as they are the same all over a primitive."""
+        """(N, C) colours that hold everywhere in a primitive."""
         return self.rgb
 
 
 @dataclass(frozen=True)
 class CustomColour(PrimitiveTensors):
-    """Any other colour, as torch code per ray-primitive pair; the reference backend renders it.
+    """Any other colour, as PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
-    ``radiance(prim, x, d)`` takes (M,) rows, (M, 3) chord middles in scene units and unit directions, returns (M, C).
+    Attributes:
+        radiance: (prim, x, d) -> (M, C) colours, from (M,) rows, (M, 3) chord middles and unit directions.
     """
 
     per_primitive: ClassVar[bool] = False
     flat: ClassVar[None] = None
     radiance: Callable[[Tensor, Tensor, Tensor], Tensor]
-    channels: int
+    channels: int  # C
 
     def fault(self, sizes: Sizes) -> str | None:
         if isinstance(self.channels, bool) or not isinstance(self.channels, int) or self.channels < 1:
@@ -210,7 +205,7 @@ class CustomColour(PrimitiveTensors):
         return labelled_fault("radiance", function_fault(self.radiance))
 
     def shaded(self, factors: Tensor | None) -> CustomColour:
-        """The same times (N,) factors, at least 0; None: 1."""
+        """Return the form times (N,) factors, at least 0; None: 1."""
         if factors is None:
             return self
 
@@ -221,11 +216,11 @@ class CustomColour(PrimitiveTensors):
         return CustomColour(radiance, self.channels)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Colours seen along chords as the code returns them, unchecked."""
+        """Return the colours along chords as the code computes them, unchecked."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
+        """Return the colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
         means = geometry.means
         directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
         return self.radiance(torch.arange(geometry.count, device=means.device), means, directions)
@@ -233,17 +228,13 @@ class CustomColour(PrimitiveTensors):
 
 @dataclass(frozen=True)
 class RayNet(PrimitiveTensors):
-    """A colour network per primitive, evaluated where each pixel's ray passes through it.
+    """A colour network per primitive, evaluated at the middle of each ray's chord.
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
-    with x_m the middle of the ray's chord, after the near plane's cut. One hidden layer of H cosine units, H = 0 to
-    :data:`MOST_UNITS`. What does not change within a primitive (view direction, light) a field folds into ``bias``,
-    ``Wout`` and ``base``. A colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
-
-    Attributes:
-        Wx: (N, H, 3) on scene axes, radians per m; bias: (N, H), radians.
-        Wout: (N, C, H), base: (N, C), any channel count C.
+    x_m is the middle of the chord behind the near plane. The network has one hidden layer of H cosine units, H = 0 to
+    256. A field folds what is constant in a primitive (view direction, light) into ``bias``, ``Wout`` and ``base``. A
+    colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
     """
 
     per_primitive: ClassVar[bool] = True
@@ -255,10 +246,10 @@ class RayNet(PrimitiveTensors):
         "Wout": (("N", "C", "H"),),
     }
 
-    Wx: Tensor
-    bias: Tensor
-    Wout: Tensor
-    base: Tensor
+    Wx: Tensor  # (N, H, 3) frequencies on scene axes, radians per m
+    bias: Tensor  # (N, H) phases, radians
+    Wout: Tensor  # (N, C, H) amplitudes, any number of channels C
+    base: Tensor  # (N, C) offsets
 
     @property
     def channels(self) -> int:
@@ -269,44 +260,44 @@ class RayNet(PrimitiveTensors):
         return int(self.Wx.shape[1])
 
     def shaded(self, factors: Tensor | None) -> RayNet:
-        """The same times (N,) factors, at least 0, which max(0, .) lets through; None: 1."""
+        """Return the form times (N,) factors, at least 0; None: 1."""
         if factors is None:
             return self
         factors = factors.to(self.base)
         return RayNet(self.Wx, self.bias, self.Wout * factors[:, None, None], self.base * factors[:, None])
 
     def primitive_radiance(self, prim: Tensor, local: Tensor) -> Tensor:
-        """(M, C) float64 colours of primitives ``prim`` (M,) at ``local`` = x~_m (M, 3) float64; differentiable."""
+        """Return (M, C) float64 colours of primitives ``prim`` (M,) at ``local`` = x~_m (M, 3); differentiable."""
         phase = (self.Wx.double()[prim] * local[:, None, :]).sum(-1) + self.bias.double()[prim]
         mixed = (self.Wout.double()[prim] * phase.cos()[:, None, :]).sum(-1)
         return (self.base.double()[prim] + mixed).clamp_min(0)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """(M, C) float64 colours that are seen along chords; differentiable."""
+        """Return the (M, C) float64 colours that rays see along chords; differentiable."""
         return self.primitive_radiance(pairs.prim, pairs.local)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """(N, C) float64 colours at the centres of the primitives; the same from everywhere."""
+        """Return the (N, C) float64 colours at the centres of the primitives, which no position changes."""
         middles = torch.zeros_like(geometry.means, dtype=torch.float64)
         return self.primitive_radiance(torch.arange(geometry.count, device=middles.device), middles)
 
 
 LoweredColour = Constant | RayNet | CustomColour
-"""Of each: ``channels``, and ``per_primitive``, whether a colour at its centre says what a primitive looks like from a
-direction."""
+"""What :meth:`ColourField.lower` returns. ``per_primitive``: whether a primitive's colour at its centre is that of all
+of it, seen from one direction."""
 
 Shade = Callable[[Tensor], Tensor]
-"""(M, 3) float64 scene points that pixels show -> (M,) factors on the light that they send to the camera, without
+"""Function of the (M, 3) float64 scene points that pixels show, which returns (M,) factors on their light, without
 gradient."""
 
 
 @dataclass(frozen=True)
 class Shading:
-    """Factors on a frame's colours that follow from the primitives themselves, such as shadows; without gradient.
+    """Factors on the colours of a frame that follow from the primitives themselves, such as shadows; no gradient.
 
     Attributes:
-        primitives: (M,) at least 0, one for each primitive of the frame; None: 1.
-        pixels: a factor asked for once per pixel, at the mean depth of what it shows (deferred shading); None: 1.
+        primitives: (M,) factors of at least 0, one per primitive of the frame; None: 1.
+        pixels: function of one point per pixel, at the mean depth of what it shows (deferred shading); None: 1.
     """
 
     primitives: Tensor | None = None

@@ -20,6 +20,8 @@ from neuprim.core.model.fields import Conditions, CustomDensity, DensityField
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 
+__all__ = ["GaussianDensity"]
+
 _SHORT = 0.2
 """Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per
 decade of w."""
@@ -29,7 +31,7 @@ _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 
 
 class GaussianDensity(DensityField):
-    """sigma = kappa/m exp(-c^2 |y|^2 / 2); one parameter, log kappa, so 11 with the geometry.
+    """Density field of Gaussians, sigma = kappa/m exp(-c^2 |y|^2 / 2), with one parameter, log kappa.
 
     ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``, "paper" at 0.1, as 3D
     Gaussian splatting does.
@@ -63,11 +65,11 @@ class GaussianDensity(DensityField):
         return (depth / ctx.thickness / central).log().float()[:, None]
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """As wide as they are: the support ends where it ends for every Gaussian."""
+        """Return the support of the Gaussians, c standard deviations, and ``alphas``."""
         return torch.full_like(alphas, self.deviations), alphas
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
-        """The line integral over a chord [t0, t1] in closed form, in float64; differentiable in every argument.
+        """Return the line integral over a chord [t0, t1] in closed form, float64, differentiable in every argument.
 
         With y the whitened chord middle, v = diag(1/s) R^T d, a = v.v, u = y.v/a and x = y - u v the closest approach,
 
@@ -105,7 +107,7 @@ class GaussianDensity(DensityField):
         return peak[prim] * (-0.5 * self.deviations**2 * (y * y).sum(-1)).exp()
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Each child gets half its parent's mass: kappa'/m' prod s' = (1/2) kappa/m prod s.
+        """Return children with half their parent's mass each: kappa'/m' prod s' = (1/2) kappa/m prod s.
 
         No Gaussian continues another inside a smaller support, so this split changes the image.
         """
@@ -118,7 +120,7 @@ class GaussianDensity(DensityField):
         }
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """See the base class; a factor below 1e-30 counts as 1e-30, a negative one is a ValueError."""
+        """Return the scaled amplitudes; a factor below 1e-30 counts as 1e-30, a negative one is a ValueError."""
         if bool((factor < 0).any()):
             raise ValueError(f"density factor {float(factor.min())}; a Gaussian's must not be negative")
         shift = factor.to(params["log_amplitude"]).clamp_min(_FAINTEST).log()

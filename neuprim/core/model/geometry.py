@@ -11,6 +11,8 @@ from torch import Tensor
 from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import PrimitiveTensors, Shapes
 
+__all__ = ["Geometry"]
+
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
     """Rotation matrices (..., 3, 3) of wxyz quaternions (..., 4), normalised on use; NaN of a zero quaternion."""
@@ -25,11 +27,11 @@ def quaternion_to_matrix(quats: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class Geometry(PrimitiveTensors):
-    """N ellipsoids of hard support (radius 1 in whitened space).
+    """N ellipsoids: centres, semi-axes and orientations.
 
     Attributes:
         means: (N, 3) centres, scene units.
-        log_scales: (N, 3) natural logarithm of the semi-axes, scene units.
+        log_scales: (N, 3) natural logarithms of the semi-axes, scene units.
         quats: (N, 4) wxyz, any non-zero norm.
     """
 
@@ -45,23 +47,23 @@ class Geometry(PrimitiveTensors):
 
     @property
     def scales(self) -> Tensor:
-        """(N, 3) semi-axes."""
+        """Semi-axes, (N, 3), scene units."""
         return self.log_scales.exp()
 
     @property
     def log_length_scale(self) -> Tensor:
-        """(N,) logarithm of m = max semi-axis; a tie sends its gradient to the first axis, in every backend."""
+        """Logarithm of the longest semi-axis m, (N,); the first of equal axes gets the gradient, in every backend."""
         first = self.log_scales.argmax(dim=-1, keepdim=True)
         return self.log_scales.gather(-1, first)[..., 0]
 
     @property
     def length_scale(self) -> Tensor:
-        """(N,) m, the field's length scale."""
+        """Longest semi-axis m, (N,), scene units: the length scale of the fields."""
         return self.log_length_scale.exp()
 
     @property
     def rotations(self) -> Tensor:
-        """(N, 3, 3), columns are the ellipsoid's axes in scene coordinates."""
+        """Rotation matrices, (N, 3, 3); their columns are the axes of the ellipsoids in scene coordinates."""
         return quaternion_to_matrix(self.quats)
 
     def __getitem__(self, rows: Tensor | slice) -> Geometry:

@@ -19,6 +19,8 @@ from neuprim.core.model.schema import Params
 from neuprim.core.model.sh import sh_colors
 from neuprim.core.model.tensors import Sizes, primitive_tensors_fault
 
+__all__ = ["lobe_colors"]
+
 AMPLITUDE, AXIS, LOG_SHARPNESS = "lobe_amplitude", "lobe_axis", "lobe_log_sharpness"
 """Names of the parameters (N, L, C), (N, L, 3) and (N, L)."""
 
@@ -26,13 +28,17 @@ AMPLITUDE, AXIS, LOG_SHARPNESS = "lobe_amplitude", "lobe_axis", "lobe_log_sharpn
 def lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """(N, C) colours of lobes in the module's equation, in the colour space of the images; fused on float32 tensors.
+    """Return (N, C) colours of spherical Gaussian lobes, in the colour space of the images; fused on float32.
+
+    c(d) = max(0, C0 dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))), d the unit direction from the camera.
 
     Args:
-        means: (N, 3) scene units. origin: (3,) the camera's position.
+        means: (N, 3) centres of the primitives, scene units.
         dc: (N, C) base colours as zero-order coefficients of spherical harmonics: C0 dc + 1/2 is the colour.
-        amplitude: (N, L, C), L from 0 to 8. axis: (N, L, 3), of any length.
-        log_sharpness: (N, L) natural logarithms.
+        amplitude: (N, L, C) a_l, L from 0 to 8.
+        axis: (N, L, 3) m_l, of any length.
+        log_sharpness: (N, L) natural logarithms of s_l.
+        origin: (3,) position of the camera.
 
     Raises:
         FormError: a tensor does not fit.

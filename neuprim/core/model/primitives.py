@@ -31,24 +31,22 @@ from neuprim.core.model.schema import InitContext, ParameterSpec
 from neuprim.core.model.tensors import Sizes, function_fault
 from neuprim.core.settings import RenderSettings
 
+__all__ = ["ActivePrimitives", "LoweredPrimitives", "Primitives"]
+
 
 @dataclass(frozen=True)
 class LoweredPrimitives:
-    """The input of the renderer for one frame, whatever the task.
-
-    ``rows`` (M,) int64: which primitives of the model these are; None for all. ``shade``: a factor on each pixel
-    (:meth:`~neuprim.core.model.fields.ColourField.shade`). ``fields``: class names of the fields, for messages.
-    """
+    """The input of the renderer for one frame: ellipsoids with closed forms of density and colour."""
 
     geometry: Geometry
     density: LoweredDensity
     colour: LoweredColour
-    rows: Tensor | None = None
-    shade: Shade | None = None
-    fields: tuple[str, str] | None = None
+    rows: Tensor | None = None  # (M,) int64 rows of the model that these are; None for all
+    shade: Shade | None = None  # factor on each pixel, see ColourField.shade
+    fields: tuple[str, str] | None = None  # class names of the fields, for messages
 
     def check(self, viewmat: Any = None, background: Any = None) -> None:
-        """Raise :class:`FormError` unless everything that a renderer takes fits."""
+        """Raise FormError if a tensor has a wrong type, shape or device."""
         density, colour = self.fields or (None, None)
         sizes = check_geometry(self.geometry, "geometry")
         check_lowered_density(self.density, sizes, density)
@@ -58,7 +56,7 @@ class LoweredPrimitives:
         self.check_frame(viewmat, background)
 
     def check_finite(self) -> None:
-        """Raise NonFiniteError for the first primitive with a number, quaternion or scale that cannot be drawn.
+        """Raise NonFiniteError for the first primitive with a number, quaternion or scale that cannot be rendered.
 
         The kernels check the same while they prepare a frame.
         """
@@ -79,7 +77,7 @@ class LoweredPrimitives:
                 raise non_finite_primitive_error(tensors, int(bad.nonzero()[0]))
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
-        """Check what :meth:`Primitives.lower` has not checked; raises as :meth:`check`."""
+        """Check what :meth:`Primitives.lower` has not checked; raises FormError."""
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
@@ -103,42 +101,42 @@ class LoweredPrimitives:
 
     @property
     def kind(self) -> str:
-        """The kind of device that its tensors are on."""
+        """Kind of device of the tensors: "cpu" or "cuda"."""
         return self.geometry.means.device.type
 
     @property
     def movable(self) -> bool:
-        """Whether all that it is made of are tensors: a model's own code stays where it is."""
+        """Whether another device can hold it: no, if a field's own code computes density or colour."""
         return self.density.movable and self.colour.movable
 
     def to(self, device: torch.device) -> LoweredPrimitives:
-        """The same on another device, without ``rows`` and ``shade``; differentiable. It must be :attr:`movable`."""
+        """Return a copy on another device, without ``rows`` and ``shade``; differentiable. Needs :attr:`movable`."""
         return LoweredPrimitives(
             self.geometry.to(device), self.density.to(device), self.colour.to(device), fields=self.fields
         )
 
     def owner(self, kind: Literal["density", "colour"]) -> str:
-        """Whose form it is, for messages: ``"density field Waves"``."""
+        """Return the name of the field for messages: ``"density field Waves"``."""
         return model_field_label(kind, None if self.fields is None else self.fields[kind == "colour"])
 
     def source(self, kind: Literal["density", "colour"]) -> str:
-        """The same with the form: ``"density field Waves lowered to Cosine"``."""
+        """Return the name of field and form for messages: ``"density field Waves lowered to Cosine"``."""
         return f"{self.owner(kind)} lowered to {type(getattr(self, kind)).__name__}"
 
     def center_colors(self, position: Tensor) -> Tensor:
-        """(M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
+        """Return the (M, C) colours at the primitives' centres, seen from ``position`` (3,)."""
         found = self.colour.at_primitive_centers(self.geometry, position)
         return check_primitive_field_result(
             found, (self.geometry.count, self.colour.channels), f"{self.source('colour')}: radiance"
         )
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """(M,) float64 integrals of sigma along chords, unclamped."""
+        """Return the (M,) float64 integrals of sigma along chords, unclamped."""
         found = self.density.optical_depth(pairs)
         return check_primitive_field_result(found, (len(pairs),), f"{self.source('density')}: line_integral").double()
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """(M, C) float64 colours that are seen along chords."""
+        """Return the (M, C) float64 colours that rays see along chords."""
         found = self.colour.chord_colours(pairs)
         return check_primitive_field_result(
             found, (len(pairs), self.colour.channels), f"{self.source('colour')}: radiance"
@@ -147,29 +145,30 @@ class LoweredPrimitives:
 
 @dataclass(frozen=True)
 class ActivePrimitives:
-    """The M active primitives, which can absorb anything under some conditions."""
+    """The M primitives that can absorb anything under some conditions."""
 
     field: DensityField
     conditions: Conditions
-    rows: Tensor | None  # (M,) int64 ascending rows of the model; None where all are
-    params: dict[str, Tensor]  # all their tensors
-    own: dict[str, Tensor]  # those of the density field
-    stored: Geometry  # as DensityField.density takes it
-    geometry: Geometry  # where they are under the conditions
+    rows: Tensor | None  # (M,) int64 rows of the model, ascending; None for all
+    params: dict[str, Tensor]  # all tensors of these primitives
+    own: dict[str, Tensor]  # tensors of the density field
+    stored: Geometry  # ellipsoids as the model stores them
+    geometry: Geometry  # ellipsoids under the conditions
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
-        """World density (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
+        """Return sigma (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
         found = self.field.density(self.own, self.stored, prim, x, self.conditions)
         return check_primitive_field_result(found, (len(prim),), model_method_label(self.field, "density"))
 
 
 class Primitives:
-    """N primitives with a density and a colour field.
+    """A model: N primitives with a density field and a colour field.
 
     Attributes:
-        density, colour: the fields.
-        specs: every parameter, geometry first; the only list of tensors there is.
-        params: name -> (N, *shape) tensor, in the order of ``specs``. Others are a ValueError.
+        density: the density field.
+        colour: the colour field.
+        specs: specifications of all parameters, geometry first.
+        params: name -> (N, *shape) tensor, in the order of ``specs``. Other names and shapes are a ValueError.
     """
 
     def __init__(self, density: DensityField, colour: ColourField, params: Mapping[str, Tensor]) -> None:
@@ -190,7 +189,7 @@ class Primitives:
 
     @classmethod
     def initialise(cls, density: DensityField, colour: ColourField, context: InitContext) -> Primitives:
-        """Fresh primitives from the specs' own initialisers; raises FormError for other shapes."""
+        """Return new primitives with the start values of their parameters; raises FormError for wrong shapes."""
         own = [("starting points", spec) for spec in GEOMETRY_SPECS]
         own += [
             (model_method_label(field, "parameters"), spec)
@@ -207,7 +206,7 @@ class Primitives:
 
     @property
     def device(self) -> torch.device:
-        """Where its tensors are."""
+        """Device of the tensors."""
         return self.params["means"].device
 
     @property
@@ -219,7 +218,7 @@ class Primitives:
         return Geometry(self.params["means"], self.params["log_scales"], self.params["quats"])
 
     def of(self, field: DensityField | ColourField) -> dict[str, Tensor]:
-        """The tensors one field owns."""
+        """Return the tensors of one of the two fields, by name."""
         return self._of(field, self.params)
 
     def _of(self, field: DensityField | ColourField, params: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -229,14 +228,14 @@ class Primitives:
     def lower(
         self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None, shaded: bool = True
     ) -> LoweredPrimitives:
-        """Fold a frame's conditions into closed forms; differentiable. Inactive primitives are left out.
+        """Return the closed forms of a frame, without inactive primitives; differentiable.
 
         Args:
-            settings: for images that a colour field needs first, such as a shadow's; None: the defaults.
-            shaded: whether :meth:`~neuprim.core.model.fields.ColourField.shade` is asked.
+            settings: for images that a colour field renders first, such as those of shadows; None: the defaults.
+            shaded: whether to apply :meth:`~neuprim.core.model.fields.ColourField.shade`.
 
         Raises:
-            FormError: a field hands over tensors that do not fit.
+            FormError: a field returned tensors of a wrong type, shape or device.
         """
         active = self.active(conditions)
         geometry, (density, sizes) = (
@@ -254,7 +253,7 @@ class Primitives:
         return LoweredPrimitives(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
-        """Return geometry and density of the primitives active in a frame."""
+        """Return geometry and density of the active primitives of a frame."""
         active = self.active(conditions)
         return active.geometry, self._lower_density(active)[0]
 
@@ -269,14 +268,14 @@ class Primitives:
         return density, sizes
 
     def component(self, name: str) -> Primitives:
-        """The part of the extinction that comes from the source grid ``name``, or KeyError."""
+        """Return a model of the extinction that comes from the source grid ``name``; raises KeyError."""
         own = {key: value.detach() for key, value in self.of(self.density).items()}
         scaled = self.density.scale_density(own, self.density.components(own)[name])
         return Primitives(self.density, self.colour, {**self.params, **scaled})
 
     @torch.no_grad()
     def limit(self, largest: float) -> None:
-        """Scale densities, in place, so that no primitive exceeds this extinction: the data's largest."""
+        """Scale densities in place, so that no primitive exceeds an extinction, 1/scene unit."""
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
         if found is None:
@@ -287,7 +286,7 @@ class Primitives:
                 own[name].copy_(value)
 
     def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActivePrimitives:
-        """Return the primitives active in a frame; differentiable. With ``dtype``, detached and of that type."""
+        """Return the active primitives of a frame; differentiable. With ``dtype``, detached and of that type."""
         rows = self.density.active_rows(self.of(self.density), conditions)
         params = self.params
         if rows is not None:
@@ -306,7 +305,7 @@ class Primitives:
         return ActivePrimitives(self.density, conditions, rows, params, own, stored, moved)
 
     def to(self, device: torch.device) -> Primitives:
-        """The same model on another device, without gradients; itself if it is there already."""
+        """Return the model on another device, without gradients; itself if it is there already."""
         if self.device == device:
             return self
         return Primitives(
@@ -314,7 +313,7 @@ class Primitives:
         )
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
-        """Detached copies of some rows of every parameter."""
+        """Return detached copies of some rows of every parameter, by name."""
         return {name: value.detach()[index].clone() for name, value in self.params.items()}
 
     def check_finite(self, what: str = "parameter") -> None:

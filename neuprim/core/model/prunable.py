@@ -18,19 +18,21 @@ from torch import Tensor
 from neuprim.core.errors import CheckpointError
 from neuprim.core.model.schema import ParameterSpec, Params
 
+__all__ = ["PrunableUnit"]
+
 Index = tuple[int | slice, ...]  # index into a parameter, behind the axis of the primitives
 
 
 @dataclass(frozen=True)
 class PrunableUnit:
-    """Numbers of a field that are removed together."""
+    """Numbers of a field that pruning removes together, such as one neuron."""
 
     name: str  # unique within the field, e.g. "neuron 2"
     places: Mapping[str, Index]  # parameter -> index of the numbers
     group: str = ""  # units that are reported together, e.g. "band 2"; empty: the name
 
     def of(self, params: Params) -> dict[str, Tensor]:
-        """Return views of the numbers, (N, ...) each."""
+        """Return the numbers by parameter, as (N, ...) views."""
         return {name: params[name][(slice(None), *place)] for name, place in self.places.items()}
 
 

@@ -12,27 +12,30 @@ from torch import Tensor
 
 from neuprim.core.validation import Range, validate_value
 
+__all__ = ["InitContext", "ParameterSpec", "Params", "RateUnit"]
+
 RateUnit = Literal["absolute", "extent", "pixel"]
-"""What a learning rate is a multiple of; see :class:`ParameterSpec`."""
+"""Unit of a learning rate; see :class:`ParameterSpec`."""
 
 Params = Mapping[str, Tensor]
-"""Parameter name -> tensor of shape (N, *spec.shape)."""
+"""Parameters by name; each tensor has shape (N, *spec.shape)."""
 
 
 @dataclass
 class InitContext:
-    """Everything an initialiser may look at.
+    """What the start value of a parameter may depend on.
 
     Attributes:
         means: (N, 3) initial centres, scene units.
         scales: (N,) isotropic initial semi-axes, scene units.
         colors: (N, C) initial colours in the data set's own colour space.
-        generator: the only source of randomness initialisers may use.
-        settings: free settings of the preset (``model.init``), e.g. ``{"alpha": 0.8}``.
-        conditions: name -> (N,) condition at which each starting point was found, where the data set says so.
-        axes, quats: (N, 3) semi-axes and (N, 4) wxyz orientations of starting points that are ellipsoids.
-        alphas: (N,) opacities in 0..1 through their middles, where they have one.
-        steps: condition name -> from one of a sequence's frames to the next.
+        generator: the only source of random numbers.
+        settings: settings of the preset under ``model.init``, e.g. ``{"alpha": 0.8}``.
+        conditions: name -> (N,) condition at which each starting point was observed, if the data set knows it.
+        axes: (N, 3) semi-axes of starting points that are ellipsoids.
+        quats: (N, 4) wxyz orientations of starting points that are ellipsoids.
+        alphas: (N,) opacities 0..1 of the starting points through their centres, if known.
+        steps: condition name -> difference between neighbouring frames of a sequence.
     """
 
     means: Tensor
@@ -48,8 +51,7 @@ class InitContext:
 
     @property
     def thickness(self) -> Tensor:
-        """(N,) float64 chord through the middle over the longest axis, weighted so that as much is hidden from all
-        sides."""
+        """Harmonic mean of the semi-axes over the longest one, (N,) float64; 1 for spheres."""
         if self.axes is None:
             return torch.ones(self.count, dtype=torch.float64)
         axes = self.axes.double()
@@ -60,7 +62,7 @@ class InitContext:
         return int(self.means.shape[0])
 
     def uniform(self, *shape: int, bound: float = 1.0) -> Tensor:
-        """U(-bound, bound) of shape (N, *shape), float32."""
+        """Draw (N, *shape) float32 numbers, uniform from -bound to bound."""
         u = torch.rand((self.count, *shape), generator=self.generator, dtype=torch.float32)
         return (2.0 * u - 1.0) * bound
 
@@ -81,13 +83,12 @@ class ParameterSpec:
     Attributes:
         name: unique within a model; the key in checkpoints, rates and exports.
         shape: shape per primitive, ``()`` for a scalar.
-        lr: base learning rate; ``train.rates.NAME`` overrides it. 0: a label, which is kept in every file.
-        init: draws the (N, *shape) float32 start value.
-        lr_unit: what rates are multiplied by: "absolute", nothing; "extent", the data set's
+        lr: learning rate; ``train.rates.NAME`` overrides it. 0 means a label: not learned, stored in every file.
+        init: function that draws the (N, *shape) float32 start values.
+        lr_unit: factor on the rate: "absolute", 1; "extent", the data set's
             :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the start.
             ``train.rate_units.NAME`` overrides it.
-        low: least value that training leaves. Where a model takes max(0, value), a value below 0 gets no gradient and
-            stays there; with 0 it can rise again.
+        low: lower bound of the values. With 0, a value that the model clamps at 0 keeps its gradient and can rise.
     """
 
     name: str
@@ -99,12 +100,12 @@ class ParameterSpec:
 
     @property
     def fixed(self) -> bool:
-        """Whether it is a label that is not learned."""
+        """Whether the tensor is a label that is not learned."""
         return self.lr == 0
 
     @property
     def size(self) -> int:
-        """Numbers per primitive."""
+        """Number of values per primitive."""
         n = 1
         for s in self.shape:
             n *= s

@@ -14,14 +14,16 @@ from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import Params
 from neuprim.core.model.tensors import Shape, Sizes, primitive_tensors_fault
 
+__all__ = ["initial_sh_dc", "sh_basis", "sh_coefficient_count", "sh_colors"]
+
 
 def sh_coefficient_count(degree: int) -> int:
-    """Coefficients per channel of all bands up to ``degree``."""
+    """Return the number of coefficients per channel of all bands up to ``degree``."""
     return (degree + 1) ** 2
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """(N, (degree + 1)^2) basis values at unit ``directions`` (N, 3), degree 0..3."""
+    """Return the (N, (degree + 1)^2) values of the basis at unit ``directions`` (N, 3), degree 0..3."""
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical-harmonics degree {degree}; expected 0..3")
     x, y, z = directions.unbind(-1)
@@ -50,12 +52,13 @@ def lowest_band_colors(dc: Tensor) -> Tensor:
 
 
 def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
-    """(N, C) max(0, SH(direction origin -> mean) + 1/2); fused on float32 tensors.
+    """Return the (N, C) colours max(0, SH(direction from origin to mean) + 1/2); fused on float32 tensors.
 
     Args:
-        means: (N, 3) scene units. origin: (3,) the camera's position.
+        means: (N, 3) centres of the primitives, scene units.
         dc: (N, C) zero-order coefficients.
-        rest: (N, at least (degree + 1)^2 - 1, C) of the higher bands; None only at degree 0.
+        rest: (N, at least (degree + 1)^2 - 1, C) coefficients of the higher bands; None only at degree 0.
+        origin: (3,) position of the camera.
         degree: bands in use, 0..3.
 
     Raises:
@@ -120,5 +123,5 @@ def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[Pru
 
 
 def initial_sh_dc(color: Tensor) -> Tensor:
-    """(N, C) float32 zero-order coefficients of a colour (N, C) that is the same from everywhere."""
+    """Return the (N, C) float32 zero-order coefficients of a colour (N, C) that no direction changes."""
     return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

@@ -54,21 +54,21 @@ def render(
     settings: RenderSettings | None = None,
     background: Tensor | None = None,
 ) -> RenderOutput:
-    """Draw one frame; differentiable in every parameter, in ``camera.viewmat`` and in ``background``.
+    """Render one view; differentiable in every parameter, in ``camera.viewmat`` and in ``background``.
 
-    All tensors of a model are on one device, the CPU or a GPU; the image is there too.
+    All tensors of a model are on one device, the CPU or a GPU. The image is on the same device.
 
     Args:
-        camera: the view; rgb is (camera.height, camera.width, C). Only the reference draws a :class:`RayCamera`.
-        conditions: e.g. ``{"time": tensor(0.5)}``.
-        settings: None: the defaults, with ``near="auto"``.
+        camera: the camera; rgb is (camera.height, camera.width, C). Only "reference" renders a :class:`RayCamera`.
+        conditions: a value of every condition, e.g. ``{"time": tensor(0.5)}``.
+        settings: render settings; None for the defaults with ``near="auto"``.
         background: (C,) colour behind everything; None is black.
 
     Raises:
-        FormError: a field, the camera or the background has a tensor that does not fit.
-        NonFiniteError: a parameter is NaN or infinite (named, with the primitive).
-        BackendUnavailable: the named backend cannot draw this model or camera, or cannot run here.
-        ConfigError: there is no backend of the name.
+        FormError: a tensor of a field, the camera or the background has a wrong shape, type or device.
+        NonFiniteError: a parameter is NaN or infinite; the message names parameter and primitive.
+        BackendUnavailable: the chosen backend cannot render this model or camera, or cannot run here.
+        ConfigError: no backend has this name.
     """
     settings = settings or RenderSettings(near="auto")
     # fields are lowered by as many threads as pixels
@@ -81,7 +81,7 @@ def render(
 def render_lowered(
     lowered: LoweredPrimitives, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
 ) -> RenderOutput:
-    """Draw a model whose conditions are folded in already; the same errors as :func:`render`."""
+    """Render closed forms, as :meth:`Primitives.lower` returns them; raises the errors of :func:`render`."""
     lowered.check(camera.viewmat, background)
     return _render_checked_view(lowered, camera, settings, background)
 
@@ -114,7 +114,7 @@ def _render_checked_view(
 
 
 def probe_backend(name: str) -> str | None:
-    """Return None if backend ``name`` works here, else why not: draw one small sphere and check the middle pixel."""
+    """Return None if a backend works on this machine, else the reason; renders one small sphere to find out."""
     from neuprim.core.model.geometry import Geometry
 
     try:
@@ -139,13 +139,13 @@ def probe_backend(name: str) -> str | None:
 def render_slabs(
     geometry: Geometry, density: LoweredDensity, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return (S, H, W) opacities and mean depths of the slabs that have primitives, in their order; no gradients.
+    """Return (S, H, W) opacities and mean depths of groups of primitives (slabs), each rendered alone; no gradients.
 
-    They are drawn in one frame where the backend can, else one by one: the same bits.
+    Slabs without primitives are left out; the others keep their order.
 
     Args:
         slabs: (N,) slab of each primitive, 0 to ``count`` - 1, on the primitives' device.
-        settings: with ``depth``.
+        settings: render settings with ``depth``.
     """
     with torch.no_grad():
         black = Constant(torch.zeros(geometry.count, 1, device=geometry.means.device))

@@ -39,39 +39,39 @@ def _cpu_backend_name() -> str:
 
 @dataclass(frozen=True)
 class Backend:
-    """One way to draw; ``name`` is of the setting ``renderer.backend``."""
+    """A renderer backend."""
 
-    name: str
-    load: Callable[[], Draw]  # imports it and returns its :data:`~neuprim.core.render.output.Draw`
+    name: str  # value of the setting renderer.backend
+    load: Callable[[], Draw]  # imports the backend and returns its render function
     unsupported: Callable[[LoweredPrimitives, AnyCamera | None], str | None] = _no_backend_fault
-    """What it cannot draw of a model through a camera (None: any pinhole), as the rest of a sentence that starts with
-    "cannot draw"; None if it can."""
-    device_name: Callable[[], str] = _cpu_backend_name
+    """Returns what it cannot render of a model with a camera (None: any pinhole), as the rest of a sentence that starts
+    with "cannot draw"; None if it can."""
+    device_name: Callable[[], str] = _cpu_backend_name  # name of its device, for reports
     missing: Callable[[], str | None] = _no_backend_fault
-    """Why this machine lacks what it needs, such as a package; None if it has it. Cheap."""
-    checks: bool = False  # whether it refuses numbers that are not finite while it prepares a frame
-    differentiates_intrinsics: bool = False
-    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it draws tensors of, its own first
+    """Returns what this machine lacks, such as a package; None for nothing. Fast."""
+    checks: bool = False  # whether it checks that numbers are finite
+    differentiates_intrinsics: bool = False  # whether focal lengths and principal points get gradients
+    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device whose tensors it renders, its own first
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_backend_fault
-    """Loads and returns what draws the slabs of a set of primitives in one frame; None without."""
+    """Loads and returns a function that renders all slabs in one frame; None without."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
-        """Return the kind of device that it draws on under these settings."""
+        """Return the kind of device, "cpu" or "cuda", on which it renders with these settings."""
         return self.devices[0] if settings.device == AUTO else settings.device
 
     def computing_on(self, settings: RenderSettings) -> str:
-        """Return what it computes on under these settings, for a run's numbers."""
+        """Return the name of the device on which it renders with these settings, for reports."""
         return self.device_name() if self.drawing_device(settings) == self.devices[0] else _cpu_backend_name()
 
     def unavailable(self, device: str | None = None) -> str | None:
-        """Return why this machine cannot run it on a kind of device, None: its own; None if it can."""
+        """Return why this machine cannot run it on a kind of device (None: its own); None if it can."""
         device = device or self.devices[0]
         return (hardware.cuda_unavailable() if device == hardware.CUDA else None) or self.missing()
 
     def cannot_draw(
         self, lowered: LoweredPrimitives, camera: AnyCamera | None, device: str | None = None
     ) -> str | None:
-        """Return why it does not draw this on a kind of device, as the rest of a sentence; None if it does."""
+        """Return why it cannot render this on a kind of device, as the rest of a sentence; None if it can."""
         device = device or self.devices[0]
         if device not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {device}"
@@ -139,7 +139,7 @@ def backend_names() -> tuple[str, ...]:
 
 
 def available_backends() -> tuple[Backend, ...]:
-    """Return those that this machine can run."""
+    """Return the backends that this machine can run, fastest first."""
     return tuple(backend for backend in TABLE if backend.unavailable() is None)
 
 
@@ -235,9 +235,9 @@ def best_render_backend_device(
 
 
 def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
-    """Return the backend that draws this model through this camera (None: any pinhole).
+    """Return the backend that renders this model with this camera (None: any pinhole).
 
-    Raises BackendUnavailable if the named one cannot, and ConfigError if there is none of the name.
+    Raises BackendUnavailable if the chosen backend cannot, and ConfigError if no backend has this name.
     """
     check_render_backend(settings)
     reasons = []

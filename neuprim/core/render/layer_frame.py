@@ -19,6 +19,8 @@ from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render_lowered
 from neuprim.core.render.output import unproject_rendered_depth
 
+__all__ = ["LayerFrame", "LayerSpec"]
+
 _CLEAR = 2e-4  # a transmittance above has no clamped primitive: one, at alpha_max = 0.9999, would halve it
 _WEAKEN = 1 / 8
 _ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly more
@@ -26,28 +28,28 @@ _ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly
 
 @dataclass(frozen=True)
 class LayerFrame:
-    """One frame of a model under every condition of the task, on the model's device; no gradients."""
+    """A model in one view, as layers need it: its image and integrals along rays, without gradients."""
 
     model: Primitives
     camera: Camera
-    conditions: Conditions
+    conditions: Conditions  # a value of every condition of the task
     settings: RenderSettings
     color_space: str = "linear"
 
     @cached_property
     def lowered(self) -> LoweredPrimitives:
-        """The frame's closed forms, as it is drawn."""
+        """Closed forms of the frame."""
         with torch.no_grad():
             return self.model.lower(self.camera, self.conditions, self.settings)
 
     @cached_property
     def drawn(self) -> RenderOutput:
-        """The frame over black with its depth: ``rgb`` is premultiplied by ``alpha``."""
+        """Image over black, with depth; ``rgb`` is premultiplied by ``alpha``."""
         return self._render(self.lowered, replace(self.settings, depth=True))
 
     @cached_property
     def emitted(self) -> Tensor | None:
-        """(H, W, C) integral of sigma c along each ray, where each primitive has one colour in the frame; else None."""
+        """Integral of sigma times colour along each ray, (H, W, C); None if colours vary within a primitive."""
         colours = self.lowered.colour.flat
         if colours is None:
             return None
@@ -55,14 +57,14 @@ class LayerFrame:
 
     @cached_property
     def unshaded(self) -> Tensor:
-        """(H, W, C) the frame over black without :meth:`~neuprim.core.model.fields.ColourField.shade`."""
+        """Image over black without :meth:`~neuprim.core.model.fields.ColourField.shade`, (H, W, C)."""
         with torch.no_grad():
             forms = self.model.lower(self.camera, self.conditions, shaded=False)
         return self._render(replace(self.lowered, colour=forms.colour, shade=None), self.settings).rgb
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """(H, W) mean shading factor of what a pixel shows, 0 where nothing is hit; None without shading."""
+        """Mean shading factor of what each pixel shows, (H, W), 0 where nothing is hit; None without shading."""
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
@@ -81,18 +83,17 @@ class LayerFrame:
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def composite(self, colour: LoweredColour) -> Tensor:
-        """(H, W, C') the frame over black with other colours of :attr:`lowered`: the sum of alpha_i T_i c_i."""
+        """Return the (H, W, C') image over black with other colours of :attr:`lowered`: the sum of alpha_i T_i c_i."""
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
-        """(H, W) sum along each ray of the primitives' optical depths, each times its weight.
+        """Return (H, W) sums along each ray of the primitives' optical depths, each times its weight.
 
-        Optical depths are those of whole chords behind the near plane, at least 0. Nothing is clamped at ``alpha_max``,
-        skipped below ``alpha_min`` or cut where a ray ends: it is -log of the transmittance of a medium made thin
-        enough.
+        Optical depths are those of whole chords behind the near plane, at least 0. ``alpha_max``, ``alpha_min`` and
+        ``transmittance_min`` do not apply: the result is -log of the transmittance of a medium made thin enough.
 
         Args:
-            weights: (N,) finite and at least 0, one per primitive of :attr:`lowered`; None for 1.
+            weights: (N,) finite numbers of at least 0, one per primitive of :attr:`lowered`; None for 1.
         """
         count = self.lowered.geometry.count
         weights = torch.ones(count, device=self.lowered.geometry.means.device) if weights is None else weights.detach()
@@ -143,15 +144,15 @@ def _depth_of_transmittance(transmittance: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class LayerSpec:
-    """One layer.
+    """One layer of the files that ``neuprim render --format exr`` writes.
 
     Attributes:
-        name: what the user types after ``--layers``, and the prefix of its channels in the file: letters, digits, _.
-        summary: one line with the meaning and unit of a value; it is written into the file, too.
-        draw: :class:`LayerFrame` -> (H, W, C) finite values, or (H, W) for one channel; None if the frame's model has
-            no such layer.
-        channels: their names. Empty for layers of light, which have the channels of the task's images over black,
-            premultiplied by alpha, and are sums over the lights of an environment. They need linear colours.
+        name: what the user types after ``--layers``, and the prefix of the channels: letters, digits, _.
+        summary: one line with meaning and unit of the values; it is also written into the file.
+        draw: :class:`LayerFrame` -> (H, W, C) finite values, or (H, W) for one channel; None if the model of the frame
+            has no such layer.
+        channels: names of the channels. Empty for layers of light, which have the channels of the task's images over
+            black, premultiplied by alpha, and are sums over the lights of an environment. They need linear colours.
     """
 
     name: str
@@ -161,7 +162,7 @@ class LayerSpec:
 
     @property
     def light(self) -> bool:
-        """Whether its values are light."""
+        """Whether the values are light."""
         return not self.channels
 
 

@@ -19,14 +19,14 @@ from neuprim.core.settings import RenderSettings
 
 @dataclass
 class Contributions:
-    """What each of the N primitives of a frame contributed to it; zeros until the frame's backward pass fills them."""
+    """Contributions of the N primitives of a frame to its image; 0 until the backward pass fills them."""
 
-    weight: Tensor  # (N,) sum over pixels of alpha_i T_i; positive exactly for primitives that the view shows
+    weight: Tensor  # (N,) sum over pixels of alpha_i T_i; positive exactly for visible primitives
     error_weight: Tensor  # (N,) sum over pixels of alpha_i T_i x error
-    rows: Tensor | None = None  # of the model, where some primitives were left out of the frame
+    rows: Tensor | None = None  # (N,) rows of the model, if some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return (count,) sums of all primitives of the model, zero for those left out of the frame."""
+        """Return ``weight`` and ``error_weight`` (count,) of all primitives of the model, 0 for those left out."""
         if self.rows is None:
             return self.weight, self.error_weight
         weight, error_weight = (
@@ -73,19 +73,19 @@ class ContributionRequest:
 
 @dataclass
 class RenderStats:
-    """By-products of a frame."""
+    """Statistics of a rendered frame."""
 
-    backend: str
-    count: int  # primitives of the frame
-    pairs: int = 0  # tile-primitive pairs (cpu, cuda) or ray-primitive pairs (reference) that were evaluated
-    rows: Tensor | None = None  # of the model, where some primitives were left out of the frame
+    backend: str  # name of the backend
+    count: int  # number of primitives of the frame
+    pairs: int = 0  # evaluated pairs of tile and primitive (cpu, cuda) or ray and primitive (reference)
+    rows: Tensor | None = None  # rows of the model, if some primitives were left out of the frame
     samples: int = 1  # rays per pixel side
-    drawn_on: torch.device | None = None  # where that is not the device that its tensors are on
+    drawn_on: torch.device | None = None  # device of the backend, if not that of the tensors
     contributions: ContributionRequest | None = None  # see RenderOutput.request_contributions
-    extra: dict[str, Any] = field(default_factory=dict)
+    extra: dict[str, Any] = field(default_factory=dict)  # further data of the backend
 
     def request_contributions(self, error: Tensor) -> Contributions:
-        """As :meth:`RenderOutput.request_contributions`, without its check of the shape."""
+        """Do what :meth:`RenderOutput.request_contributions` does, without the check of the shape."""
         n, error = self.samples, error.detach()
         blank = torch.zeros(self.count, device=error.device)
         result = Contributions(blank, blank.clone(), self.rows)
@@ -97,22 +97,22 @@ class RenderStats:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """One frame."""
+    """A rendered frame."""
 
     rgb: Tensor  # (H, W, C) in the model's colour space, composited over the background
     alpha: Tensor  # (H, W) accumulated opacity 1 - T
     # (H, W) weighted mean camera-z (ray distance for a RayCamera) of the chord middles, 0 where nothing is hit; None
-    # unless the settings ask for it
+    # without the setting depth
     depth: Tensor | None
-    stats: RenderStats  # see RenderStats
+    stats: RenderStats
 
     def request_contributions(self, error: Tensor) -> Contributions:
-        """Have the backward pass sum each primitive's part in the frame and in an error.
+        """Return how much each primitive contributes to the image and to an error.
 
-        Call it before ``backward()``, which fills the result. A second call replaces the first.
+        The backward pass fills the result: call this before ``backward()``. A second call replaces the first.
 
         Args:
-            error: (H, W) any measure of what is wrong at each pixel; no gradient reaches it.
+            error: (H, W) any measure of error at each pixel; no gradient reaches it.
         """
         check_model_tensor_shape("request_contributions: error", error, tuple(self.alpha.shape), ", that of the frame")
         return self.stats.request_contributions(error)

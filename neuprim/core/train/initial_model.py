@@ -19,6 +19,8 @@ from neuprim.core.model.schema import InitContext
 from neuprim.core.render.near_plane import near_plane_extent
 from neuprim.core.train.settings import ModelSettings
 
+__all__ = ["initial_model_to_train"]
+
 _USUAL_OPACITY = 0.5
 """Of Gaussians that say how large they are, but not how opaque."""
 
@@ -26,17 +28,16 @@ _USUAL_OPACITY = 0.5
 def initial_model_to_train(
     density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int
 ) -> Primitives:
-    """Primitives on the data set's starting points, as large as their neighbours are far (RMS distance to the 3
-    nearest).
+    """Return a new model on starting points; the size of a primitive is the RMS distance to its 3 nearest neighbours.
 
     ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D
-    Gaussians in the coordinates of the data's files; the latter bring sizes, orientations and opacities of their own.
-    ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``: share of the primitives that start where
-    views show something and the data set has no points, for photographs; 0 unless said.
+    Gaussians in the coordinates of the data's files; Gaussians also give sizes, orientations and opacities.
+    ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default: share of the primitives that
+    start where photographs show something and the data set has no points.
 
     Raises:
-        ConfigError: no such setting, or a setting with an impossible value.
-        DataError: the data set offers no starting point, or the file is damaged.
+        ConfigError: a setting does not exist or has an impossible value.
+        DataError: the data set has no starting point, or the file is damaged.
     """
     for key in settings.init:
         known = ("scale", "points", "surroundings", *density.init_settings, *colour.init_settings)

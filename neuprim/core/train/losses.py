@@ -25,6 +25,8 @@ from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.settings import TrainSettings
 from neuprim.core.volumes.points import PointShares, volume_values_at
 
+__all__ = ["compressed_loss", "l1", "photometric", "relative_loss"]
+
 _WINDOW = 11
 _MAX_CPU_CHANNELS = 51
 _MU = 16.0
@@ -39,7 +41,8 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
     """The photometric loss by kornia and autograd, on any device and in any dtype; the oracle of the fused versions.
 
     Args:
-        rendered, truth: (H, W, C), values nominally in 0..1.
+        rendered: (H, W, C) rendered image, values nominally in 0..1.
+        truth: (H, W, C) true image.
         ssim_weight: lambda. SSIM uses an 11 x 11 Gaussian window (sigma 1.5) without padding, averaged over windows;
             images smaller than the window use L1 alone.
     """
@@ -76,7 +79,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric(settings: Mapping[str, Any]) -> Loss:
-    """Make the photometric loss from ``{"ssim_weight": lambda}``."""
+    """Return the loss (1 - lambda) L1 + lambda (1 - SSIM), from ``{"ssim_weight": lambda}``."""
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
@@ -92,12 +95,12 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
 
 def l1(settings: Mapping[str, Any]) -> Loss:
-    """Mean absolute difference."""
+    """Return the mean absolute difference as a loss."""
     return _image_loss("l1", lambda rendered, truth: (rendered - truth).abs().mean())
 
 
 def compressed_loss(settings: Mapping[str, Any]) -> Loss:
-    """L1 of log(1 + mu x) / log(1 + mu), mu = 16: shadows count more, highlights less."""
+    """Return the L1 loss of log(1 + mu x) / log(1 + mu), mu = 16, which weights shadows more than highlights."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         scale = torch.log1p(torch.tensor(_MU))
@@ -108,7 +111,7 @@ def compressed_loss(settings: Mapping[str, Any]) -> Loss:
 
 
 def relative_loss(settings: Mapping[str, Any]) -> Loss:
-    """Squared error over the squared rendered value, which carries no gradient (Mildenhall et al. 2022, RawNeRF)."""
+    """Return squared error over squared rendered value, which has no gradient (Mildenhall et al. 2022, RawNeRF)."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         return ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean()

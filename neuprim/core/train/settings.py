@@ -26,15 +26,15 @@ def _are_training_reductions(words: list[Any]) -> bool:
 
 @dataclass
 class ModelSettings:
-    """What is fitted.
+    """Settings of the model: number of primitives, density and colour.
 
     Attributes:
         primitives: number of primitives. "auto" chooses it from the budget: ``auto_primitives`` times the square root
             of the number of steps, or of the steps that a short test of the pace expects in ``train.max_seconds``; a
             run stores the number.
         auto_primitives: the factor of ``primitives=auto``.
-        density, colour: settings of the density and the colour that the task builds; the presets of a task show what
-            there is.
+        density: settings of the density that the task builds; the presets of a task show what there is.
+        colour: settings of the colour that the task builds; the presets of a task show what there is.
         neurons: hidden width K of the cosine density, 0 to 16; 0 is a constant density. A Gaussian density has none.
         sh_degree: degree of the spherical harmonics of the colour, 0 to 3.
         sh_every: fraction of the budget after which one more band of spherical harmonics is trained; 0 trains all from
@@ -61,10 +61,10 @@ class ModelSettings:
 
     @property
     def count(self) -> int:
-        """``primitives`` as a number.
+        """Number of primitives.
 
         Raises:
-            ConfigError: it is "auto", and only the start of a training measures the pace that it depends on.
+            ConfigError: ``primitives`` is "auto"; only the start of a training chooses the number.
         """
         if self.primitives == "auto":
             raise ConfigError(
@@ -73,8 +73,7 @@ class ModelSettings:
         return self.primitives
 
     def with_count_for(self, train: TrainSettings, pace: float | None = None) -> ModelSettings:
-        """Replace "auto" by the number for a budget: that of steps, or of seconds where ``pace`` is known, the smaller
-        where there are both.
+        """Return the settings with "auto" replaced by the number for a budget of steps or of seconds, the smaller one.
 
         Args:
             pace: seconds of a step per primitive; None leaves "auto" to budgets of seconds.
@@ -96,7 +95,8 @@ class PopulationSettings:
             constant once it is reached) or "gradient" (clone, split and prune by the norm of the density gradient, as
             the authors of the method do).
         every: steps between two interventions.
-        start, stop: fractions of the budget between which interventions happen.
+        start: fraction of the budget at which interventions begin.
+        stop: fraction of the budget at which interventions end.
         fraction: relocate: largest share of primitives moved at once.
         idle: relocate: move only primitives whose weight in the images since the last intervention is below this share
             of the mean weight; null moves the least used ones, whatever their weight.
@@ -104,8 +104,10 @@ class PopulationSettings:
             null is ``model.primitives``, for which the data may not offer enough starting points.
         grow_from: relocate: share of ``model.primitives`` at the start; the others are added where the error is
             largest. 1 starts with all that the data offer points for.
-        grow_threshold, prune_threshold: gradient: thresholds of the mean norm of the density gradient.
-        clone_scale, prune_scale: gradient: limits of a primitive's size, in units of the scene's extent.
+        grow_threshold: gradient: mean norm of the density gradient from which primitives are cloned or split.
+        prune_threshold: gradient: mean norm of the density gradient below which primitives are removed.
+        clone_scale: gradient: largest size of a primitive that is cloned, in units of the scene's extent.
+        prune_scale: gradient: size from which primitives are removed, in units of the scene's extent.
         max_primitives: gradient: upper bound of the number of primitives.
     """
 
@@ -170,7 +172,8 @@ class TrainSettings:
         ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM).
         size_weight: weight of the mean semi-axis over the scene's extent. Smaller primitives overlap less: steps are
             faster, and primitives that no view needs vanish (3DGS-MCMC, Kheradmand et al. 2024).
-        anisotropy_weight, anisotropy_from: weight of mean(std over axes of s / min s), and the step at which it begins.
+        anisotropy_weight: weight of mean(std over axes of s / min s).
+        anisotropy_from: step at which the anisotropy weight begins.
         background: "white", "black", "random" or "auto" (the choice of the data set).
         checkpoint_every_seconds: seconds between two checkpoints; the end of the training writes one too.
         log_every: steps between two lines of metrics.jsonl.
@@ -218,8 +221,10 @@ if TYPE_CHECKING:
     from neuprim.core.extensions import LossExtension
     from neuprim.core.task import TaskSpec
 
+__all__ = ["ModelSettings", "OPTIONAL", "PopulationSettings", "TrainSettings"]
+
 OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight")
-"""Shared settings that a task or loss uses only if it says so."""
+"""Shared settings that a task or loss gets only if its ``uses`` lists them."""
 
 
 class TrackedMapping(dict[str, Any]):

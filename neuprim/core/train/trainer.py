@@ -42,17 +42,19 @@ from neuprim.core.train.training_views import (
     hash_training_views,
 )
 
+__all__ = ["StepReport", "Trainer"]
+
 MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
 
 
 @dataclass(frozen=True)
 class StepReport:
-    """What one step did.
+    """Result of one training step.
 
     Attributes:
-        seconds: of training up to the end of this step.
-        psnr: of the training view (the mean of several), or of the extinction at points in a step without views.
-        change: what the population did, if anything.
+        seconds: training time up to the end of this step.
+        psnr: PSNR of the training view (mean of several), or of the extinction at points in a step without views.
+        change: what population control changed, if anything.
     """
 
     step: int
@@ -105,21 +107,21 @@ class _RenderedView(NamedTuple):
 
 
 class Trainer:
-    """Fits a model to the training views of a data set.
+    """Trains a model on the training views of a data set.
 
-    The model's tensors move to the device that the renderer's settings choose. Random numbers are drawn on the CPU, so
-    that they are the same on every device.
+    The model's tensors move to the device that the render settings choose. Random numbers are drawn on the CPU, so that
+    they are the same on every device.
 
     Attributes:
-        extent: the unit of position rates and size limits, see
-            :func:`~neuprim.core.render.near_plane.near_plane_extent`.
-        pixel: another unit of rates, see :func:`~neuprim.core.render.near_plane.typical_pixel_size`.
-        step, elapsed: steps done and seconds of training they took (held-out evaluations and file writes not counted).
-        fake_quantize: parameters -> parameters as a file would store them, with gradients; None renders them as they
-            are.
+        extent: unit of learning rates "extent" and of size limits, scene units.
+        pixel: unit of learning rates "pixel", scene units.
+        step: number of steps done.
+        elapsed: seconds of training, without held-out evaluations and file writes.
+        fake_quantize: function (parameters) -> parameters as a file would store them, with gradients; None for none.
         zero_masks: parameter -> (N, ...) bool of the numbers that stay zero.
-        rank, ranks: number of this process among those that train the model, and how many there are.
-        stop_requested: polled after every step; see :attr:`stopping`.
+        rank: number of this process among those that train the model.
+        ranks: number of processes that train the model.
+        stop_requested: function that is called after every step; see :attr:`stopping`.
     """
 
     rank, ranks = 0, 1
@@ -160,7 +162,7 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Used fraction of the budget: the larger of steps and seconds. Every schedule runs on it."""
+        """Used fraction of the budget of steps or seconds, the larger of both; schedules depend on it."""
         steps = self.settings.iterations
         done = 0.0 if steps is None else self.step / steps if steps else 1.0
         if self.settings.max_seconds is not None:
@@ -173,12 +175,11 @@ class Trainer:
 
     @property
     def stopping(self) -> bool:
-        """Whether the step just done is the last one, because somebody asked to stop."""
+        """Whether the last step was the final one, because a stop was requested."""
         return self.stop_requested()
 
     def rates(self) -> dict[str, float]:
-        """Learning rate of every parameter now: warm-up, exponential decay to ``final_rate`` at the end of the budget,
-        cool-down."""
+        """Return the current learning rates by parameter: warm-up, exponential decay to ``final_rate``, cool-down."""
         s = self.settings
         factor = s.final_rate**self.progress
         if s.cooldown and self.progress > 1 - s.cooldown:
@@ -192,16 +193,16 @@ class Trainer:
     # ------------------------------------------------------------ the loop
 
     def run(self) -> Iterator[StepReport]:
-        """Step until the budget is used. Between two steps the state may be saved or the loop left."""
+        """Iterate over training steps until the budget is used; the loop may save the state or end early."""
         while not self.finished:
             yield self.train_step()
 
     def train_step(self) -> StepReport:
-        """Take one step, on as many threads as the renderer has.
+        """Take one training step and return its result.
 
         Raises:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; this step updated nothing.
-            DeviceMemoryError: the GPU has no room for a step; what was saved is intact.
+            DeviceMemoryError: the memory of the GPU is too small for a step; files are intact.
         """
         with self._limit_resources():
             start, model, progress = time.perf_counter(), self.model, self.progress
@@ -403,7 +404,7 @@ class Trainer:
     # ------------------------------------------------------------ exact state
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """CPU tensors and JSON-able numbers from which :meth:`load_state` goes on exactly, on any device."""
+        """Return CPU tensors and JSON-able numbers from which :meth:`load_state` continues exactly, on any device."""
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
@@ -417,10 +418,10 @@ class Trainer:
         return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
-        """Continue from :meth:`state`.
+        """Continue from a :meth:`state`.
 
         Raises:
-            CheckpointError: the state belongs to other settings or data; names what differs. The trainer is unchanged.
+            CheckpointError: the state is of other settings or data; names the difference. The trainer is unchanged.
         """
         check_state(tensors, header, where, *self.state())
         moved = {name: value.to(self.device, copy=True) for name, value in tensors.items()}

@@ -21,6 +21,8 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.model.fields import Conditions, Cosine
 from neuprim.core.model.primitives import Primitives
 
+__all__ = ["box_lattice", "density_at", "density_grid"]
+
 _PLANES_PER_JOB = 8
 _PAIRS = 1 << 17  # of points and primitives that torch code evaluates at once
 
@@ -29,8 +31,10 @@ POINTS_LIMIT = 2**30
 
 
 def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of a regular grid of cell centres that fills a (2, 3) box, ``resolution`` along
-    its longest side."""
+    """Return a regular grid of cell centres that fills a (2, 3) box, with ``resolution`` cells on its longest side.
+
+    The grid is a (4, 4) scene_from_index and a shape.
+    """
     low, high = np.asarray(bounds, np.float64)
     step = float((high - low).max()) / resolution
     x, y, z = (max(1, round(float(side) / step)) for side in high - low)
@@ -55,15 +59,15 @@ def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> 
 def density_grid(
     model: Primitives, conditions: Conditions, scene_from_index: Tensor, shape: tuple[int, int, int], threads: int = 0
 ) -> Tensor:
-    """(X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``; on the CPU.
+    """Return (X, Y, Z) float32 extinctions, 1/scene unit, at ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
     A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other
     density is evaluated in blocks. It takes a few MB besides the grid.
 
     Args:
-        conditions: of the frame, e.g. ``{"time": tensor(0.5)}``.
+        conditions: conditions of the frame, e.g. ``{"time": tensor(0.5)}``.
         scene_from_index: (4, 4) float64 affine map, invertible.
-        threads: 0 for all cores; the result does not depend on it.
+        threads: number of threads, 0 for all cores; the result does not depend on it.
 
     Raises:
         ConfigError: more than :data:`POINTS_LIMIT` points, or a map that is singular or not finite.
@@ -90,7 +94,7 @@ def density_grid(
 
 
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
-    """(M,) float64 extinction, 1/scene unit, at (M, 3) points: every primitive at every point. Slow; the reference."""
+    """Return (M,) float64 extinctions, 1/scene unit, at (M, 3) points. Slow, as it visits every primitive."""
     with torch.no_grad():
         active = model.to(device.HOST).active(conditions, torch.float64)
         geometry = active.geometry

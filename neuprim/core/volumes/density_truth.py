@@ -17,6 +17,8 @@ from neuprim.core.model.fields import Conditions
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import density_grid
 
+__all__ = ["DensityGridPlacement", "DensityGridSource", "DensityTruth", "GridExtent", "TruthFrame"]
+
 DENSITY_ERRORS = ("correlation", "relative_l2", "psnr_active", "max_error")
 """Names of the numbers of :meth:`DensityComparison.errors`."""
 
@@ -25,14 +27,14 @@ _MIN_SQUARED_ERROR = 1e-20  # as a share of the peak's square: 200 dB, as no num
 
 
 class GridExtent(NamedTuple):
-    """Largest value of a frame's absorbing grid, and (2, 3) box around its active voxels, world units, or None."""
+    """Range and place of the absorbing grid of one frame."""
 
-    largest: float
-    box: np.ndarray | None
+    largest: float  # largest value
+    box: np.ndarray | None  # (2, 3) box around the active voxels, world units; None without any
 
     @staticmethod
     def around(extents: Sequence[GridExtent]) -> GridExtent:
-        """That of several frames together."""
+        """Return the extent of several frames together."""
         boxes = [extent.box for extent in extents if extent.box is not None]
         box = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]) if boxes else None
         return GridExtent(max((extent.largest for extent in extents), default=0.0), box)
@@ -40,17 +42,17 @@ class GridExtent(NamedTuple):
 
 @dataclass(frozen=True)
 class DensityGridPlacement:
-    """How scene units follow from the world of the files.
+    """Placement of the voxel files of a scene, and meaning of their values.
 
     Attributes:
-        scene_from_world: (4, 4) float64.
-        numbers: of the frames.
+        scene_from_world: (4, 4) float64 transform.
+        numbers: numbers of the frames.
         times: name -> value per frame of the condition that tells frames apart, e.g. ``{"time": [0.0, 0.5, 1.0]}``.
         sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
-        grid: name of the grid that absorbs.
+        grid: name of the absorbing grid.
         exact: whether that grid alone makes the extinction; if not, other grids add to it.
-        component: the name of that grid's part of the extinction in models.
-        extents: of that grid in every frame; empty if unknown.
+        component: name of the grid's part of the extinction in models.
+        extents: extents of the grid in every frame; empty if unknown.
     """
 
     scene_from_world: np.ndarray
@@ -63,13 +65,13 @@ class DensityGridPlacement:
     extents: Sequence[GridExtent] = ()
 
     def matches(self, other: DensityGridPlacement) -> bool:
-        """Whether both mean the same frames, places and values."""
+        """Return whether both describe the same frames, places and values."""
         keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
         mine, theirs = self.to_json(), other.to_json()
         return all(mine[key] == theirs[key] for key in keys)
 
     def to_json(self) -> dict[str, Any]:
-        """Plain numbers, exact when read back."""
+        """Return plain numbers, exact when read back."""
         return {
             "scene_from_world": self.scene_from_world.tolist(),
             "numbers": list(self.numbers),
@@ -83,10 +85,10 @@ class DensityGridPlacement:
 
     @staticmethod
     def from_json(record: Mapping[str, Any], where: str) -> DensityGridPlacement:
-        """Read what :meth:`to_json` gave; ``where`` names the file in errors.
+        """Return the placement that :meth:`to_json` wrote; ``where`` names the file in errors.
 
         Raises:
-            DataError: anything else.
+            DataError: the record is something else.
         """
         try:
             placement = DensityGridPlacement(
@@ -123,19 +125,18 @@ class DensityGridPlacement:
 
 @dataclass(frozen=True)
 class TruthFrame:
-    """One frame of the ground truth: a name to show, and the conditions of the same frame of a model; empty if
-    unknown."""
+    """One frame of the ground truth of a volume."""
 
-    name: str
-    conditions: Conditions
+    name: str  # name to show
+    conditions: Conditions  # conditions of the same frame of a model; empty if unknown
 
 
 class DensityTruth(ABC):
-    """The extinction sigma that a data set was made from, on any regular grid, 1/scene unit.
+    """Base class of ground-truth extinctions, which can be sampled on any regular grid.
 
     Attributes:
-        frames: in order, one or more.
-        bounds: (2, 3) float64 box around all of it, scene units.
+        frames: frames in order, one or more.
+        bounds: (2, 3) float64 box around everything, scene units.
     """
 
     frames: Sequence[TruthFrame]
@@ -143,32 +144,34 @@ class DensityTruth(ABC):
 
     @abstractmethod
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
-        """(4, 4) float64 scene_from_index and shape of the grid on which models are compared with a frame: all voxels
-        of a file in the box. None where the frame holds nothing."""
+        """Return the grid on which models are compared with a frame, the voxels of a file; None for an empty frame.
+
+        The grid is a (4, 4) float64 scene_from_index and a shape.
+        """
 
     @abstractmethod
     def grid(
         self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
     ) -> Tensor:
-        """(X, Y, Z) float32 extinction of a frame at the points ``scene_from_index @ (i, j, k, 1)``.
+        """Return the (X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
 
         Args:
-            component: only the part from the source grid of this name.
+            component: name of a source grid, for its part alone; None for all.
         """
 
 
 class DensityGridSource(DensityTruth):
-    """The files themselves, one frame at a time; ``frames`` are those of the placement."""
+    """Base class of ground truth in voxel files, read one frame at a time."""
 
-    placement: DensityGridPlacement
+    placement: DensityGridPlacement  # has the same frames
 
     @abstractmethod
     def grid_transform(self, frame: int) -> np.ndarray | None:
-        """(4, 4) float64, index to world, of the absorbing grid of a frame; None where the frame lacks it."""
+        """Return the (4, 4) float64 world_from_index of the absorbing grid of a frame; None if it has no such grid."""
 
     @abstractmethod
     def open_files(self, path: Path) -> DensityTruth:
-        """Another file, or folder of frames, read by the same rules and placed as these are.
+        """Return another file or folder of frames, read by the same rules and placed like these.
 
         Raises:
             DataError: nothing in ``path`` fits.

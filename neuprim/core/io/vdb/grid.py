@@ -14,15 +14,16 @@ from neuprim.core.errors import DataError
 
 TILE_SIZES = (8, 128, 4096)  # edges of a constant tile in voxels: in a lower node, in an upper node, in the root
 
-DENSE_LIMIT = 2 * 2**30  # most bytes that :meth:`VdbGrid.to_dense` takes unless told otherwise: 2 GiB
+DENSE_LIMIT = 2 * 2**30
+"""Most bytes of an array that :meth:`VdbGrid.to_dense` returns by default: 2 GiB."""
 
 Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
-"""A box of voxels: lowest index, and the first index beyond the highest, per axis."""
+"""A box of voxels: the lowest index and one more than the highest index, per axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class VdbTiles:
-    """T cubes of one value each."""
+    """T constant tiles: cubes of voxels with one value each."""
 
     origins: np.ndarray  # (T, 3) int32, the lowest index of each
     sizes: np.ndarray  # (T,) int32, edges in voxels, each one of TILE_SIZES
@@ -31,7 +32,7 @@ class VdbTiles:
 
     @staticmethod
     def none(channels: int = 1) -> VdbTiles:
-        """No tiles."""
+        """Return an empty set of tiles."""
         shape = (0,) if channels == 1 else (0, channels)
         return VdbTiles(
             np.zeros((0, 3), np.int32), np.zeros(0, np.int32), np.zeros(shape, np.float32), np.zeros(0, bool)
@@ -44,7 +45,11 @@ class VdbTiles:
 def vdb_scale_transform(
     voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """(4, 4) index to world: voxels of an edge (one, or one per axis), the centre of voxel 0 at ``translation``."""
+    """Return a (4, 4) index-to-world transform for voxels of a size, with the centre of voxel 0 at ``translation``.
+
+    Args:
+        voxel_size: edge length, one or one per axis, world units.
+    """
     matrix = np.eye(4)
     matrix[range(3), range(3)] = voxel_size
     matrix[:3, 3] = translation
@@ -53,10 +58,10 @@ def vdb_scale_transform(
 
 @dataclass(frozen=True, eq=False)
 class VdbGrid:
-    """A float or vec3s grid.
+    """A sparse grid of numbers (float) or vectors (vec3s): leaves of 8 x 8 x 8 voxels, and constant tiles.
 
-    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels of no leaf and no tile have
-    the background value and are not active. Values that are not finite are kept and counted in :attr:`non_finite`.
+    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. All other voxels have the background
+    value and are not active. Values that are not finite are kept; :attr:`non_finite` counts them.
     """
 
     name: str
@@ -81,12 +86,12 @@ class VdbGrid:
         half: bool = False,
         metadata: Mapping[str, Any] | None = None,
     ) -> VdbGrid:
-        """A fog volume of the voxels that differ from the background; DataError for another shape or range.
+        """Return a fog volume whose active voxels differ from the background; DataError for a wrong shape or range.
 
         Args:
-            array: (X, Y, Z) or (X, Y, Z, 3), any real type; kept as float32.
+            array: (X, Y, Z) or (X, Y, Z, 3) values of any real type; stored as float32.
             lower: index of ``array[0, 0, 0]``.
-            transform: (4, 4) index to world, as of :func:`vdb_scale_transform`; None: voxels of edge 1.
+            transform: (4, 4) index to world, see :func:`vdb_scale_transform`; None for voxels of edge 1.
         """
         array = np.asarray(array, np.float32)
         if array.ndim not in (3, 4) or array.shape[3:] not in ((), (3,)):
@@ -119,7 +124,7 @@ class VdbGrid:
 
     @property
     def channels(self) -> int:
-        """1 or 3."""
+        """Numbers per voxel: 1 or 3."""
         return 3 if self.values.ndim == 5 else 1
 
     @property
@@ -130,12 +135,12 @@ class VdbGrid:
 
     @cached_property
     def active_voxels(self) -> int:
-        """How many voxels are active, those of active tiles included."""
+        """Number of active voxels, including those of active tiles."""
         return int(np.count_nonzero(self.masks)) + sum(s**3 for s in self.tiles.sizes[self.tiles.active].tolist())
 
     @cached_property
     def bounds(self) -> Bounds | None:
-        """The box of all active voxels, in indices; None if there is none."""
+        """Box around all active voxels, in indices; None without any."""
         lows, highs = [], []
         used = np.asarray(self.masks.any((1, 2, 3)))
         if used.any():
@@ -153,7 +158,7 @@ class VdbGrid:
         return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     def world_bounds(self) -> np.ndarray | None:
-        """(2, 3) float64 box, in world units and axes, around all active voxels with their extent; None without."""
+        """Return the (2, 3) float64 box around all active voxels, with their extent, world units; None without."""
         if self.bounds is None:
             return None
         corners = np.stack(np.meshgrid(*np.array(self.bounds, float).T - 0.5, indexing="ij"), -1).reshape(-1, 3)
@@ -161,19 +166,19 @@ class VdbGrid:
         return np.stack([world.min(0), world.max(0)])
 
     def active_values(self) -> np.ndarray:
-        """(M,) or (M, 3) float32 of active leaf voxels, and one for each active tile."""
+        """Return the (M,) or (M, 3) float32 values of active leaf voxels, and one value per active tile."""
         return np.concatenate([self.values[self.masks], self.tiles.values[self.tiles.active]])
 
     @cached_property
     def range(self) -> tuple[float, float] | None:
-        """Least and greatest finite number among active values (of all channels); None if there is none."""
+        """Smallest and largest finite active value, of all channels; None without any."""
         values = self.active_values()
         values = values[np.isfinite(values)]
         return (float(values.min()), float(values.max())) if values.size else None
 
     @cached_property
     def non_finite(self) -> int:
-        """How many active leaf voxels and active tiles hold a NaN or an infinite number."""
+        """Number of active leaf voxels and active tiles with NaN or infinity."""
         bad = ~np.isfinite(self.active_values())
         return int(np.count_nonzero(bad.any(-1) if self.channels == 3 else bad))
 
@@ -183,7 +188,7 @@ class VdbGrid:
 
     @property
     def dense_bytes(self) -> int:
-        """Memory that the box of active voxels takes as one float32 array."""
+        """Bytes of the box of active voxels as a float32 array."""
         return (
             0
             if self.bounds is None
@@ -193,13 +198,12 @@ class VdbGrid:
     def to_dense(
         self, bounds: Bounds | None = None, max_bytes: int = DENSE_LIMIT, non_finite: float | None = None
     ) -> np.ndarray:
-        """(X, Y, Z) or (X, Y, Z, 3) float32: every voxel of a box, active or not.
+        """Return every voxel of a box, active or not, as (X, Y, Z) or (X, Y, Z, 3) float32.
 
         Args:
-            bounds: the box, in indices; None takes :attr:`bounds`, and (0, 0, 0) voxels for a grid without active ones.
-            max_bytes: most memory for the result, else DataError; built on whole leaves (up to 7 voxels more on each
-                side).
-            non_finite: what replaces NaN and infinite numbers; None keeps them.
+            bounds: the box, in indices; None for :attr:`bounds`, or no voxels if none is active.
+            max_bytes: limit of the memory, with up to 7 more voxels on each side; DataError beyond.
+            non_finite: value that replaces NaN and infinity; None keeps them.
         """
         box = self.bounds if bounds is None else bounds
         channels = (3,) if self.channels == 3 else ()

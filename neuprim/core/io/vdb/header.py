@@ -149,29 +149,29 @@ _METADATA = {
 
 @dataclass(frozen=True)
 class GridHeader:
-    """One grid as its file describes it."""
+    """Header of one grid of a file."""
 
-    name: str  # unique in its file: second and later grids of one name get [1], [2], ... as in OpenVDB
+    name: str  # unique in its file: further grids of one name get [1], [2], ... as in OpenVDB
     type: str  # OpenVDB's tree type, without the suffix for half floats
-    half: bool  # its values are stored as 16-bit floats
+    half: bool  # whether values are stored as 16-bit floats
     flags: int  # compression bits
     metadata: Mapping[str, Any]  # values of types not known here are bytes
     map: str  # name of the transform's class
-    transform: np.ndarray | None  # (4, 4) float64, index to world, acting on column vectors; None of an unknown class
+    transform: np.ndarray | None  # (4, 4) float64, index to world, acting on column vectors; None if unknown
     parent: str  # the grid whose tree this one shares; empty for nearly all
     tree_at: int  # byte offset of the tree
-    block: int  # of its leaf buffers
-    end: int  # of the first byte after the grid
+    block: int  # byte offset of the leaf buffers
+    end: int  # byte offset of the first byte after the grid
 
     @property
     def kind(self) -> str:
-        """The grid class: ``fog volume``, ``level set``, ``staggered`` or ``unknown``."""
+        """Class of the grid: ``fog volume``, ``level set``, ``staggered`` or ``unknown``."""
         value = self.metadata.get("class")
         return value if isinstance(value, str) and value else "unknown"
 
     @property
     def channels(self) -> int:
-        """1 for float, 3 for vec3s, 0 for types that are not read."""
+        """Numbers per voxel: 1 for float, 3 for vec3s, 0 for types that neuprim does not read."""
         return _CHANNELS.get(self.type, 0)
 
     @property
@@ -187,7 +187,7 @@ class GridHeader:
         return x, y, z
 
     def undecodable(self) -> str | None:
-        """Why the voxels cannot be decoded, or None."""
+        """Return why the voxels cannot be decoded, or None."""
         if "ptdataidx" in self.type or "ptidx" in self.type:
             return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
         if not self.channels:
@@ -197,7 +197,7 @@ class GridHeader:
         return None
 
     def refusal(self) -> str | None:
-        """Why this grid cannot serve as a volume, or None."""
+        """Return why the grid cannot be used as a volume, or None."""
         if self.kind == "level set":
             return "is a level set: signed distances to a surface, not densities; convert it to a fog volume first"
         return self.undecodable()
@@ -205,7 +205,7 @@ class GridHeader:
 
 @dataclass(frozen=True)
 class FileHeader:
-    """An OpenVDB file's head and the headers of all of its grids, in file order."""
+    """Header of an OpenVDB file, with the headers of its grids in file order."""
 
     path: Path
     version: int
@@ -214,7 +214,7 @@ class FileHeader:
     grids: tuple[GridHeader, ...]
 
     def grid(self, name: str) -> GridHeader:
-        """The grid called ``name``; raises DataError with the nearest names if there is none."""
+        """Return the header of a grid; raises DataError with similar names if there is none."""
         for grid in self.grids:
             if grid.name == name:
                 return grid
@@ -223,7 +223,7 @@ class FileHeader:
 
 
 def read_header(path: Path) -> FileHeader:
-    """Describe a file without decoding a tree, or raise DataError."""
+    """Return the header of a file without decoding voxels; raises DataError."""
     with open_cursor(Path(path)) as cursor:
         return parse_header(cursor)
 

@@ -31,25 +31,27 @@ from neuprim.core.io.vdb.header import (
 )
 
 LEAF_LIMIT = 4 * 2**30
-"""Most bytes of decoded leaves and tiles that :func:`read_grid` takes unless told otherwise: 4 GiB."""
+"""Most bytes of decoded leaves and tiles that :func:`read_grid` accepts by default: 4 GiB."""
 
 
 def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> VdbGrid:
-    """Read one grid of a file; the others stay undecoded. Arguments and errors as of :func:`read_grids`."""
+    """Return one grid of a file; the others are not decoded. Arguments and errors as of :func:`read_grids`."""
     return next(read_grids(path, (name,), max_bytes=max_bytes, level_sets=level_sets))
 
 
 def read_grids(
     path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False
 ) -> Iterator[VdbGrid]:
-    """Read several grids of a file, one at a time.
+    """Return several grids of a file, decoded one at a time.
 
     Args:
-        names: which, in this order; None for all that can be decoded, in file order.
-        max_bytes: most memory for the leaves and tiles of each; more is refused before it is taken.
+        names: names of the grids, in this order; None for all that can be decoded, in file order.
+        max_bytes: limit of the memory for leaves and tiles of each grid.
         level_sets: read signed distances too, for inspection.
 
-    Raises DataError, or BackendUnavailable where the package ``blosc`` is missing.
+    Raises:
+        DataError: the file is damaged or too large, or has no such grid.
+        BackendUnavailable: the package ``blosc`` is missing.
     """
     with open_cursor(Path(path)) as cursor:
         file = parse_header(cursor)
@@ -328,28 +330,32 @@ def _unpack_vdb_mask(raw: bytes) -> np.ndarray:
 
 @dataclass(frozen=True)
 class VdbFrame:
-    """One file and the number in its name."""
+    """One file of a sequence."""
 
-    number: int
+    number: int  # number in the name of the file
     path: Path
 
 
 @dataclass(frozen=True)
 class VdbSequence:
-    """One or more frames in the order of their numbers."""
+    """A sequence of files, in the order of the numbers in their names."""
 
     folder: Path
-    frames: tuple[VdbFrame, ...]
-    gaps: tuple[tuple[int, int], ...]  # (first, last) number of every run of missing ones
+    frames: tuple[VdbFrame, ...]  # one or more
+    gaps: tuple[tuple[int, int], ...]  # first and last of each series of missing numbers
 
     def __len__(self) -> int:
         return len(self.frames)
 
 
 def list_vdb_files(folder: Path, prefix: str | None = None) -> VdbSequence:
-    """The .vdb files of a folder by the last number in each name, after ``prefix`` where it holds several sequences.
+    """Return the .vdb files of a folder, ordered by the last number in each name.
 
-    Raises DataError for no file, a name without a number, several prefixes, or one number twice.
+    Args:
+        prefix: name before the number, for a folder with several sequences.
+
+    Raises:
+        DataError: no file, a name without a number, several prefixes, or one number twice.
     """
     folder = Path(folder)
     expected = "expected a folder with .vdb files"

@@ -18,7 +18,7 @@ from neuprim.core.io.vdb.header import BLOSC, MAGIC, MASK, ZIP, blosc_module, vd
 from neuprim.core.io.vdb.read import ALL_VALUES, LOWER, UPPER, NodeSlots
 
 COMPRESSIONS = {"none": MASK, "zip": ZIP | MASK, "blosc": BLOSC | MASK}
-"""Ways to pack values; inactive ones that are the background are never stored."""
+"""Names of the compressions."""
 
 _VERSION = 224
 _LIBRARY = (10, 0)
@@ -29,14 +29,16 @@ _STALE = ("file_mem_bytes", "file_delayed_load")
 def write_vdb(
     path: Path, grids: Sequence[VdbGrid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write grids to a file, whole or not at all.
+    """Write grids to a file, which is complete or absent.
 
     Args:
-        grids: one or more, with different names. Those with ``half`` are rounded to 16-bit floats.
-        compression: one of :data:`COMPRESSIONS`.
-        metadata: of the file: str, bool, int, float, or three ints or floats each.
+        grids: one or more grids with different names; those with ``half`` are rounded to 16-bit floats.
+        compression: "none", "zip" or "blosc".
+        metadata: metadata of the file: str, bool, int, float, or three ints or floats each.
 
-    Raises DataError for what the format cannot hold, BackendUnavailable without the package ``blosc``.
+    Raises:
+        DataError: the format cannot hold a grid or entry.
+        BackendUnavailable: the package ``blosc`` is missing.
     """
     path = Path(path)
     if compression not in COMPRESSIONS:

@@ -369,3 +369,10 @@ def test_memory_is_bounded_by_the_setting_whatever_the_length(hot: Path, tmp_pat
         assert 0 < sum(image.nbytes for image in cache._items.values()) <= max(cache._memory, 96 * 96 * 8)
     assert len(train._items) < len(tight.train)
     assert [round(cache._memory) / 2**20 for cache in caches(data)] == [768, 128, 512]
+
+
+def test_pixels_narrower_than_voxels_need_one_ray(folder: Path, tmp_path: Path) -> None:
+    for size, rays in ((8, 2), (96, 1)):
+        found = recorded(dataset(folder, tmp_path, size=size, samples="auto")).capture
+        assert found.samples == rays
+        assert recorded(dataset(folder, tmp_path, size=size, samples=3)).capture.samples == 3

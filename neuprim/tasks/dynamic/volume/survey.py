@@ -106,12 +106,14 @@ class SequenceSurvey:
         extents: frame number -> extent of its extinction grid.
         hottest: the largest flame.
         peaks: meaning -> a value that one voxel in a thousand exceeds.
+        voxel: shortest edge of a voxel of these grids, world units.
     """
 
     box: np.ndarray
     extents: dict[int, GridExtent]
     hottest: float
     peaks: dict[str, float]
+    voxel: float
 
 
 def survey_volume_frames(
@@ -122,7 +124,7 @@ def survey_volume_frames(
     Raises:
         DataError: no frame has an active voxel.
     """
-    matter, extents, hottest = list[GridExtent](), dict[int, GridExtent](), 0.0
+    matter, extents, hottest, voxel = list[GridExtent](), dict[int, GridExtent](), 0.0, math.inf
     histograms = {meaning: np.zeros(1 << 15, np.int64) for meaning in (reader.extinction, "flames")}
     for i, frame in enumerate(frames):
         progress("looking through the frames", i / len(frames))
@@ -132,6 +134,7 @@ def survey_volume_frames(
             if box is None or meaning not in histograms or grid.channels != 1:
                 continue
             extent = GridExtent(max(grid.range[1], 0.0) if grid.range else 0.0, box)
+            voxel = min(voxel, float(np.linalg.norm(grid.transform[:3, :3], axis=0).min()))
             histograms[meaning] += _count_vdb_values(grid.active_values())
             if meaning == reader.extinction:
                 extents[frame.number] = extent
@@ -144,7 +147,8 @@ def survey_volume_frames(
         where = os.path.commonpath([f.path for f in frames])
         name = reader.names[reader.extinction]
         raise DataError(f"{where}: no frame has an active voxel of {name!r}; expected matter in at least one")
-    return SequenceSurvey(box, extents, hottest, {m: _peak_vdb_value(counts) for m, counts in histograms.items()})
+    peaks = {m: _peak_vdb_value(counts) for m, counts in histograms.items()}
+    return SequenceSurvey(box, extents, hottest, peaks, voxel)
 
 
 def _count_vdb_values(values: np.ndarray) -> np.ndarray:

@@ -28,7 +28,13 @@ from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fiel
 from neuprim.core.volumes.density_truth import GridExtent
 from neuprim.scenes.smoke.smoke_scenes import MAX_TIMESTEPS, Resolution, simulate_smoke
 from neuprim.tasks.dynamic.time_density import ChunkOverlaps, TimeDensity
-from neuprim.tasks.dynamic.volume.capture import Capture, CaptureDensity, CapturedVdbFrames, hemisphere_capture_cameras
+from neuprim.tasks.dynamic.volume.capture import (
+    Capture,
+    CaptureDensity,
+    CapturedVdbFrames,
+    choose_rays_per_pixel,
+    hemisphere_capture_cameras,
+)
 from neuprim.tasks.dynamic.volume.capture_dataset import (
     TRAINING_MEMORY,
     TrainingFrames,
@@ -83,7 +89,8 @@ class VdbSceneSettings:
             :func:`count_time_chunks`; None or 1: one run.
         grids: meaning -> name in the files.
         look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
-        size: width and height of the images in pixels; ``samples``: rays per pixel side.
+        size: width and height of the images in pixels.
+        samples: rays per pixel side; "auto": 1 where pixels are narrower than voxels, else 2.
         cameras: on the upper hemisphere; two are held out. ``field_of_view``: degrees.
         lights: different directional lights of each frame, the look's own and drawn ones, which the cameras take in
             turns; models of more than one know light, others have it in their colours.
@@ -106,7 +113,7 @@ class VdbSceneSettings:
     size: Annotated[int, Range(8, 4096)] = 160
     cameras: Annotated[int, Range(4, 1000)] = 40
     field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
-    samples: Annotated[int, Range(1, 16)] = 2
+    samples: Annotated[int, Range(1, 16)] | Literal["auto"] = "auto"
     lights: Annotated[int, Range(1, 64)] = 1
     train_every: Annotated[int, Range(1, 1000)] = 1
     up: Axis = "z"
@@ -239,6 +246,9 @@ def _prepare_vdb_scene(
     optics = options.resolve_optics("density" in reader.names)
     reader = reader.with_extinction(optics.extinction_grids, folder)
     measured: Mapping[int, GridExtent] = {}
+    train, test = hemisphere_capture_cameras(
+        options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
+    )
     if known is None:
         survey = survey_volume_frames(frames, reader, optics, context.progress)
         if not survey.hottest > 0:  # no flames in any frame: leave out everything that only flames need
@@ -248,16 +258,15 @@ def _prepare_vdb_scene(
             optics = replace(optics, **{key: value for key, value in derived.items() if key not in options.optics})
         normalisation, measured = CaptureNormalisation.from_bounds(survey.box), survey.extents
         bounds = normalisation.to_scene(survey.box)
+        auto_samples = choose_rays_per_pixel(train[0], survey.voxel * normalisation.scale)
     else:
         derived = {key: known["look"][key] for key in DATA_DEPENDENT}
         optics = replace(optics, **{**derived, "flame_range": tuple(derived["flame_range"])})
         reader = replace(reader, names=known["grids"])
         center, bounds = tuple(known["normalisation"]["center"]), np.array(known["bounds"])
         normalisation = CaptureNormalisation(center, known["normalisation"]["scale"])
-    train, test = hemisphere_capture_cameras(
-        options.size, options.cameras, up=options.up, field_of_view=options.field_of_view
-    )
-    views = ([*train, *test], options.samples)
+        auto_samples = known["samples"]
+    views = ([*train, *test], auto_samples if options.samples == "auto" else options.samples)
     if options.lights > 1 and optics.light is None:
         found = f"scene.lights={options.lights}: look {options.look} has no light"
         raise ConfigError(

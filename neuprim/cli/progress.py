@@ -55,7 +55,7 @@ class RunProgress(_ProgressBar):
         info = TextColumn("{task.fields[info]}", markup=False)
         super().__init__(console, (TimeElapsedColumn(), TextColumn("eta"), TimeRemainingColumn(), info), False)
         self.title, self._quiet = title, search and not self.live
-        self._stage, self._printed = "", -1.0
+        self._stage, self._printed, self._started = "", -1.0, time.monotonic()
         self._smooth: float | None = None
         self._held_out = ""
 
@@ -82,9 +82,12 @@ class RunProgress(_ProgressBar):
     def _show_preparing(self, event: Preparing) -> None:
         text, fraction = event.text, event.fraction
         self.bar.update(self.task, description=self.title, completed=fraction, info=text)
+        if text != self._stage:
+            self._started = time.monotonic()
         if not self.live and (text != self._stage or fraction >= self._printed + 0.25):
             self._printed = fraction
-            self._print(f"{text}, {fraction:.0%}" if fraction > 0 else text)
+            left = _format_time_left(time.monotonic() - self._started, fraction)
+            self._print(f"{text}, {fraction:.0%}{left}" if fraction > 0 else text)
         self._stage = text
 
     def _show_step(self, event: Step) -> None:
@@ -97,7 +100,15 @@ class RunProgress(_ProgressBar):
         self.bar.update(self.task, completed=progress, info=info)
         if not self.live and progress >= self._printed + 0.1:
             self._printed = progress
-            self._print(f"{progress:4.0%}  {report.seconds:6.1f} s  {info}")
+            self._print(f"{progress:4.0%}  {report.seconds:6.1f} s{_format_time_left(report.seconds, progress)}  {info}")
+
+
+def _format_time_left(seconds: float, fraction: float) -> str:
+    """Return ", about 40 s left" if the rest goes on as the done ``fraction``; empty before a hundredth is done."""
+    if not 0.01 <= fraction < 1.0:
+        return ""
+    left = seconds * (1.0 - fraction) / fraction
+    return f", about {left / 60:.0f} min left" if left > 100 else f", about {left:.0f} s left"
 
 
 class DrawProgress(_ProgressBar):

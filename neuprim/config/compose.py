@@ -313,9 +313,13 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
         read_config_group(spec, "preset", preset),
     )
     place = f"preset/{spec.name}/{preset}.yaml"
+    for name, value in (preset_node.pop("scene", None) or {}).items():
+        if name not in scene_node or name == _PATHS:
+            raise ConfigError(f"preset={preset}: sets scene.{name}, which scene={scene} does not have")
+        scene_node[name] = value
     for key in preset_node:
         if key not in PRESET_GROUPS:
-            raise ConfigError(f"{place}: {key}: a preset may only set {', '.join(PRESET_GROUPS)}")
+            raise ConfigError(f"{place}: {key}: a preset may only set scene, {', '.join(PRESET_GROUPS)}")
     paths = scene_node.pop(_PATHS, None) or []
     if not isinstance(paths, list) or any(name not in scene_node for name in paths) or "name" in scene_node:
         raise ConfigError(

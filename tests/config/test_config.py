@@ -113,7 +113,8 @@ def test_paths_are_made_absolute_and_survive_any_character(toy: Path) -> None:
     ("file", "content", "text"),
     [
         ("preset/toy/quick.yaml", "train: {iteratons: 3}", "preset/toy/quick.yaml: train.iteratons: no such setting"),
-        ("preset/toy/quick.yaml", "scene: {size: 3}", "a preset may only set model, train, renderer"),
+        ("preset/toy/quick.yaml", "seed: 3", "a preset may only set scene, model, train, renderer"),
+        ("preset/toy/quick.yaml", "scene: {nope: 3}", "sets scene.nope, which scene=ball does not have"),
         ("task/toy.yaml", "scnee: ball", "task/toy.yaml: scnee: no such setting; did you mean 'scene'"),
         ("task/toy.yaml", "preset: lng", "no such preset; did you mean 'long'"),
         ("scene/toy/files.yaml", None, "task 'toy': toytask.conf has no scene/toy/files.yaml"),

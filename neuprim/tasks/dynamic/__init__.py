@@ -222,7 +222,7 @@ _MULTIVIEW = "images with a time per frame (D-NeRF layout): scene.path=DIR"
 TASK = TaskSpec(
     api=API_VERSION,
     name="dynamic",
-    summary="Smoke and fire over time, from OpenVDB sequences or images with a time each (time inside the density)",
+    summary="Smoke and fire over time, from OpenVDB sequences or images with a time each",
     config_package="neuprim.tasks.dynamic.conf",
     scenes=(
         *(SceneSpec(name, summary, *_VOLUME_FUNCTIONS) for name, summary in _VOLUME_SCENES.items()),

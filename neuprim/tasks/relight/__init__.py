@@ -220,7 +220,7 @@ def relight_pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
 TASK = TaskSpec(
     api=API_VERSION,
     name="relight",
-    summary="A scene under any light, from images under one point light each (a colour network per primitive)",
+    summary="An object under any light, from images under one point light each",
     config_package="neuprim.tasks.relight.conf",
     scenes=(
         SceneSpec(

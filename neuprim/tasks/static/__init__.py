@@ -77,7 +77,7 @@ def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
 TASK = TaskSpec(
     api=API_VERSION,
     name="static",
-    summary="A scene that does not change, from posed images (colours of spherical harmonics or lobes)",
+    summary="A scene that does not change, from photographs or other posed images",
     config_package="neuprim.tasks.static.conf",
     scenes=(
         SceneSpec(

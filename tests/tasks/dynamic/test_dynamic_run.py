@@ -134,3 +134,13 @@ def test_the_preset_of_the_equations_is_the_papers_form_at_the_bytes_of_quick(fi
     fields = TASK.build(vars(quick.model), data)
     numbers = 10 + sum(spec.size for field in fields for spec in field.parameters())
     assert abs(143 * equations.model.primitives - numbers * quick.model.primitives) <= 143 / 2
+
+
+def test_a_preview_renders_four_cameras_and_learns_from_voxels(files: Path, tmp_path: Path) -> None:
+    words = ["task=dynamic", "scene=vdb", f"scene.vdb='{files}'", "preset=preview", "scene.size=24"]
+    config = compose([*words, "train.iterations=40", "model.primitives=60", f"output_dir='{tmp_path / 'run'}'"])
+    assert config.scene["cameras"] == 4 and config.train.supervision == "voxels"
+    assert len(metrics(run(config))["per_frame"]) == 4
+    assert compose([*words, "scene.cameras=6"]).scene["cameras"] == 6
+    with pytest.raises(ConfigError, match="preset=preview: sets scene.cameras, which scene=multiview does not have"):
+        compose(["task=dynamic", "scene=multiview", f"scene.path='{tmp_path}'", "preset=preview"])

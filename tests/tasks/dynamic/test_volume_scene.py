@@ -373,6 +373,6 @@ def test_memory_is_bounded_by_the_setting_whatever_the_length(hot: Path, tmp_pat
 
 def test_pixels_narrower_than_voxels_need_one_ray(folder: Path, tmp_path: Path) -> None:
     for size, rays in ((8, 2), (96, 1)):
-        found = recorded(dataset(folder, tmp_path, size=size, samples="auto")).capture
+        found = recorded(dataset(folder, tmp_path, size=size, samples=None)).capture
         assert found.samples == rays
         assert recorded(dataset(folder, tmp_path, size=size, samples=3)).capture.samples == 3

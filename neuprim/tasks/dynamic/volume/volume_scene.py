@@ -90,7 +90,7 @@ class VdbSceneSettings:
         grids: meaning -> name in the files.
         look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
         size: width and height of the images in pixels.
-        samples: rays per pixel side; "auto": 1 where pixels are narrower than voxels, else 2.
+        samples: rays per pixel side; None: 1 where pixels are narrower than voxels, else 2.
         cameras: on the upper hemisphere; two are held out. ``field_of_view``: degrees.
         lights: different directional lights of each frame, the look's own and drawn ones, which the cameras take in
             turns; models of more than one know light, others have it in their colours.
@@ -113,7 +113,7 @@ class VdbSceneSettings:
     size: Annotated[int, Range(8, 4096)] = 160
     cameras: Annotated[int, Range(4, 1000)] = 40
     field_of_view: Annotated[float, Range(1, 120, says="degrees from 1 to 120")] = 27.0
-    samples: Annotated[int, Range(1, 16)] | Literal["auto"] = "auto"
+    samples: Annotated[int, Range(1, 16)] | None = None
     lights: Annotated[int, Range(1, 64)] = 1
     train_every: Annotated[int, Range(1, 1000)] = 1
     up: Axis = "z"
@@ -266,7 +266,7 @@ def _prepare_vdb_scene(
         center, bounds = tuple(known["normalisation"]["center"]), np.array(known["bounds"])
         normalisation = CaptureNormalisation(center, known["normalisation"]["scale"])
         auto_samples = known["samples"]
-    views = ([*train, *test], auto_samples if options.samples == "auto" else options.samples)
+    views = ([*train, *test], options.samples or auto_samples)
     if options.lights > 1 and optics.light is None:
         found = f"scene.lights={options.lights}: look {options.look} has no light"
         raise ConfigError(

@@ -100,7 +100,9 @@ class RunProgress(_ProgressBar):
         self.bar.update(self.task, completed=progress, info=info)
         if not self.live and progress >= self._printed + 0.1:
             self._printed = progress
-            self._print(f"{progress:4.0%}  {report.seconds:6.1f} s{_format_time_left(report.seconds, progress)}  {info}")
+            self._print(
+                f"{progress:4.0%}  {report.seconds:6.1f} s{_format_time_left(report.seconds, progress)}  {info}"
+            )
 
 
 def _format_time_left(seconds: float, fraction: float) -> str:

@@ -33,11 +33,15 @@ def typical_light(dataset: Dataset, falloff: bool) -> float:
 
 
 def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]:
-    """Parse ``--light``: (3,) scene positions of "x,y,z" in world units, or "orbit[:DISTANCE:POLAR:FRAMES]" about z."""
+    """Parse ``--light``: (3,) scene positions of "x,y,z" in world units, or "orbit[:DISTANCE:POLAR:FRAMES]".
+
+    An orbit circles the upward direction of the scene, +z without a ``world``.
+    """
     expected = "expected x,y,z or orbit or orbit:DISTANCE:POLAR_DEGREES:FRAMES"
     kind, *parts = text.split(":")
+    world = world or World()
     if kind != "orbit":
-        return [(world or World()).scene_points(_parse_light_numbers(text, "light", expected)).float()]
+        return [world.scene_points(_parse_light_numbers(text, "light", expected)).float()]
     try:
         values = [float(p) for p in parts] + list(_ORBIT[len(parts) :])
         distance, polar, frames = values[0], values[1], int(values[2])
@@ -47,7 +51,13 @@ def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]
         raise ConfigError(f"--light {text}: {expected}")
     across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
     turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
-    return list(torch.stack([across * turns.cos(), across * turns.sin(), torch.full_like(turns, height)], -1).float())
+    up = world.up / world.up.norm()
+    first = torch.eye(3, dtype=torch.float64)[(int(up.abs().argmax()) + 1) % 3]  # x where up is z
+    first = first - (first @ up) * up
+    first = first / first.norm()
+    second = torch.linalg.cross(up, first)
+    around = turns.cos()[:, None] * first + turns.sin()[:, None] * second
+    return list((across * around + height * up).float())
 
 
 def light_orbit_in_frames(text: str, count: int) -> str | None:

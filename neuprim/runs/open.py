@@ -104,9 +104,13 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
     model, header = load_model_checkpoint(model_file(run), task)
     config = replace(config, renderer=with_available_render_backend(config.renderer))
     stored = StoredRun(config, task, run, model, header, task)
-    if any(spec.place for spec in task.conditions) and not stored.world.identity:
-        task = replace(task, conditions=tuple(spec.within(stored.world) for spec in task.conditions))
-    return replace(stored, task=task)
+    if not any(spec.place for spec in task.conditions):
+        return stored
+
+    def place_task(world: World) -> TaskSpec:
+        return replace(task, conditions=tuple(spec.within(world) for spec in task.conditions))
+
+    return replace(stored, task=place_task(stored.world), scene_task=place_task(World(up=stored.world.up)))
 
 
 def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContext:

@@ -250,7 +250,7 @@ class LiveTraining:
 
     def _make_scene(self, fitted: Fitted) -> ViewerScene:
         dataset = fitted.dataset
-        conditions = tuple(spec.within(dataset.world) for spec in fitted.task.conditions)
+        conditions = tuple(spec.within(replace(dataset.world, up=dataset.up)) for spec in fitted.task.conditions)
         return ViewerScene(
             name=self.config.output_dir.name,
             task=replace(fitted.task, conditions=conditions),

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from neuprim.core.cameras.pinhole import Camera, RayCamera
 from neuprim.core.errors import DataError
+from neuprim.core.io.json_reader import JsonReader
 
 __all__ = ["World"]
 
@@ -30,6 +31,7 @@ class World:
     """
 
     scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))  # (4, 4) float64
+    up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64))  # (3,) scene's
 
     @staticmethod
     def at(origin: Sequence[float]) -> World:
@@ -109,13 +111,20 @@ class World:
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """Return the world of a model's header, the identity if it has none; raises DataError if damaged."""
-        record = header.get("world")
+        """Return the world of a model's header, the identity with +z up if it has none; raise DataError if damaged."""
+        record, facts = header.get("world"), header.get("data")
+        world = World()
+        if isinstance(facts, dict) and "up" in facts:
+            data = JsonReader(facts, f"{where}: header field 'data'")
+            world = World(up=data.array("up", (3,), "3 numbers"))
+            if not bool(world.up.any()):
+                raise data.fail("up", "a direction")
         if record is None:
-            return World()
+            return world
         where = f"{where}: header field 'world'"
         try:
-            return World(torch.tensor(record["scene_from_world"], dtype=torch.float64)).validate(where)
+            matrix = torch.tensor(record["scene_from_world"], dtype=torch.float64)
+            return replace(world, scene_from_world=matrix).validate(where)
         except (KeyError, TypeError, ValueError, OverflowError, RuntimeError) as error:
             raise DataError(f"{where} is damaged ({type(error).__name__})") from None
 

@@ -75,7 +75,7 @@ class ConditionSpec:
     def within(self, world: World) -> ConditionSpec:
         """Return the condition for a model in ``world``: users write positions in the coordinates of their files."""
         place = self.place
-        return self if place is None or world.identity else replace(self, parse=lambda text: place(text, world))
+        return self if place is None else replace(self, parse=lambda text: place(text, world))
 
     def given(self, value: Tensor, world: World) -> Tensor:
         """Return a value as users write it: a position is in float64 world coordinates."""

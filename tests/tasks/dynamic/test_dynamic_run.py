@@ -142,5 +142,5 @@ def test_a_preview_renders_four_cameras_and_learns_from_voxels(files: Path, tmp_
     assert config.scene["cameras"] == 4 and config.train.supervision == "voxels"
     assert len(metrics(run(config))["per_frame"]) == 4
     assert compose([*words, "scene.cameras=6"]).scene["cameras"] == 6
-    with pytest.raises(ConfigError, match="preset=preview: sets scene.cameras, which scene=multiview does not have"):
+    with pytest.raises(ConfigError, match=r"preset=preview: sets scene\.cameras, which scene=multiview does not have"):
         compose(["task=dynamic", "scene=multiview", f"scene.path='{tmp_path}'", "preset=preview"])

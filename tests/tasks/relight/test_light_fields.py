@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras.world import World
 from neuprim.core.errors import ConfigError
 from neuprim.core.light_conditions import parse_light_intensities, parse_light_positions
 from neuprim.core.model import sh
@@ -257,3 +258,11 @@ def test_gradients_reach_every_parameter() -> None:
     render(m, scenes.camera(), light(), RenderSettings(backend="cpu")).rgb.square().sum().backward()
     for name, value in m.params.items():
         assert value.grad is not None and bool(value.grad.any()), name
+
+
+def test_an_orbit_of_the_light_circles_the_upward_direction() -> None:
+    for axis, up in enumerate(torch.eye(3, dtype=torch.float64)):
+        orbit = torch.stack(parse_light_positions("orbit:2:60:8", World(up=3 * up)))
+        assert torch.allclose(orbit[:, axis], torch.ones(8))
+        assert torch.allclose(orbit.norm(dim=1), torch.full((8,), 2.0))
+        assert torch.linalg.cross(orbit[0], orbit[1])[axis] > 0, "anticlockwise, seen from above"

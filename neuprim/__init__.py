@@ -11,7 +11,7 @@ __all__ = ["__version__", "rasterize"]
 
 
 def __getattr__(name: str) -> Any:
-    """The functional front door, loaded when first used: ``import neuprim`` alone must not load torch."""
+    """Import :func:`~neuprim.functional.rasterize` on first use, so that ``import neuprim`` does not load torch."""
     if name == "rasterize":
         from neuprim.functional import rasterize
 

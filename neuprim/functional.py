@@ -156,7 +156,7 @@ def _check_tensor(name: str, value: Any) -> None:
 def _check_primitives(
     t: Mapping[str, Tensor], views: int, omega0: float, edge: int
 ) -> tuple[Geometry, Cosine, list[Tensor]]:
-    """Closed forms and one palette per camera; numbers that are not finite are refused where they are drawn."""
+    """Return geometry, density and one colour tensor per camera. Rendering itself refuses NaN and infinity."""
     for name in t:
         if name not in (*_REQUIRED, "log_gain"):
             raise DataError(f"rasterize: unknown tensor {name!r}{nearest(name, [*_REQUIRED, 'log_gain'])}")
@@ -191,7 +191,7 @@ def _check_primitives(
 
 
 def _check_cameras(viewmats: Tensor, Ks: Tensor, size: tuple[int, int]) -> list[Camera]:
-    """One camera per matrix; intrinsics that require a gradient stay tensors."""
+    """Return one camera per matrix; intrinsics that require a gradient stay tensors."""
     if len(size) != 2 or any(isinstance(side, bool) or not isinstance(side, int) or side < 1 for side in size):
         raise _wrong("size", f"value {size!r}", "two positive ints, width and height")
     _check_tensor("viewmats", viewmats)
@@ -225,7 +225,7 @@ def _check_cameras(viewmats: Tensor, Ks: Tensor, size: tuple[int, int]) -> list[
 
 
 def _check_backgrounds(backgrounds: Tensor | None, views: int, channels: int) -> Sequence[Tensor | None]:
-    """One background per camera."""
+    """Return one background per camera."""
     if backgrounds is None:
         return [None] * views
     _check_tensor("backgrounds", backgrounds)

@@ -1,7 +1,7 @@
-"""What every command of ``neuprim`` shares: its description, its parser, values of flags, and plain text output.
+"""Shared parts of the commands of ``neuprim``: description, parser, values of flags, and plain text output.
 
-A command is one module, ``NAME_command.py``, with a :class:`Command` named ``COMMAND``; :data:`neuprim.cli.COMMANDS`
-lists them. Modules that load torch are imported inside the function that runs the command, so that help stays fast.
+The modules ``*_commands.py`` define the commands, each as a :class:`Command`; :data:`neuprim.cli.COMMANDS` lists them.
+Modules that load torch are imported inside the function that runs the command, so that help stays fast.
 """
 
 from __future__ import annotations
@@ -193,7 +193,7 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
 
 
 def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
-    """Return what an interrupted run has, and the command that continues it."""
+    """Return text for the user: the state of an interrupted run, and the command that continues it."""
     begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
     state = "has the run up to here" if begun else "has no checkpoint yet"
     return f"; {directory} {state}; to go on:\n  {typed.resume_command(directory)}"

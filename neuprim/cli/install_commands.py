@@ -226,7 +226,7 @@ def _list_doctor_devices() -> Rows:
 
 
 def _probe_doctor_backend(name: str) -> str | None:
-    """None if a backend draws a picture here, else the reason it does not."""
+    """Return why a backend cannot render an image here; None if it can."""
     from neuprim.core.render import probe_backend
 
     try:

@@ -57,7 +57,7 @@ def _eval_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_metric(metrics: Mapping[str, Any], name: str) -> float | None:
-    """The number under a name in metrics.json, where infinity is null; None where it was not measured."""
+    """Return a metric of metrics.json, which stores infinity as null; None if it was not measured."""
     value: float | None = math.inf if metrics.get(f"{name}_infinite") else metrics.get(name)
     return value
 
@@ -111,7 +111,7 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _bench_command(args: argparse.Namespace) -> int:
-    """List the tables, or run what stands for their rows."""
+    """Print the paper's tables, or run and print the protocol of their rows."""
     from neuprim.cli.progress import run_command_here
     from neuprim.config.command_settings import take_budget_override
     from neuprim.config.overrides import CommandLine
@@ -184,7 +184,7 @@ def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
 
 
 def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, Any]]]) -> Iterator[str]:
-    """Per row, over scenes and seeds that have both numbers."""
+    """Yield lines with the means of each row, over scenes and seeds that have both our and the paper's number."""
     from neuprim.runs.paper import compare_run_with_paper
 
     rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
@@ -320,7 +320,7 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
 
 
 def _list_front_rows(record: TradeoffRecord, numbers: Sequence[int]) -> list[Sequence[str]]:
-    """List the reference and a front; the numbers are those of the commands."""
+    """Return table rows of the reference and a front, numbered as the printed commands."""
     trained = bool(record.points[0].run_dir)
     names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "bytes", *(["ms/step"] if trained else [])]
     first = ("centre" if trained else "ref.", *_format_printed_point(record.points[0]))

@@ -55,7 +55,7 @@ def _export_command(arguments: argparse.Namespace) -> int:
 
 
 def _export_help(words: Sequence[str]) -> str:
-    """Without a format only package metadata is read; with one, that exporter is imported."""
+    """Return the text below the arguments: all formats, from package metadata, or the options of ``--format NAME``."""
     if not {"-h", "--help"} & set(words):
         return ""
     found = re.search(r"--format[= ]([^-\s]\S*)", " ".join(words))

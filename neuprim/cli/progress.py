@@ -1,4 +1,4 @@
-"""Show the progress of commands: a bar on a terminal, otherwise a line now and then; and run a scene under it."""
+"""Show the progress of commands: a bar on a terminal, otherwise a line now and then; and run a scene with it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from neuprim.runs.launch.jobs import JobStatus
 
 
 class _ProgressBar:
-    """Context manager: the bar is there inside."""
+    """Context manager that shows a progress bar inside its block."""
 
     def __init__(self, console: Console | None, columns: tuple[ProgressColumn, ...], transient: bool) -> None:
         self.console = console or plain_console(stderr=True)
@@ -45,7 +45,7 @@ class _ProgressBar:
 
 
 class RunProgress(_ProgressBar):
-    """Context manager around one run, which calls it with its events.
+    """Progress display of one run: a context manager around it, which the run calls with its events.
 
     Args:
         search: whether many short trainings follow each other; without a terminal only notes are shown then.
@@ -114,7 +114,7 @@ def _format_time_left(seconds: float, fraction: float) -> str:
 
 
 class DrawProgress(_ProgressBar):
-    """Context manager around the drawing of images; the bar is gone afterwards."""
+    """Context manager that shows the progress while images are rendered; the bar disappears afterwards."""
 
     def __init__(self, console: Console | None = None) -> None:
         super().__init__(console, (TextColumn("eta"), TimeRemainingColumn()), True)
@@ -125,7 +125,7 @@ class DrawProgress(_ProgressBar):
         self.console.print(f"neuprim: {text}")
 
     def show(self, text: str, fraction: float) -> None:
-        """Show how far it is; without a terminal, every half a minute."""
+        """Show text and finished fraction, 0..1; without a terminal, print them every 30 seconds."""
         self.bar.update(self.task, description=text, completed=fraction)
         if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
             self._started = time.monotonic()
@@ -133,7 +133,7 @@ class DrawProgress(_ProgressBar):
 
 
 def print_notes(event: Event) -> None:
-    """Print notes on standard output, for commands whose notes are what they were asked for."""
+    """Print notes on standard output, for commands whose notes are their result."""
     if isinstance(event, Note):
         print(event.text)
 
@@ -141,11 +141,11 @@ def print_notes(event: Event) -> None:
 # ---------------------------------------------------------------- several jobs
 
 _LINE_INTERVAL = 0.25
-"""Share of a training between two lines, where there is no terminal."""
+"""Share of a training between two printed lines, if there is no terminal."""
 
 
 class RunLaunchProgress:
-    """Show several runs: one table on a terminal, a line now and then elsewhere. Call it with their statuses."""
+    """Progress display of several runs, called with their statuses: a table on a terminal, else a line now and then."""
 
     def __init__(self, configs: Sequence[RunConfig]) -> None:
         self.console = plain_console(stderr=True)
@@ -231,10 +231,10 @@ def run_command_here(
 ) -> Path:
     """Run one configuration in this process and return its directory.
 
-    An interruption says where the run is and the command that continues it.
+    The text of a KeyboardInterrupt has the run's directory and the command that continues it.
 
     Args:
-        launcher: where the chunks of a scene that is fitted in chunks work; None: here.
+        launcher: where the chunks of a scene are fitted, if it is fitted in chunks; None: in this process.
     """
     from neuprim.runs.run import run
 
@@ -266,7 +266,7 @@ def _run_with_viewer(config: RunConfig, events: RunProgress, settings: ViewerSet
 
 
 def warn_of_open_host(settings: ViewerSettings) -> None:
-    """Warn of an address that other machines can reach."""
+    """Print a warning if other machines can reach the viewer's address."""
     from neuprim.viewer.server import is_loopback
 
     if not is_loopback(settings.host):

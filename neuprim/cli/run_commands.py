@@ -81,7 +81,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _refuse_bare_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Refuse words that are neither settings nor flags, with the settings that names of tasks and scenes stand for."""
+    """Refuse words other than KEY=VALUE, with the settings that they probably mean; return ``rest`` if it has flags."""
     if not rest or any(word.startswith("-") for word in rest):
         return rest
     from neuprim.plugins.registry import TASKS, list_scene_names
@@ -130,7 +130,7 @@ def _run_command(args: argparse.Namespace) -> int:
         from neuprim.runs.sweep import read_sweep_overrides
 
         overrides = read_sweep_overrides(overrides)
-        typed = CommandLine([*overrides, *asked], args.config)  # what goes on with it says all of it
+        typed = CommandLine([*overrides, *asked], args.config)  # the command that resumes has all overrides
     stored = None if args.config is None else read_stored_config(args.config)
     check = not args.print_config
     configs = compose_all(overrides, check, stored) if args.multirun else [compose(overrides, check, stored)]
@@ -143,7 +143,7 @@ def _run_command(args: argparse.Namespace) -> int:
         return _run_command_with_target(configs[0], *wanted, launcher, typed)
     if viewer is not None:
         refuse_chunks(configs[0], "viewer=true shows one training")
-    if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # the chunks of a scene are launched themselves
+    if len(configs) > 1 or (launched and not is_chunked(configs[0])):  # of a scene in chunks, its chunks are launched
         return run_command_with_launcher(configs, overrides, launcher, typed)
     print_run_summary(run_command_here(configs[0], typed, viewer, launcher))
     return 0
@@ -169,7 +169,7 @@ def _run_command_with_target(
 
 
 def _list_printed_target_lines(record: TargetRecord) -> list[str]:
-    """What was predicted and achieved, and why the search ended."""
+    """Return lines for the user: predicted and achieved values, and why the search ended."""
     from neuprim.search.size_forecast import format_target_forecast
     from neuprim.search.target_record import TARGET_FILE
 
@@ -203,8 +203,8 @@ def run_command_with_launcher(
     """Launch the runs of a sweep, or a single run in another process; return the exit status.
 
     Args:
-        overrides: what the sweep was asked for.
-        typed: all that was typed, for the command that continues.
+        overrides: overrides of the sweep.
+        typed: the whole command line, for the command that continues.
     """
     from neuprim.cli.progress import RunLaunchProgress, print_run_summary
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
@@ -312,7 +312,7 @@ def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> in
 
     Args:
         words: the overrides.
-        more: whether anything but one run was asked for.
+        more: whether the user asked for anything other than one run.
     """
     from neuprim.core.compute.threads import limit_process_threads, machine_cores
     from neuprim.core.train.process_group import ProcessGroup
@@ -321,7 +321,7 @@ def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> in
 
     def terminate(number: int, frame: FrameType | None) -> None:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)
-        if sys.exc_info()[0] is not None:  # on its way out already, with an error that says more
+        if sys.exc_info()[0] is not None:  # it is ending already, with a more helpful error
             return
         raise group.explain_broken_connection(RankError("ended by SIGTERM"))
 
@@ -398,7 +398,7 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 
 
 def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
-    """Train, and show it on rank 0."""
+    """Train the run; rank 0 shows the progress."""
     from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.fit import ignore_run_event

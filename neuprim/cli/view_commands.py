@@ -298,7 +298,7 @@ def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
 
 
 def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
-    """Grids that cannot be decoded have a ``reason`` and no numbers from voxels."""
+    """Return JSON-ready values of a grid; one that cannot be decoded has a ``reason`` and no values from voxels."""
     entry: dict[str, Any] = {
         "name": header.name,
         "class": header.kind,
@@ -329,7 +329,7 @@ def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
 
 
 def _vdb_command_to_json(value: Any) -> Any:
-    """Plain values: JSON knows no bytes, tuples or NaN."""
+    """Convert a value to what JSON can hold: no bytes, tuples or NaN."""
     if isinstance(value, Mapping):
         return {name: _vdb_command_to_json(item) for name, item in value.items()}
     if isinstance(value, tuple | list):

@@ -1,4 +1,4 @@
-"""A run's configuration: Hydra's key=value words and the tasks' YAML files in, one validated :class:`RunConfig` out."""
+"""Configuration of runs: ``key=value`` overrides and YAML files of tasks become one validated :class:`RunConfig`."""
 
 from neuprim.config.compose import compose, compose_all, preset_settings
 from neuprim.config.overrides import expand_sweep_overrides

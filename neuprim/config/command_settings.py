@@ -1,4 +1,4 @@
-"""Settings of the command line that no configuration of a run holds: launcher, live viewer, and target with budget."""
+"""Settings that are not part of a run's configuration: launcher, live viewer, and target with budget."""
 
 from __future__ import annotations
 

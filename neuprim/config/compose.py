@@ -88,7 +88,7 @@ _PATHS = "_paths_"
 """Key of a scene's YAML that lists its settings which are paths: they are made absolute, with ``~`` expanded."""
 
 _REQUIRED = "???"
-"""How a scene's YAML says that a setting has no default (OmegaConf's mark for a missing value)."""
+"""Value in a scene's YAML of a setting without a default (OmegaConf's mark for a missing value)."""
 
 
 @dataclass(frozen=True)
@@ -107,7 +107,7 @@ class _Selection:
 
 @dataclass(frozen=True)
 class _BaseConfig:
-    """Everything below a user's settings, with ``${...}`` as it is, and the scene's settings that are paths."""
+    """Settings before those of the user, with ``${...}`` not resolved, and names of the scene's settings of paths."""
 
     tree: dict[str, Any]
     paths: list[str]
@@ -131,7 +131,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
     earlier = [config for config in (begun, stored) if config is not None]
     for config in earlier:
         refuse_untrusted_settings(config, typed)
-    # Where torchrun's ranks get the overrides that describe a run, these say how many views each rank has.
+    # If torchrun's ranks get the overrides that describe a run, these decide how many views each rank has.
     new_launch = begun is not None and read_torchrun_rank() is not None and bool(choices["task"] or choices["scene"])
     if begun is not None:
         choices = stored_choices(begun, choices, resumed=True)
@@ -144,7 +144,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
         )
     except UnknownPlugin:
         if begun is not None:
-            refuse_missing_config_plugins(begun)  # naming the package says more
+            refuse_missing_config_plugins(begun)  # the error that names the package is more helpful
         raise
     if begun is not None:
         if config.model.primitives == "auto":  # typed again: the run stored the number
@@ -190,7 +190,7 @@ def compose_all(
 
 
 def _uses_own_stored_config(directory: Path, own: Sequence[str], recorded: bool) -> bool:
-    """Whether a run of a sweep goes on from its own configuration; the sweep's record refuses other overrides."""
+    """Return whether a sweep's run resumes its own configuration; the sweep's record refuses other overrides later."""
     if not (directory / "config.yaml").is_file():
         return False
     return not recorded or drop_output_overrides(RunConfig.from_yaml(directory).overrides) == list(own)
@@ -210,7 +210,7 @@ def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None
 
 
 def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
-    """Return what was typed for a choice; None where nothing was."""
+    """Return what the user typed for a choice such as ``task``; None if nothing."""
     given = [a for a in assignments if a.key == key]
     if not given or given[-1].value is None:
         return None
@@ -245,7 +245,10 @@ def _compose_run_config(
     check_output: bool,
     new_launch: bool = False,
 ) -> tuple[RunConfig, list[str]]:
-    """Return a valid configuration without its overrides, over ``earlier`` runs, and the scene's settings of paths."""
+    """Return a valid configuration on top of ``earlier`` runs, and names of the scene's settings of paths.
+
+    ``overrides`` of the configuration are not set yet.
+    """
     spec, scene = chosen.spec, chosen.scene
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
     declared = base.tree["scene"]
@@ -296,7 +299,7 @@ def _compose_run_config(
 
 
 def _merge_overrides(earlier: RunConfig, overrides: Sequence[str]) -> list[str]:
-    """Return what was typed for a run by now: of overrides with one key, the later."""
+    """Return all overrides typed for a run so far; a later one replaces an earlier one of the same key."""
     again = {key_of(text) for text in overrides}
     return [*(text for text in drop_output_overrides(earlier.overrides) if key_of(text) not in again), *overrides]
 
@@ -331,7 +334,7 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
     )
     try:
         loss = _validate_settings(_resolve_config(base, {})).train.loss
-        # while another loss is chosen, a preset may also set what the task's own reads
+        # while another loss is chosen, a preset may also set settings that the task's own loss reads
         unused = unused_settings(spec, None if loss is None else LOSSES.load(loss))
         refuse_unused([name for name in flatten(preset_node) if name in unused], spec, None)
     except ConfigError as error:
@@ -368,7 +371,7 @@ def _resolve_config(
     if seconds is not None and steps is None:
         OmegaConf.update(tree, "train.iterations", None)  # a budget in seconds is used up, however fast the machine
     if steps is not None and seconds is None and earlier:
-        OmegaConf.update(tree, "train.max_seconds", None)  # the other budget was the earlier run's
+        OmegaConf.update(tree, "train.max_seconds", None)  # it was the budget of the earlier run
     if other_strategy and _find_typed_value(values, "train.population", "grow_from") is None:
         OmegaConf.update(tree, "train.population.grow_from", 1.0)  # the preset's value is for its own strategy
     plain: dict[str, Any] = restore_config_references(omegaconf_to_plain(tree))

@@ -26,7 +26,7 @@ class Assignment:
     Attributes:
         key: dotted.
         text: what was typed.
-        whole: a mapping takes the place of what was there, instead of entries of it.
+        whole: whether a mapping replaces the old value, instead of single entries of it.
     """
 
     key: str
@@ -43,7 +43,7 @@ class CommandLine:
     file: Path | None = None
 
     def resume_command(self, directory: Path) -> str:
-        """Return the command that continues what these began: a run in ``directory``, or the sweep it is a part of."""
+        """Return the command that continues the run in ``directory``, or the sweep that it is a part of."""
         sweep = bool(swept_override_keys(self.overrides))
         overrides = drop_output_overrides(self.overrides)
         if not overrides and self.file is None and not (directory / "config.yaml").is_file():
@@ -54,7 +54,7 @@ class CommandLine:
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
-    """Read assignments of one value each; a leading ``+`` or ``++`` means nothing, as keys are checked by name."""
+    """Parse assignments of one value each; a leading ``+`` or ``++`` is ignored, as keys are checked by name."""
     found = []
     for override, text in zip(_parse_with_hydra(overrides), overrides, strict=True):
         if override.is_sweep_override():
@@ -152,7 +152,7 @@ def key_of(override: str) -> str:
 
 
 def drop_output_overrides(overrides: Iterable[str]) -> list[str]:
-    """Return the overrides that say what is made, without those that say where and whether it goes on."""
+    """Return the overrides without ``output_dir`` and ``resume``."""
     return [text for text in overrides if key_of(text) not in NOT_SWEPT]
 
 
@@ -162,7 +162,7 @@ def swept_override_keys(overrides: Iterable[str]) -> list[str]:
 
 
 def _parse_with_hydra(overrides: Sequence[str]) -> list[Any]:
-    """Parse each with Hydra."""
+    """Parse overrides with Hydra; return its ``Override`` objects."""
     from hydra.core.override_parser.overrides_parser import OverridesParser
     from hydra.errors import HydraException
 

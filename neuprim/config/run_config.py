@@ -151,7 +151,7 @@ class RunConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
-        """Return the configuration of what :meth:`to_dict` returned.
+        """Return the configuration from the values of :meth:`to_dict`.
 
         Raises:
             ConfigError: a setting in it does not exist or has an impossible value.
@@ -247,7 +247,7 @@ def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Job:
-    """A configuration with the task that its name stands for, looked up once and handed on together."""
+    """A configuration with its task, which is loaded once and passed on together with it."""
 
     config: RunConfig
     task: TaskSpec
@@ -266,7 +266,7 @@ class Job:
 
     @property
     def plugins(self) -> RunPlugins:
-        """The plugins of the run, which errors in their code name."""
+        """The plugins of the run, whose names appear in errors of their code."""
         return find_config_plugins(self.config)
 
 
@@ -293,21 +293,21 @@ def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = Non
 
 
 def current_config_provenance(config: RunConfig, task: TaskSpec) -> Provenance:
-    """Return the record of a run that starts or goes on now: the same packages, in the versions that are installed."""
+    """Return the provenance of a run that starts or resumes now: the same packages, in their installed versions."""
     task_info = TASKS.find(config.made_by.task.qualified_name)
     loss = None if config.train.loss is None else LOSSES.find(config.train.loss)
     return Provenance.of_installed(task_info, find_config_scene(config, task), loss)
 
 
 def find_config_plugins(config: RunConfig) -> RunPlugins:
-    """Find the plugins of a run, which errors in their code name."""
+    """Find the plugins of a run, so that errors in their code can name them."""
     made = config.made_by
     scene = config.scene_name if made.scene is None else made.scene.qualified_name
     return RunPlugins(made.task.qualified_name, scene, config.train.loss)
 
 
 def refuse_missing_config_plugins(config: RunConfig) -> None:
-    """Raise ConfigError for a package that made a stored run and is not installed."""
+    """Raise ConfigError if a package that made a stored run is not installed."""
     find_config_scene(config, load_config_task(config, config.source), config.source)
     if config.made_by.loss is not None:
         load_recorded_plugin(LOSSES, config.made_by.loss, config.source)

@@ -26,14 +26,14 @@ if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 CHOICES = ("task", "scene", "preset", "effort")
-"""Keys that choose files and levels."""
+"""Keys that choose a task, scene, preset or level of effort."""
 
 
 def check_config_key(assignment: Assignment, scene: Mapping[str, Any], scene_name: str) -> None:
-    """Raise ConfigError for a key that names no setting, with the nearest that do.
+    """Raise ConfigError for a key that names no setting; the error suggests the nearest settings.
 
     Args:
-        scene: the scene's settings, whose names count.
+        scene: the scene's settings, whose names are valid keys.
     """
     key = assignment.key
     head, *rest = key.split(".")
@@ -64,7 +64,7 @@ def _setting_names(cls: type, where: str = "") -> Iterator[str]:
 
 
 def _is_setting(path: list[str]) -> bool:
-    """Whether field names from :class:`RunSettings` down end in a setting or inside a free dictionary."""
+    """Return whether a path of field names leads from :class:`RunSettings` to a setting or into a free dictionary."""
     hint: Any = RunSettings
     for part in path:
         if get_origin(hint) is dict or hint is Any:
@@ -129,8 +129,8 @@ def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | No
 
 
 def check_config_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
-    """Refuse names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the task has, as far
-    as the task lists its fields. The model itself may have fewer; what it lacks is refused when it is made."""
+    """Raise ConfigError for names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the
+    task has, if it lists its fields. Names that only the model lacks are refused when it is made."""
     if not spec.fields:
         return
     init = {"scale", "points", "surroundings", *(name for cls in spec.fields.values() for name in cls.init_settings)}

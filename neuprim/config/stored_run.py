@@ -1,10 +1,10 @@
-"""Directories of runs: where a run writes, and what the settings of an earlier one say and may reach.
+"""Run directories: choose where a run writes, and read the settings of an earlier run safely.
 
-Earlier settings stand under those of ``neuprim run --config FILE`` and ``resume=true``.
+``neuprim run --config FILE`` and ``resume=true`` start from the settings of an earlier run.
 
-A stored configuration is text of somebody else. What it names is read from this machine's own folders, as any user's
-run does. An address of another machine, and a place outside of the run that would be written to, are used only where
-the user typed them or said ``--trust``.
+A stored configuration is untrusted text. Files that it names are read from this machine, as by any run of the user.
+An address of another machine, or a folder outside of the run to write to, is used only if the user typed it or passed
+``--trust``.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from neuprim.plugins.registry import BUILT_IN, TASKS, split_plugin_name
 ROOT = Path("outputs")
 DEFAULT_TASK = "static"
 Choices = Mapping[str, str | None]
-"""Task, scene, preset and effort by what was typed; None where nothing was."""
+"""Key (task, scene, preset, effort) -> what the user typed, None if nothing."""
 
 _FREE = ("memory", "chunks")
 """Settings of scenes that a resumed run may change: what is decoded at once, and the chunks (they have a record)."""
 
 _SEARCH, _SWEEP = "target.json", "sweep.json"
-"""Records of directories that hold more than one run; they go on with the overrides of a search or a sweep."""
+"""Records in directories of more than one run; these resume with the overrides of the search or sweep."""
 
 
 def read_stored_config(path: Path) -> RunConfig:
@@ -46,7 +46,7 @@ def read_stored_config(path: Path) -> RunConfig:
 def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> dict[str, str | None]:
     """Return task, scene, preset and level: what was typed, else what the stored run had.
 
-    A run of ``--config`` takes another scene, one that goes on (``resumed``) a level that was typed.
+    With ``--config`` the user may type another scene, and with ``resume=true`` (``resumed``) a level.
 
     Raises:
         ConfigError: a choice that contradicts the stored run.
@@ -56,7 +56,7 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
         if typed[key] is None or split_plugin_name(str(typed[key]))[1] == split_plugin_name(own[key] or "")[1]:
             continue
         if key == "task" and resumed:
-            TASKS.find(str(typed[key]))  # a typing error is no other task
+            TASKS.find(str(typed[key]))  # a misspelt name is reported as such
         if resumed:
             raise _resumed_config_error(stored, key, typed[key], own[key])
         has = "the level" if own[key] is None else f"{key} {own[key]}"
@@ -67,9 +67,9 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
 
 
 def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
-    """Return the settings of a stored run by the keys that they replace whole; ``$`` is hidden from OmegaConf.
+    """Return key -> settings of a stored run, which replace the key's whole value; ``$`` is hidden from OmegaConf.
 
-    A file is data: only what users type or packages contain may refer to something (:func:`restore_config_references`).
+    A file is data: only overrides and packages may contain references ``${...}`` (:func:`restore_config_references`).
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
@@ -112,7 +112,7 @@ def _stored_choices_of(stored: RunConfig) -> dict[str, str | None]:
 
 
 def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bool) -> RunConfig | None:
-    """Return the configuration of the run that ``resume=true`` continues; None where nothing was begun there yet.
+    """Return the configuration of the run that ``resume=true`` continues; None if no run was begun there yet.
 
     Args:
         typed: key -> value of the overrides.
@@ -122,7 +122,7 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
         ConfigError: only the directory was typed, and no run is there; or a folder in it is a link out of it.
         CheckpointError, ConfigError: its ``config.yaml`` is damaged. Where settings were typed, unknown ones in the
             file are a warning.
-        UnknownPlugin: the place follows from a task, which is not installed.
+        UnknownPlugin: the directory depends on a task that is not installed.
     """
     if typed.get("resume") is not True:
         return None
@@ -151,7 +151,7 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
 
 
 def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:
-    """Refuse settings that a run cannot change on its way: what the model is, and what it is trained on and for.
+    """Raise ConfigError if a resumed run changes its model, scene, task options, seed or loss.
 
     Budgets, rates, renderers, memory, and the scene's ``paths`` (its settings that say where data lie) may change.
     """
@@ -182,11 +182,11 @@ def _fixed_config_settings(config: RunConfig) -> dict[str, Any]:
 
 
 def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None = None) -> None:
-    """Raise ConfigError for what a configuration from a file would reach outside of its run, unless it is trusted.
+    """Raise ConfigError if an untrusted configuration names an address, or a folder to write to outside of its run.
 
     Args:
         config: passes if it has no ``source``.
-        typed: dotted keys that the user gave values for beside the file; None: there is no way to give any.
+        typed: dotted keys that the user typed in addition to the file; None if the user cannot type any.
     """
     if config.source is None or trusted():
         return
@@ -278,7 +278,7 @@ def config_output_directory(asked: str | None, name: str, resume: bool, check: b
 
 
 def _config_output_numbers(name: str) -> list[int]:
-    """Numbers of the existing ``NAME`` (1) and ``NAME-n`` under the output root."""
+    """Return the numbers of the existing ``NAME`` (1) and ``NAME-n`` under the output root."""
     if not ROOT.is_dir():
         return []
     pattern = re.compile(re.escape(name) + r"(?:-(\d+))?")

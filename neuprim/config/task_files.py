@@ -4,9 +4,9 @@ A task's ``config_package`` holds ``task/NAME.yaml``, ``scene/NAME/*.yaml``, ``p
 ``effort/NAME.yaml``. Scenes and presets lie under the task's name because several tasks have a scene of the same name.
 A preset or scene may start from others of its folder, as in Hydra: ``defaults: [paper, _self_]``.
 
-``effort/NAME.yaml`` freezes settings under the numbers 1 to 9, all of which are there::
+``effort/NAME.yaml`` has settings for each level of effort, 1 to 9::
 
-    preset: quick                # what the levels are settings over
+    preset: quick                # the preset that the levels change
     levels:
       1: {model.primitives: 700, train.iterations: 300}
       ...
@@ -38,7 +38,7 @@ PRESET_GROUPS = ("model", "train", "renderer")
 
 @dataclass(frozen=True)
 class TaskChoices:
-    """What ``task/NAME.yaml`` says: default scene and preset, and values of all of the task's own options."""
+    """Content of ``task/NAME.yaml``: default scene and preset, and values of all of the task's own options."""
 
     scene: str
     preset: str
@@ -47,14 +47,14 @@ class TaskChoices:
 
 @dataclass(frozen=True)
 class Level:
-    """A level of effort: the preset that it was measured with, and its settings as if they were typed."""
+    """A level of effort: the preset that it was measured with, and its settings as overrides."""
 
     preset: str
     settings: tuple[Assignment, ...]
 
 
 def read_task_config(spec: TaskSpec) -> TaskChoices:
-    """Read ``task/NAME.yaml``, which names only what the task has."""
+    """Read ``task/NAME.yaml``; raise ConfigError if it names a scene, preset or option that the task lacks."""
     place = f"task/{spec.name}.yaml"
     who = f"task {spec.name!r}: {place}"
     node = read_task_yaml(find_config_package(spec) / place, who)
@@ -103,15 +103,15 @@ def _require_config_file(package: str, place: str, who: str) -> None:
 
 
 def find_config_package(spec: TaskSpec) -> Traversable:
-    """Return where a task's YAML files lie. Raise ConfigError when its package cannot be opened."""
+    """Return the folder of a task's YAML files. Raise ConfigError when its package cannot be opened."""
     return _open_config_package(spec.config_package, f"task {spec.name!r}")
 
 
 def read_config_group(spec: TaskSpec, group: str, name: str, package: str | None = None) -> dict[str, Any]:
-    """Return the settings of a scene or preset over those of its ``defaults``; ``${...}`` stays as it is.
+    """Return the settings of a scene or preset, merged over its ``defaults``; ``${...}`` is not resolved.
 
     Args:
-        package: that holds the file; None for the task's own.
+        package: package with the file; None for the task's own.
     """
     root = find_config_package(spec) if package is None else _open_config_package(package, f"scene {name!r}")
     return _read_with_defaults(root, f"{group}/{spec.name}", name, f"task {spec.name!r}: ", ())
@@ -176,7 +176,7 @@ def _open_config_package(name: str, who: str) -> Traversable:
 def choose_config_effort_level(
     spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]
 ) -> Level | None:
-    """Return the level that ``effort=N`` names, which must be of the ``preset`` that was typed, if any."""
+    """Return the level that ``effort=N`` names; raise ConfigError if the user typed another ``preset`` than its own."""
     if chosen is None:
         return None
     if chosen not in map(str, LEVELS):

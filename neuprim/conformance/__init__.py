@@ -178,7 +178,7 @@ def check_parameters_conformance(t: TaskUnderTest) -> None:
 
 
 def check_evaluation_conformance(t: TaskUnderTest) -> None:
-    """What the task measures, films and displays of its example can be used, and its orbit has every condition."""
+    """Metrics, facts, clips and layers of the task fit its example; its orbit has all conditions."""
     task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
     find_channels(task, data).display(data.test.pixels(0).over(data.background))
     before = {name: value.clone() for name, value in model.params.items()}
@@ -226,7 +226,7 @@ def check_loss_conformance(t: TaskUnderTest) -> None:
 
 
 def check_channels_conformance(t: TaskUnderTest) -> None:
-    """A colour built for grey images has one channel and for five bands five, or ``build`` refuses such data."""
+    """Colours built for one and for five channels have as many, or ``build`` refuses such data."""
     if t.task.example is not None or t.task.channels:
         return  # only the task knows what data of other channels would look like, or there are no others
     declared = {}
@@ -270,7 +270,7 @@ def check_resume_conformance(t: TaskUnderTest) -> None:
 
 
 def check_save_load_conformance(t: TaskUnderTest) -> None:
-    """A model comes back from its files with the same bits and picture; compressing it again changes nothing more."""
+    """A saved model loads with equal bits and images; compressing it a second time changes nothing."""
     model = t.perturbed_model(torch.float32)
     canonical = canonical_model(model)
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():

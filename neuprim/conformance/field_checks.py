@@ -1,4 +1,4 @@
-"""Check fields: integrals, gradients, and what changes a population."""
+"""Checks of fields: integrals, gradients, scaling, splitting and reductions."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Ten
 def conformance_points_inside(
     geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95
 ) -> Tensor:
-    """Draw (M, 3) float64 points, one uniform in ``reach`` of the ellipsoid of each of ``rows`` (M,)."""
+    """Draw (M, 3) float64 points, uniform in the ellipsoids of ``rows`` (M,) scaled by ``reach``."""
     direction = _random_directions(len(rows), generator)
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     local = geometry.scales.double()[rows] * direction * radius
@@ -130,7 +130,7 @@ def check_integral_conformance(t: TaskUnderTest) -> None:
 
 
 class _ShadingUnderTest(ColourField):
-    """A colour field whose shading is given; shading carries no gradient, so finite differences must not change it."""
+    """A colour field with fixed shading: it has no gradient, so finite differences must not change it."""
 
     def __init__(self, model: Primitives, conditions: Conditions) -> None:
         self.colour, self.channels = model.colour, model.colour.channels
@@ -264,7 +264,10 @@ def check_split_conformance(t: TaskUnderTest) -> None:
 def _require_conforming_masses(
     t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]
 ) -> None:
-    """Compare integrals of |sigma| over parents and children: where sigma varies, one pair may be off, the mean not."""
+    """Require pairs of children to keep their parent's integral of |sigma|.
+
+    Where sigma varies, one pair may be off, the mean not.
+    """
     view = t.double_views[0]
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
     ball = ball[ball.norm(dim=-1) < 1]
@@ -289,7 +292,7 @@ def _require_conforming_masses(
 
 
 def check_reductions_conformance(t: TaskUnderTest) -> None:
-    """A field that can do with less of something becomes a field of the task that has fewer numbers and draws."""
+    """Every reduction gives a field of the task that has fewer parameters and renders."""
     model = t.perturbed_model(torch.float32)
     for kind, field in (("density", model.density), ("colour", model.colour)):
         for name, values in field.reductions().items():

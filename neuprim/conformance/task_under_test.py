@@ -1,4 +1,4 @@
-"""The task that the checks examine, and what they build from it."""
+"""The task under test, and the models, data and trainers that checks build from it."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ class TaskUnderTest:
         self.task, self.check, self.preset, self.changes = task, check, preset, dict(model or {})
 
     def named(self, check: str) -> TaskUnderTest:
-        """Return the same for another check; what was read from files is shared."""
+        """Return a copy for another check; settings read from files are shared."""
         other = copy(self)
         other.check = check
         return other
 
     def with_channels(self, channels: int) -> TaskUnderTest:
-        """Return the same with a synthetic data set of this number of colour channels."""
+        """Return a copy with a synthetic data set of this number of colour channels."""
         other = copy(self)
         other.dataset = conformance_dataset(self.task.conditions, channels)
         return other
@@ -75,8 +75,10 @@ class TaskUnderTest:
         self.require(ok, where, "NaN or infinity", "finite numbers")
 
     def require_layout(self, where: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-        """Raise :class:`ConformanceError` unless the tensors have the expected names, dtypes and shapes and are
-        finite."""
+        """Raise :class:`ConformanceError` unless tensors are finite and of the expected layout.
+
+        The layout is names, dtypes and shapes.
+        """
         self.require(set(found) == set(expected), where, f"tensors {sorted(found)}", sorted(expected))
         for name, value in expected.items():
             a, b = (f"{x.dtype} {tuple(x.shape)}" for x in (found[name], value))
@@ -84,8 +86,7 @@ class TaskUnderTest:
             self.require_finite(f"{where}: {name}", found[name])
 
     def require_close(self, where: str, found: Tensor, expected: Tensor, rows: Tensor) -> None:
-        """Raise :class:`ConformanceError` unless values of the primitives ``rows`` agree to a millionth of the
-        largest."""
+        """Raise :class:`ConformanceError` unless values of ``rows`` agree to 1e-6 of the largest."""
         if len(rows):
             error = (found - expected).abs() / expected.abs().max().clamp_min(1e-30)
             i = int(error.argmax())
@@ -99,7 +100,7 @@ class TaskUnderTest:
             self.require(same, f"{where}: {name}", "different values", "equal bits")
 
     def draw(self, where: str, model: Primitives, view: View) -> Tensor:
-        """Draw (H, W, C) colours of a view, which must be finite."""
+        """Render a view, (H, W, C); raise :class:`ConformanceError` unless it is finite."""
         try:
             rgb = render(model, view.camera, view.conditions, self.settings.renderer).rgb
         except NonFiniteError as error:
@@ -157,7 +158,7 @@ class TaskUnderTest:
         return "" if kind is None else f"{kind}.lower: "
 
     def initial_model(self, seed: int = 0) -> Primitives:
-        """Return a model as a run starts with."""
+        """Return the initial model of a run."""
         density, colour = self.build_fields()
         return initial_model_to_train(density, colour, self.dataset, self.settings.model, seed)
 

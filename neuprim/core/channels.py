@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 __all__ = ["Channels"]
 
-_LISTED = 8  # names that a line of text lists; of more, the first three and the last
+_LISTED = 8  # most names that a line of text lists; longer lists show the first three and the last
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class Channels:
 
     @property
     def rgb(self) -> tuple[int, int, int] | None:
-        """Indices of red, green and blue by name, of all three channels, or of a single one; else None."""
+        """Indices of R, G and B by name; else (0, 1, 2) for three channels, (0, 0, 0) for one, None otherwise."""
         if {"R", "G", "B"} <= set(self.names):
             return self.names.index("R"), self.names.index("G"), self.names.index("B")
         return {1: (0, 0, 0), 3: (0, 1, 2)}.get(self.count)
@@ -64,7 +64,7 @@ class Channels:
 
     @property
     def display_text(self) -> str:
-        """Text that says what pictures show; empty for red, green and blue or grey."""
+        """Text for the user on the channels that pictures show; empty for plain RGB or grey."""
         if self.own is not None:
             return f"{self.name_list} through the display of task {self.task!r}"
         if self.names == default_exr_channel_names(self.count) and not self.hides_channels:
@@ -77,7 +77,7 @@ class Channels:
 
     @property
     def name_list(self) -> str:
-        """Names in one line; of many channels the first ones and the last."""
+        """Names of the channels in one line; of more than 8, the first three and the last."""
         if self.count <= _LISTED:
             return ", ".join(self.names)
         return f"{', '.join(self.names[:3])}, … {self.names[-1]} ({self.count} channels)"
@@ -124,7 +124,7 @@ class Channels:
 
 
 def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
-    """Return the channels of a task's data set, whose background must have one number for each."""
+    """Return the channels of a task's data set; raises DataError if their number or the background does not fit."""
     if task.channels and len(task.channels) != dataset.channels:
         named = f"{len(task.channels)}, which task {task.name!r} names: {', '.join(task.channels)}"
         raise DataError(f"{dataset.name}: {dataset.channels} channels; expected {named}")
@@ -146,7 +146,7 @@ def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec,
         CheckpointError: the header's names are damaged or do not fit the model.
     """
     names = header.get("channels")
-    if names is None:  # of a model that no run wrote
+    if names is None:  # no run wrote the model
         names = task.channels if len(task.channels) == count else default_exr_channel_names(count)
     elif not isinstance(names, list) or len(names) != count or exr_channel_name_error(names):
         raise CheckpointError(

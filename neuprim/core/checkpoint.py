@@ -1,8 +1,8 @@
 """Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
 
 A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also
-be a compressed file (:mod:`neuprim.core.compression`), which its first bytes tell; whatever reads models here reads
-both.
+be a compressed file (:mod:`neuprim.core.compression`). All readers of models accept both; the first bytes tell them
+apart.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ __all__ = ["load_model_checkpoint", "read_header", "save_model"]
 FORMAT = 1
 _KEY = "neuprim"
 _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitives")
-"""Of a header: what any reader may take for a number of at least 0, or nothing."""
+"""Header entries that reading checks: each is null, missing, or a number of at least 0."""
 
 
 def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
@@ -115,7 +115,7 @@ def read_tensors(
     """Return header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
 
     Args:
-        rows: of a tensor's name and shape, those to read; None for all.
+        rows: (tensor name, shape) -> rows to read, None for all. Compressed files are read whole.
     """
     if is_compressed(path):
         header, tensors, _ = read_compressed(path)
@@ -125,7 +125,7 @@ def read_tensors(
         with safe_open(str(path), framework="pt") as file:
             found = {name: file.get_slice(name) for name in file.keys()}
             parts = {name: rows(name, tuple(one.get_shape())) for name, one in found.items()}
-            empty = {name for name, one in found.items() if 0 in one.get_shape()}  # of which the library takes no slice
+            empty = {name for name, one in found.items() if 0 in one.get_shape()}  # safetensors cannot slice these
             tensors = {
                 name: found[name][part] if part and name not in empty else file.get_tensor(name)
                 for name, part in parts.items()
@@ -142,7 +142,7 @@ def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any
     Args:
         task: name of the task.
         extra: JSON-able entries of the header: background, colour space, data source.
-        without_zeros: leave out zeros of the fields, as for pruned models.
+        without_zeros: whether to store the fields' parameters sparsely where that is smaller, for pruned models.
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
     tensors, sparse = sparse_primitive_parameters(model.params, specs)
@@ -159,10 +159,10 @@ def save_compressed(
     bits: BitTable | Quantizers,
     config: str | None = None,
 ) -> dict[str, StoredSize]:
-    """As :func:`save_model`, in few bits; returns what the file has of every parameter.
+    """Write a quantised model file, otherwise as :func:`save_model`; return the stored size of each parameter.
 
     Args:
-        bits: how many, or how the numbers of a model that is folded are coded.
+        bits: bits per parameter, or quantizers fitted to ``model``, which must then be a :func:`canonical_model`.
         config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
     """
     if isinstance(bits, BitTable):
@@ -184,7 +184,7 @@ def checkpoint_config(path: Path) -> str | None:
 
 
 def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict[str, Any]:
-    """The header of a file that :func:`save_model` writes, but for format and kind."""
+    """Return the header that :func:`save_model` writes, without its entries ``format`` and ``kind``."""
     fields = {
         kind: {"class": type(field).__name__, "settings": field.settings()}
         for kind, field in (("density", model.density), ("colour", model.colour))
@@ -193,7 +193,7 @@ def model_header(model: Primitives, task: str, extra: Mapping[str, Any]) -> dict
 
 
 def read_header_extra(header: Mapping[str, Any]) -> dict[str, Any]:
-    """Of a model's header, what :func:`save_model` was given beside the model itself."""
+    """Return the ``extra`` entries that :func:`save_model` added to a model's header."""
     own = ("format", "kind", "task", "primitives", "density", "colour")
     return {key: value for key, value in header.items() if key not in own}
 

@@ -1,9 +1,9 @@
 """Read the conditions of a task from text: one grammar for every command and exporter, and the check of their ranges.
 
-A condition is given as ``--NAME TEXT`` or ``--NAME=TEXT``, with ``-`` or ``_`` inside its name. For a
-condition that is one number the text may be a number, a list ``A,B,C`` of them, ``FIRST:LAST`` or ``FIRST:LAST:COUNT``,
-one frame each; :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The text of any
-other condition is the task's altogether, as ``x,y,z`` or ``orbit`` for a light.
+A condition is given as ``--NAME TEXT`` or ``--NAME=TEXT``, with ``-`` or ``_`` inside its name. A condition that is
+one number accepts a number, a list ``A,B,C``, or a range ``FIRST:LAST`` or ``FIRST:LAST:COUNT``; each value is a frame,
+and :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The task alone parses the
+text of any other condition, such as ``x,y,z`` or ``orbit`` for a light.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.model.fields import ConditionSpec
 
 FRAMES = 60
-"""Frames of a range that does not say how many."""
+"""Number of frames of a range without ``COUNT``."""
 
 _MOST = 100_000
 _NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d+)?"
@@ -37,17 +37,17 @@ def _ignore_condition_warning(text: str) -> None:
 
 
 def condition_flag(name: str) -> str:
-    """How messages name a condition: ``"--light-intensity"`` for ``light_intensity``; every command takes it."""
+    """Return the flag of a condition, ``"--light-intensity"`` for ``light_intensity``, as every command accepts it."""
     return "--" + name.replace("_", "-")
 
 
 def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
-    """The name of the condition that ``word`` means, with ``-`` or ``_``; None if there is none."""
+    """Return the name of the condition that ``word`` spells, with ``-`` or ``_``; None if there is none."""
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
 def split_conditions(words: Sequence[str], specs: Sequence[ConditionSpec]) -> tuple[dict[str, str], list[str]]:
-    """Return condition name -> text out of the words of a command, and the other words in their order."""
+    """Split command-line arguments into condition name -> text and the other arguments, in their order."""
     found: dict[str, str] = {}
     rest: list[str] = []
     queue = list(words)
@@ -76,10 +76,10 @@ def read_conditions(
 ) -> dict[str, list[Tensor]]:
     """Return name -> values, one per frame, of the conditions that were given, in the task's order.
 
-    An animation that does not say how many frames it has, ``0:1`` or ``orbit``, takes the number of those that do.
+    An animation without a number of frames, ``0:1`` or ``orbit``, takes the number of the other conditions.
 
     Args:
-        warn: called with one line for each condition that leaves its range; those of strict ones are refused.
+        warn: called with one line for each condition beyond its range; strict conditions raise ConfigError instead.
     """
     given = [spec for spec in specs if spec.name in texts]
     said = {}
@@ -98,7 +98,7 @@ def read_conditions(
 
 
 def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
-    """Return how many frames conditions have together; those of one value hold it in all frames, others must agree."""
+    """Return the common number of frames; a single value holds in all frames, the other conditions must agree."""
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if len(set(counts.values())) > 1:
         each = " and ".join(
@@ -109,7 +109,7 @@ def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequenc
 
 
 def _condition_with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
-    """The text in so many frames; None where it says its number, or is a single value or a list."""
+    """Return the text with ``count`` frames; None if it has a count already, or is a single value or a list."""
     if spec.shape:
         return spec.in_frames(text, count)
     found = _RANGE.fullmatch(text.strip())
@@ -129,7 +129,7 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
 
 
 def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
-    """Read one number or range; a range that the task does not read is made of numbers that it does."""
+    """Read one number or range; expand a range here if the task itself parses only numbers."""
     try:
         return _condition_values_from_text(spec, text)
     except NeuprimError:
@@ -159,7 +159,7 @@ def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tens
 def _condition_values_from_text(spec: ConditionSpec, text: str) -> list[Tensor]:
     try:
         values = spec.parse(text)
-    except ValueError as error:  # as float("x") raises it; the text is the user's
+    except ValueError as error:  # as float("x") raises it; the user typed the text
         raise ConfigError(
             f"{condition_flag(spec.name)} {text}: cannot be read ({' '.join(str(error).split())})"
         ) from error
@@ -169,12 +169,12 @@ def _condition_values_from_text(spec: ConditionSpec, text: str) -> list[Tensor]:
 
 
 def _format_condition_number(number: float) -> str:
-    """As a user would write it: whole numbers without a point, others exact."""
+    """Format a number as a user would: whole numbers without a point, others exactly."""
     return repr(number).removesuffix(".0")
 
 
 def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
-    """Elementwise; the range's ends are rounded as the values are, so that 0.3 lies within 0 to 0.3."""
+    """Check every element; bounds are rounded to the dtype of the values, so that 0.3 lies within 0 to 0.3."""
     low, high = spec.range
     shown = f"{condition_flag(spec.name)} {text}"
     for value in values:
@@ -201,7 +201,7 @@ def _first_where(value: Tensor, where: Tensor) -> float:
 def conditions_per_frame(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
 ) -> list[dict[str, Tensor]]:
-    """Return a mapping of every condition of the task per frame; all must be given, of one frame unless ``several``."""
+    """Return condition name -> value for each frame; all must be given, for one frame unless ``several``."""
     for spec in specs:
         if spec.name not in texts:
             what = f"{condition_flag(spec.name)}: required, as the model depends on it ({spec.unit})"
@@ -216,7 +216,7 @@ def conditions_per_frame(
 
 
 def _example_condition_text(spec: ConditionSpec) -> str:
-    """A text that is within the range."""
+    """Return an example text within the range, for messages."""
     low, high = spec.range
     usual = 1.0 if spec.shape else 0.5
     value = usual if low <= usual <= high else (low + high) / 2

@@ -1,4 +1,4 @@
-"""Light from all around: an image of latitude and longitude, and a few directions that stand for it.
+"""Environment maps: a latitude-longitude image of the light from all directions, and a few lights that approximate it.
 
 The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis; to the
 right of it, as seen from inside, directions turn clockwise about up. With up = +z: the middle column is +x, a quarter
@@ -31,7 +31,7 @@ from neuprim.core.io.images import image_info, read_image, srgb_to_linear
 __all__ = ["DirectionalLights", "Environment", "EnvironmentFile", "Illumination", "read_environment"]
 
 MAX_LIGHTS = 4096
-_ROWS = 512  # larger images are summed to at most so many rows of cells, of which no energy is lost
+_ROWS = 512  # most rows of cells; larger images are summed into cells, which loses no energy
 _LUMINANCE = np.array([0.2126, 0.7152, 0.0722])  # Rec. 709, linear
 Array = NDArray[np.float64]
 
@@ -64,14 +64,14 @@ class Illumination:
     guessed: tuple[bool, ...] = ()  # whether the light of a frame has no training data nearby; empty if none has
 
     def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:
-        """Return the conditions of the frames, without those of guessed light unless ``guesses``; perhaps none."""
+        """Return the conditions of the frames; without ``guesses``, only of light near training data, perhaps none."""
         if guesses or not any(self.guessed):
             return self.conditions
         return tuple(c for c, guess in zip(self.conditions, self.guessed, strict=True) if not guess)
 
 
 class Environment:
-    """Radiance from every direction: an image of latitude and longitude.
+    """Radiance from every direction, as a latitude-longitude image.
 
     Args:
         radiance: (H, 2H, 3) linear RGB, finite and not negative.
@@ -108,7 +108,7 @@ class Environment:
         for r0, r1, c0, c1 in _cut_environment_into_rectangles(self._moment, self._flux @ _LUMINANCE, count):
             flux, moment = self._flux[r0:r1, c0:c1].sum((0, 1)), self._moment[r0:r1, c0:c1].sum((0, 1))
             length = np.linalg.norm(moment)
-            if length <= 1e-9 * float(flux @ _LUMINANCE):  # light from all sides alike has no direction; any is as good
+            if length <= 1e-9 * float(flux @ _LUMINANCE):  # equal light from all sides has no mean direction; take any
                 moment, length = self._moment[r0, c0], np.linalg.norm(self._moment[r0, c0])
             directions.append(moment / length)
             irradiance.append(flux)
@@ -153,7 +153,7 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
 
 
 def _environment_axes(up: Tensor) -> Array:
-    """(3, 3) rows: first horizontal axis, second, up."""
+    """Return the axes as rows (3, 3): first horizontal axis, second, up."""
     top = up.detach().double().numpy()
     length = np.linalg.norm(top)
     if not (np.isfinite(length) and length > 0):
@@ -166,7 +166,7 @@ def _environment_axes(up: Tensor) -> Array:
 
 
 def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
-    """(R, C, 3) radiance times solid angle, and its luminance times direction, summed over blocks of texels."""
+    """Return two (R, C, 3) sums over blocks of texels: radiance times solid angle, its luminance times direction."""
     height, width = radiance.shape[:2]
     block = -(-height // _ROWS)
     starts = np.arange(0, width, block)
@@ -194,7 +194,7 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
 
 
 def _cut_environment_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
-    """At most ``count`` rectangles (first row, end, first column, end) with energy, which together have all of it."""
+    """Return at most ``count`` non-black rectangles (first row, end, first column, end) that hold all the energy."""
     rows, columns = weight.shape
     table = np.zeros((rows + 1, columns + 1, 4))
     table[1:, 1:] = np.concatenate([moment, weight[..., None]], -1).cumsum(0).cumsum(1)
@@ -220,7 +220,7 @@ def _sum_rectangle(table: Array, box: tuple[int, int, int, int]) -> Array:
 
 
 def _direction_spread(sums: Array) -> Array:
-    """Energy times variance of direction, W - |M|^2/W, of (..., 4) sums (M, W)."""
+    """Return energy times variance of direction, W - |M|^2/W, from (..., 4) sums (M, W)."""
     weight = sums[..., 3]
     return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
 
@@ -228,7 +228,7 @@ def _direction_spread(sums: Array) -> Array:
 def _cut_environment_rectangle(
     table: Array, box: tuple[int, int, int, int], least: float
 ) -> list[tuple[int, int, int, int]]:
-    """The two parts of the best cut; none if no cut lowers the spread by ``least``."""
+    """Return the two parts of the best cut of ``box``; none if no cut lowers the spread by ``least``."""
     r0, r1, c0, c1 = box
     whole = _sum_rectangle(table, box)
     best, parts = float(_direction_spread(whole)) - least, []

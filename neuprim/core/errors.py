@@ -1,7 +1,7 @@
 """Errors a user can act on, and warnings.
 
 The command line prints an error as one line and exits with status 2; anything else is a bug and keeps its traceback.
-A warning does not stop a command; it is one line, said once per process. It is a Python warning, so that notebooks and
+A warning does not stop a command; it is one line, given once per process. It is a Python warning, so that notebooks and
 programs can filter it; the command line shows it on standard error.
 """
 
@@ -22,7 +22,7 @@ DISK = (
     *(errno.EACCES, errno.EPERM, errno.EROFS, errno.ENOSPC, errno.EDQUOT, errno.EIO),
     *(errno.ENOTDIR, errno.EISDIR, errno.EEXIST, errno.ENAMETOOLONG, errno.ELOOP),
 )
-"""What a disk or a path may refuse wherever a command reads or writes; a missing file may well be a bug."""
+"""Error codes of disks and paths that users can correct; ENOENT is not one, as a missing file may be a bug."""
 
 
 class NeuprimError(Exception):
@@ -70,7 +70,7 @@ class FormError(NeuprimError):
 
 
 def cut_error_text(text: str, most: int = 80) -> str:
-    """Return a value's text as messages show it; what files and users gave goes into a message through this."""
+    """Cut a text to ``most`` characters; messages quote values from files and users only through this."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
@@ -84,7 +84,7 @@ def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "")
 
 
 _HEAD, _TAIL = 1200, 300
-"""Characters of a line's beginning, with file and key, and of its end; a damaged file's value between them is cut."""
+"""Characters that remain of a long message: its beginning, with file and key, and its end. The value between is cut."""
 
 _FULL_GPU = (
     "the GPU's memory is full; expected a smaller image or grid, fewer primitives, or CUDA_VISIBLE_DEVICES= in the "
@@ -93,13 +93,13 @@ _FULL_GPU = (
 
 
 def one_line(error: BaseException) -> str | None:
-    """What is said of an error that a user can act on, in one line; None of a bug, which keeps its traceback."""
+    """Return the one-line message of an error that a user can act on; None for a bug, which keeps its traceback."""
     if isinstance(error, NeuprimError):
         text = " ".join(str(error).split())
         return text if len(text) <= _HEAD + _TAIL else f"{text[:_HEAD]} ... {text[-_TAIL:]}"
     if isinstance(error, OSError) and error.errno in DISK:
         return f"{error.filename or 'writing'}: {error.strerror}"
-    torch = sys.modules.get("torch")  # what was not imported raised nothing
+    torch = sys.modules.get("torch")  # if it was not imported, it raised nothing
     if torch is not None and isinstance(error, torch.OutOfMemoryError):
         return _FULL_GPU
     return None
@@ -121,7 +121,7 @@ def warn_once(text: str) -> None:
 
 @contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Inside, our warnings are lines ``neuprim: warning: ...`` on standard error; other packages' stay as they are."""
+    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error; leave others alone."""
     previous = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:

@@ -1,4 +1,4 @@
-"""A point light as a condition of frames: where it is, how strong, how users write it; many make an environment."""
+"""Point lights as conditions of a frame: parse position and intensity, and approximate environment maps by lights."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, fra
 
 
 def typical_light(dataset: Dataset, falloff: bool) -> float:
-    """Median over training views of the intensity, with ``falloff`` over the squared distance; 1 in the dark."""
+    """Return the median intensity of the training views, over squared distance if ``falloff``; 1 if 0 or infinite."""
     values = []
     for i in range(len(dataset.train)):
         conditions = dataset.train.view(i).conditions
@@ -61,7 +61,7 @@ def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]
 
 
 def light_orbit_in_frames(text: str, count: int) -> str | None:
-    """``"orbit:4"`` in 24 frames -> ``"orbit:4:40:24"``; None unless it is an orbit without a number of frames."""
+    """Return an orbit's text with a number of frames, ``"orbit:4:40:24"``; None unless it is an orbit without one."""
     parts = text.split(":")
     if parts[0] != "orbit" or len(parts) > 3:
         return None
@@ -132,9 +132,9 @@ def lights_from_environment(environment: Environment, count: int, facts: Mapping
 
     Each direction becomes a light at the training lights' mean distance r, of the intensity that gives the centre the
     environment's irradiance E: exposure E r^2 with falloff inverse_square (the model draws I/distance^2 over the
-    exposure), exposure E with falloff irradiance (which intensities are then), else exposure E / pi. Away from the
-    centre light differs from parallel light by about 2 offset/r.
-    ``facts`` are the dataset's, of the model's header; raises DataError if they are damaged.
+    exposure), exposure E with falloff irradiance (intensities are irradiances then), else exposure E / pi. Away from
+    the centre light differs from parallel light by about 2 offset/r.
+    ``facts``: entry "data" of the model's header; raises DataError if it is damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
     center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))

@@ -1,4 +1,4 @@
-"""Settings of rendering and of what is measured on request."""
+"""Settings of rendering and of optional metrics."""
 
 from __future__ import annotations
 

@@ -25,7 +25,7 @@ API_VERSION = 1
 
 @dataclass(frozen=True)
 class Supervision:
-    """What a loss gets besides the rendered and the true image.
+    """Input of a loss besides the rendered and the true image.
 
     Attributes:
         view: name, camera and conditions of the view.

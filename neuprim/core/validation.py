@@ -45,7 +45,7 @@ _KINDS = {
 }
 
 
-# ---------------------------------------------------------------- what a field says about its values
+# ---------------------------------------------------------------- constraints on values
 
 
 @dataclass(frozen=True)
@@ -85,7 +85,7 @@ class Range:
 
 
 def _format_bound(value: float | None) -> str:
-    """As a bound is written; empty for none."""
+    """Format a bound for messages; empty for none."""
     return "" if value is None or math.isinf(value) else str(value) if isinstance(value, int) else f"{value:g}"
 
 
@@ -105,13 +105,13 @@ class Accepts:
 
 @dataclass(frozen=True)
 class Unbounded:
-    """Marks a number for which every finite value has a meaning."""
+    """Marker of a number for which every finite value has a meaning."""
 
     why: str  # the reason
 
 
 def nonempty_text(says: str) -> Accepts:
-    """Text or a path that is not empty, without the character that no file name can hold."""
+    """Return the requirement of a non-empty text or path without NUL, which no file name can hold."""
     return Accepts(lambda value: bool(str(value)) and "\0" not in str(value), says)
 
 
@@ -172,7 +172,7 @@ def validate_fields(settings: Any, where: str) -> None:
         value = getattr(settings, name)
         made = validate_value(value, hint, join_setting_key(where, name))
         if made is not value:
-            object.__setattr__(settings, name, made)  # frozen ones too, before anybody has seen them
+            object.__setattr__(settings, name, made)  # works on frozen classes too; nobody has read the value yet
 
 
 def validate_value(value: Any, hint: Any, where: str) -> Any:
@@ -188,7 +188,7 @@ def validate_value(value: Any, hint: Any, where: str) -> Any:
 
 
 def infer_type_to_validate(default: Any) -> Any:
-    """The type of an option that is declared by its default alone; null accepts anything."""
+    """Return the type of an option that is declared by its default alone; a default of null accepts anything."""
     if default is None:
         return Any
     if isinstance(default, Mapping):
@@ -199,7 +199,7 @@ def infer_type_to_validate(default: Any) -> Any:
 
 
 def option_type_to_validate(option: Option) -> Any:
-    """What an option's values are converted to."""
+    """Return the type that an option's values are converted to."""
     return _choice_type_to_validate(option[2]) if len(option) == 3 else infer_type_to_validate(option[0])
 
 
@@ -219,7 +219,7 @@ class _UnfitValue(ConfigError):
 
 
 def validate_setting_names(values: Iterable[object], names: Iterable[str], where: str) -> None:
-    """Raises ConfigError for the first of ``values`` that is none of ``names``, with the nearest that are."""
+    """Raise ConfigError for the first of ``values`` that is not in ``names``; it suggests the nearest names."""
     known = list(names)
     for key in values:
         if key not in known:
@@ -228,12 +228,12 @@ def validate_setting_names(values: Iterable[object], names: Iterable[str], where
 
 
 def join_setting_key(where: str, name: str) -> str:
-    """The dotted key of a setting in a group, which is empty at the root."""
+    """Return the dotted key of a setting; ``where`` is its group, empty at the root."""
     return f"{where}.{name}" if where else name
 
 
 def format_setting_value(value: object) -> str:
-    """Return a value as users type it, cut where it is long; text that reads as something else is quoted."""
+    """Return a value as users type it, cut if it is long; text that would parse as another type is quoted."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if not isinstance(value, str):
@@ -251,7 +251,7 @@ def _setting_reads_as_number(value: str) -> bool:
 
 
 def describe_expected(hint: Any, where: str) -> str:
-    """What a field expects."""
+    """Return what a type accepts, for messages: ``"a whole number from 1 to 16"``; ``where`` is the setting's key."""
     plain, notes = _split_validation_type(hint)
     says = next((note.says for note in notes if isinstance(note, Accepts)), "")
     if says:
@@ -286,18 +286,18 @@ def _join_choices(values: tuple[object, ...]) -> str:
 
 @functools.cache
 def field_types(cls: type) -> Mapping[str, Any]:
-    """Field name -> annotated type, of a settings dataclass."""
+    """Return field name -> annotated type for a settings dataclass."""
     hints = get_type_hints(cls, include_extras=True)
     return {field.name: hints[field.name] for field in dataclasses.fields(cls) if field.init}
 
 
 def _split_validation_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:
-    """The type without its notes, and these."""
+    """Split an annotated type into the plain type and its annotations."""
     return (hint.__origin__, hint.__metadata__) if get_origin(hint) is Annotated else (hint, ())
 
 
 def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> Any:
-    """The value as the first of the types that it is one of."""
+    """Return the value as the first of the types that accepts it."""
     if value is None and type(None) in options:
         return None
     refused = []
@@ -306,7 +306,7 @@ def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> A
             try:
                 return validate_value(value, option, where)
             except _UnfitValue as error:
-                if error.where != where:  # inside of a group that is the right one
+                if error.where != where:  # the error is inside a group whose type is right
                     raise
                 refused.append(error.expected)
     expected = ", or ".join([*refused, *(["null"] if type(None) in options else [])])
@@ -314,7 +314,7 @@ def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> A
 
 
 def _validate_plain_value(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
-    """``value`` as a type without notes; they are for the message alone."""
+    """Return ``value`` as the plain type ``kind``; its annotations ``notes`` serve only the message."""
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
         return value
@@ -334,7 +334,7 @@ def _validate_plain_value(value: Any, kind: Any, notes: tuple[Any, ...], where: 
         if isinstance(value, list | tuple) and len(items) == len(value):
             try:
                 return origin(validate_value(v, item, where) for v, item in zip(value, items, strict=True))
-            except _UnfitValue:  # said of the whole list, below
+            except _UnfitValue:  # reported for the whole list below
                 pass
     elif (made := _validate_scalar(value, kind)) is not None:
         return made
@@ -350,7 +350,7 @@ def _validate_entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: st
 
 
 def _validate_scalar(value: Any, kind: Any) -> Any:
-    """``value`` as a ``kind``, or None where it is none."""
+    """Return ``value`` as a ``kind``, or None if it is not one."""
     truth = isinstance(value, bool)
     if kind is bool:
         return value if truth else None

@@ -1,1 +1,1 @@
-"""The built-in formats of ``neuprim export``, one per file, registered in ``pyproject.toml`` as anybody's are."""
+"""The built-in formats of ``neuprim export``, registered in ``pyproject.toml`` like those of plugins."""

@@ -3,8 +3,7 @@
 Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in
 the coordinates of the run's data (``double x y z`` where float32 would lose more than 1e-4 of the scene's size, as in
 UTM), normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit
-of the opacity,
-natural logarithm of the standard deviations, quaternion wxyz. How they are fitted: :func:`fit_gaussians`.
+of the opacity, natural logarithm of the standard deviations, quaternion wxyz. :func:`fit_gaussians` fits them.
 Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three
 equal channels; other channels than red, green and blue are refused. A model that depends on time or light is written
 under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are
@@ -40,7 +39,7 @@ from neuprim.core.task import API_VERSION
 from neuprim.export.shared import ExportHarmonics, choose_export_views, find_export_rgb_channels, fit_export_harmonics
 
 SIZES = ("moments", "footprint", "profile")
-"""What the size of a Gaussian may be fitted to."""
+"""Quantities to which the size of a Gaussian can be fitted."""
 _SIDE = 12  # points of the quadrature along an axis of the unit ball
 _CHUNK = 512
 _FACTORS = [1.06**i for i in range(-24, 25)]  # on the covariance, in steps of three percent in size
@@ -135,7 +134,7 @@ def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: Wo
 def _draw_export_images(
     job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]
 ) -> tuple[list[tuple[View, Tensor]], str]:
-    """Draw the model from the comparison views, red, green and blue, and say which views these are."""
+    """Render the model, red, green and blue, from the comparison views; also return their description."""
     run = job.run
     views, what = choose_export_views(job, which, conditions)
     background, images = _export_background(job), []
@@ -184,7 +183,7 @@ class Gaussians:
     rows: Tensor
 
     def to_scene(self, world: World) -> Gaussians:
-        """Return the same in the scene of ``world``, if these are in the world."""
+        """Return these Gaussians, given in the world of ``world``, in coordinates of its scene."""
         if world.identity:
             return self
         linear = world.scene_from_world[:3, :3]
@@ -201,12 +200,12 @@ class Gaussians:
 def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gaussians:
     """Fit one Gaussian to each primitive that absorbs anything.
 
-    By quadrature on the ellipsoid, with rho = max(0, sigma): mean and covariance are those of rho; the opacity is the
-    mean over the ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that
-    mean. That is ``size="moments"``. A 3DGS footprint is opacity x exp(-d^2/2) on the screen, never more than a bell,
-    while an opaque primitive is flat with an edge, so the covariance is scaled: with "footprint" so that both cover the
-    same area, the mean over the axes of the integral of alpha across the screen; with "profile" so that the bell is
-    closest to alpha, by least squares over the three axes' screens, among those whose opacity makes up the area.
+    Quadrature on the ellipsoid gives mean and covariance of rho = max(0, sigma). The opacity is the mean over the
+    ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that mean. This is
+    ``size="moments"``. A 3DGS footprint is a bell, opacity x exp(-d^2/2) on the screen, while an opaque primitive is
+    flat with an edge. The other sizes therefore scale the covariance. "footprint": both cover the same area, the mean
+    over the axes of the integral of alpha across the screen. "profile": the bell is closest to alpha, by least squares
+    over the three axes' screens, among bells whose opacity makes up the area.
     """
     model = run.model
     with torch.no_grad():
@@ -299,8 +298,8 @@ def draw_exported_gaussians(
 
     Projection by its local affine approximation (EWA), 0.3 square pixels of blur, alpha = min(0.99, opacity
     exp(-d^2/2)), pairs below 1/255 skipped, front to back by the depth of centres, stop before the transmittance falls
-    below 1e-4; Gaussians nearer than 0.2 are left out. Unlike there, a footprint ends where alpha is 1/255, not at the
-    tile around three standard deviations.
+    below 1e-4; Gaussians nearer than 0.2 are left out. Unlike in 3DGS, a footprint ends where alpha is 1/255, not at
+    the tile around three standard deviations.
     """
     view = camera.viewmat.double()
     W, t = view[:3, :3], gaussians.means @ view[:3, :3].T + view[:3, 3]

@@ -1,10 +1,10 @@
-"""``html``: the model as one web page that draws it, in any browser with WebGL2; lossy by the level of its numbers.
+"""``html``: the model as one web page that draws it with WebGL2; lossy unless ``level`` is 0.
 
-The page needs no network and no server. It draws every primitive over its exact silhouette with the closed form of its
-chord, in float32, front to back in the order of centres: the image of ``renderer.sort=center`` with one ray a pixel and
-``transmittance_min`` at 0. ``level`` is that of ``neuprim compress``, 1 to 5; 0 keeps every bit. The error is the PSNR
-of the page's model against the model, on the page's own views, drawn by the run's backend. Held-out views need the
-scene's data.
+The page works in any browser with WebGL2 and needs no network and no server. It draws every primitive over its exact
+silhouette with the closed form of its chord, in float32, front to back in the order of centres: the image of
+``renderer.sort=center`` with one ray a pixel and ``transmittance_min`` at 0. ``level`` is that of ``neuprim compress``,
+1 to 5; 0 keeps every bit. The error is the PSNR of the page's model against the model, on the page's own views, drawn
+by the run's backend. Held-out views need the scene's data.
 """
 
 from __future__ import annotations

@@ -5,9 +5,9 @@ end in a step, which would leave stairs), and contoured by VTK's flying edges (S
 is that of :func:`find_export_surface_level`. Pieces with less than ``keep`` of the largest piece's area are left out.
 
 A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its
-normal. Coordinates are those of the run's data; a .glb is turned from z up to glTF's y up (but data that are y up
-already), as its readers turn it back, and has what moves it far from the origin in its node, as its vertices are
-float32. A .ply has ``double x y z`` there. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them.
+normal. Coordinates are those of the run's data. A .glb is turned from z up to glTF's y up, unless the data are y up
+already; its readers turn it back. Far from the origin, a .glb has the offset in its node, as its vertices are float32,
+and a .ply has ``double x y z``. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them.
 They are what the task's display shows, or red, green and blue, or grey. Other channels are refused.
 
 The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of
@@ -134,9 +134,11 @@ def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int)
 
 
 def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
-    """Find the level at which most columns agree: their densest voxel passes it if they are more than half opaque.
+    """Find the level whose surface best matches the opaque parts.
 
-    Columns along all three axes count. If nothing is half opaque, half of the largest optical depth replaces ln 2.
+    Columns of voxels along all three axes count. A column agrees if its densest voxel passes the level exactly when it
+    is more than half opaque, an optical depth of ln 2. If nothing is half opaque, half of the largest optical depth
+    replaces ln 2.
 
     Args:
         sigma: (X, Y, Z) extinction, 1/scene unit; step: edge of a voxel, scene units.

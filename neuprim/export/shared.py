@@ -1,4 +1,4 @@
-"""What several formats need of a model: its colours as harmonics, its box, and cameras to compare images from."""
+"""Helpers of several formats: colours as harmonics, a model's box, and cameras for comparisons."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class ExportHarmonics:
         return ExportHarmonics(self.dc, rest, self.residual)
 
     def select_channels(self, channels: tuple[int, ...]) -> ExportHarmonics:
-        """Return the same with these channels only, in this order."""
+        """Return the harmonics of these channels only, in this order."""
         index = list(channels)
         return ExportHarmonics(self.dc[:, index], self.rest[:, :, index], self.residual)
 

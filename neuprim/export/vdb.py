@@ -3,8 +3,8 @@
 Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below
 ``threshold`` is not stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that
 grid's part is written. A model that was fitted to .vdb files is written on the voxels and in the units of these files,
-with no value above the source frame's largest and nothing outside its active voxels; else in the coordinates of the
-run's data on cubic voxels whose lattice has a corner of its index space in the scene's origin, one for all frames.
+with no value above the source frame's largest and nothing outside the box of its active voxels. Other models are
+written in the coordinates of the run's data, on one lattice of cubic voxels with index (0, 0, 0) at the scene's origin.
 
 Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid; ``world``:
 extinction per world unit, what a volume shader multiplies with a length; ``scene``: extinction per scene unit, sigma.
@@ -87,7 +87,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
             transform = source.grid_transform(frame.source)
         grid = sampler.sample_grid(frame.conditions, fallback if transform is None else transform)
         if placement is not None and placement.extents:
-            extents = placement.extents  # of a time between frames: around all
+            extents = placement.extents  # for a time between frames, the extent of all
             extent = GridExtent.around(extents) if frame.source is None else extents[frame.source]
             grid = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
@@ -128,9 +128,9 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
 
 
 def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> VdbGrid:
-    """Clamp a grid to an extent: no value above its largest, none outside its box; a source value of 1 is ``per_unit``.
+    """Clamp a grid to a source frame's extent: no value above its largest, none outside its box.
 
-    The extent is that of the source's frame.
+    ``per_unit`` is the value in the grid of a source value of 1.
     """
     offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
     centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
@@ -149,7 +149,7 @@ def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> 
 def _find_export_source(
     job: ExportJob,
 ) -> tuple[DensityGridSource | None, DensityGridPlacement | None, list[str]]:
-    """Find the scene's files, how the model lies in their world, and notes about it."""
+    """Return the scene's files, the placement in their world, each None if unknown, and notes."""
     notes: list[str] = []
     source = None
     try:
@@ -183,7 +183,7 @@ def _export_frame_conditions(placement: DensityGridPlacement, frame: int) -> dic
 
 
 def _export_source_frame(conditions: Conditions, placement: DensityGridPlacement | None) -> int | None:
-    """Find the frame of the source with these conditions."""
+    """Return the index of the source's frame with these conditions; None if there is none."""
     if placement is None:
         return None
     for i in range(len(placement.numbers)):
@@ -224,7 +224,7 @@ def _export_voxel_transform(
 
 
 class _VdbExportSampler(NamedTuple):
-    """Samples a model's extinction x ``factor`` on voxels; values below ``threshold`` are background."""
+    """Sampler of a model's extinction x ``factor`` on voxels; values below ``threshold`` are background."""
 
     job: ExportJob
     model: Primitives

@@ -1,4 +1,4 @@
-"""Look inside a density: volumes, isosurfaces, slices and primitives of a run, beside the ground truth."""
+"""Inspection of a density: volumes, isosurfaces, slices, primitives, next to the ground truth."""
 
 from neuprim.inspect.field import InspectionFrame, parse_inspection_box
 

@@ -173,7 +173,7 @@ def measure_absorption(active: ActivePrimitives) -> np.ndarray:
 
 
 class GivenConditions(dict[str, Tensor]):
-    """Conditions of a frame; using one that was not given is an error that asks for it."""
+    """Conditions of a frame; reading a missing one raises a ConfigError that asks for it."""
 
     def __missing__(self, name: str) -> Tensor:
         raise ConfigError(f"this needs the {name}; give {condition_flag(name)}")
@@ -270,9 +270,9 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
 
 
 def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> list[tuple[Conditions, int]]:
-    """Pair each frame to show with the nearest frame of the truth: (conditions, truth's frame), each frame once.
+    """Pair each frame with the nearest frame of the ground truth.
 
-    The conditions are those of the truth's frame.
+    Return (conditions, truth frame) once per truth frame. The conditions are those of the truth frame.
     """
     pairs: dict[int, Conditions] = {}
     for conditions in frames:

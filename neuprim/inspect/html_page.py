@@ -36,8 +36,8 @@ from neuprim.inspect.layers import (
 )
 from neuprim.inspect.views import DIFFERENCE, ISOSURFACE, SLICES, VOLUME, find_inspection_viewpoint, unit_sphere
 
-ELLIPSOIDS_LIMIT = 4000  # of a layer, the first ones
-_ALWAYS = (VOLUME, ISOSURFACE, SLICES, DIFFERENCE)  # they show grids that the page has anyway
+ELLIPSOIDS_LIMIT = 4000  # most ellipsoids per layer, the first ones
+_ALWAYS = (VOLUME, ISOSURFACE, SLICES, DIFFERENCE)  # always offered: their grids are in the page anyway
 _SIZE_LIMIT = 2**29  # bytes of a page; browsers refuse longer strings
 
 
@@ -52,7 +52,7 @@ def write_inspection_page(
     """Write a page of ``count`` frames on one grid. It opens with the first inspector and offers built-in views, too.
 
     Args:
-        name: of the run.
+        name: name of the run.
         up: the scene's upward axis, "x", "y" or "z".
 
     Raises:
@@ -106,7 +106,7 @@ def _inspection_frame_data(frame: InspectionFrame, views: Sequence[Inspector], u
 
 
 def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
-    """Encode numbers as uint8, and name the code. Roots spend most steps near 0, where thin matter is.
+    """Encode numbers as uint8; return them and the code. Roots spend most steps near 0, where matter is thin.
 
     ========  ==========================  ==================================================
     code      scales                      byte
@@ -134,7 +134,7 @@ class InspectionFrameArrays:
 
     def __init__(self) -> None:
         self.arrays: list[str] = []
-        # with the grid itself, so that its id stays its own
+        # holds the grid itself, so that its id is not reused
         self._grids: dict[tuple[int, float, float], tuple[np.ndarray, int, str]] = {}
 
     def pack_layers(self, layers: Sequence[Layer]) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""What an inspector returns: a frame as layers, which a window, a picture, a film and a page draw alike.
+"""Layers, which inspectors return for a frame; windows, pictures, films and pages draw them alike.
 
 Positions are in scene units, in the scene's axes. Arrays are numpy arrays of finite numbers. Colours are
 display-referred red, green and blue from 0 to 1. The box of the frame's grid, its title and a bar for every
@@ -154,11 +154,11 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 class _InvalidLayer(Exception):
-    """A layer that cannot be drawn; the text says which member is what, and what was expected."""
+    """A layer that cannot be drawn; the text names the member, its value, and what was expected."""
 
 
 def validate_inspection_layers(found: Any) -> str | None:
-    """Find the first thing in an inspector's result that cannot be drawn. VTK would end the process on a wrong index.
+    """Find the first invalid layer of an inspector's result; VTK ends the process on a wrong index.
 
     Returns:
         ``"returned WHAT; expected WHAT"``, or None if all layers are valid.

@@ -14,7 +14,7 @@ from neuprim.inspect.layers import Ellipsoids, Isosurfaces, Layer, Mesh, Scale, 
 
 _SURFACE_COLOURS = "plasma"  # brighter at its lower end, where the outermost surface is
 _SIGNED_COLOURS = "coolwarm"
-_MIN_OPACITY = 1.0 / 255.0  # of an ellipsoid that is drawn
+_MIN_OPACITY = 1.0 / 255.0  # least opacity of an ellipsoid that is drawn
 _MAX_ELLIPSOIDS = 20_000
 
 
@@ -89,17 +89,17 @@ DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _i
 # ---------------------------------------------------------------- viewpoints
 
 _DIRECTIONS = {"x": (-0.45, 1.0, -1.6), "y": (1.0, 0.45, 1.6), "z": (1.0, -1.6, 0.45)}
-"""From the middle to the camera, by the scene's upward axis."""
+"""Direction from the middle to the camera, by the scene's upward axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Where a view starts.
+    """Initial camera of a view.
 
     Attributes:
-        focus: (3,) what is looked at, scene units.
-        radius: of the ball around it that fills the picture, scene units.
-        direction: (3,) unit vector from there to the camera.
+        focus: (3,) point in the middle of the picture, scene units.
+        radius: radius of the ball around ``focus`` that fills the picture, scene units.
+        direction: (3,) unit vector from ``focus`` to the camera.
         up: (3,) unit vector that points upward in the picture.
     """
 
@@ -110,7 +110,7 @@ class Viewpoint:
 
 
 def find_inspection_viewpoint(inspector: Inspector, frame: InspectionFrame, up: str) -> Viewpoint:
-    """Choose where a view of a frame starts: before the whole box, or before a single primitive.
+    """Choose the initial camera of a view: it shows the whole box, or a single primitive.
 
     Args:
         up: the scene's upward axis, "x", "y" or "z".

@@ -46,7 +46,7 @@ class Window:
     """A plotter with one panel per (inspector, side). Panels of the scene share one camera.
 
     Args:
-        size: of the picture in pixels; None for 720 x 640 per panel.
+        size: size of the picture in pixels; None for 720 x 640 per panel.
     """
 
     def __init__(self, panels: Sequence[Panel], up: str, off_screen: bool, size: tuple[int, int] | None = None) -> None:
@@ -169,7 +169,7 @@ def _add_pyvista_box(plotter: Any, box: np.ndarray) -> None:
 
 
 def _add_pyvista_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
-    """Draw a scalar bar that does not depend on what is drawn. The first one is lowest."""
+    """Draw the scalar bar of ``scale``, whatever is drawn; ``place`` counts from the lowest."""
     import pyvista
 
     mapper = pyvista.DataSetMapper()
@@ -208,7 +208,7 @@ def _add_pyvista_grid(plotter: Any, layer: InspectionGrid) -> None:
 
 
 def _make_pyvista_image(layer: InspectionGrid, values: np.ndarray, around: int = 0) -> Any:
-    """Make ``pyvista.ImageData`` of values at the layer's points, with some layers of zeros around."""
+    """Make ``pyvista.ImageData`` of values at the layer's points, padded by ``around`` zeros."""
     import pyvista
 
     origin = np.asarray(layer.origin, np.float64) - around * layer.spacing
@@ -271,7 +271,7 @@ def has_display() -> bool:
 
 @cache
 def prepare_headless() -> None:
-    """Check that VTK can draw off screen here. It ends the process if a library is missing, so another one tries.
+    """Check in a subprocess that VTK can draw off screen; a missing library ends the process.
 
     Raises:
         BackendUnavailable: it cannot; names the packages to install.

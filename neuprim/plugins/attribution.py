@@ -44,7 +44,7 @@ class ReturnError(NeuprimError):
 
 @dataclass(frozen=True)
 class PluginSource:
-    """A plugin as messages name it.
+    """Name and module of a plugin, for error messages.
 
     Attributes:
         label: e.g. ``"task 'glow' of neuprim-glow 0.1"``.
@@ -64,7 +64,7 @@ def find_plugin_source(group: PluginGroup[Any], word: str, entry: str | None = N
     """Find the source of the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses, from package metadata alone.
 
     Args:
-        entry: name of the entry point, if it is not the plugin's.
+        entry: name of the entry point, if it differs from the plugin's.
     """
     package, name = split_plugin_name(word)
     info = _find_plugin_info(group, package, entry or name)
@@ -144,7 +144,7 @@ class RunPlugins:
 
     @contextmanager
     def attribute_errors(self) -> Iterator[None]:
-        """Name the plugin in errors of code that calls several of them, by their tracebacks."""
+        """Name the plugin in errors of code that calls several plugins; the traceback shows which one it is."""
         try:
             yield
         except DatasetError as error:
@@ -217,12 +217,12 @@ def call_task_metrics(
 
 
 def call_task_diagnose(task: TaskSpec, dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Return the task's own numbers of a model."""
+    """Return the task's own diagnostics of a model for ``metrics.json``: name -> JSON-ready value."""
     return _check_returned_json(task.diagnose(dataset, model), "diagnose")
 
 
 def call_task_facts(task: TaskSpec, dataset: Dataset) -> dict[str, Any]:
-    """Return what a model's header keeps of its data: the scene's "up" and "center", and what the task adds."""
+    """Return the facts about data that a model's header stores: "up" and "center", and those that the task adds."""
     own = {"up": [float(x) for x in dataset.up], "center": [float(x) for x in dataset.center]}
     return {**own, **_check_returned_json(task.facts(dataset), "facts")}
 
@@ -261,7 +261,7 @@ def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> d
 
 
 def draw_task_layer(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None:
-    """Draw a layer: (H, W, C) finite values, or None; layers of light have the ``channels`` of the model's image."""
+    """Return a layer's (H, W, C) finite values, or None; layers of light have the ``channels`` of the model's image."""
     values = spec.draw(frame)
     if values is None:
         return None

@@ -1,4 +1,4 @@
-"""Built-in losses that any task may use, as ``train.loss=NAME``; registered like anybody's."""
+"""Built-in losses that any task may use, as ``train.loss=NAME``; registered like those of any package."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class PluginVersion:
     """The package and version that one plugin of a run came from.
 
     Attributes:
-        name: of the task, scene or loss, without its package.
+        name: name of the task, scene or loss, without its package.
         package, version: the installed distribution; the version may be empty.
     """
 
@@ -58,7 +58,7 @@ class PluginVersion:
 
     @classmethod
     def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
-        """Record an installed plugin; ``name`` is its name if its entry point has another, as a scene's has."""
+        """Record an installed plugin; pass ``name`` if its entry point has another name, as for a scene."""
         version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
 
@@ -75,12 +75,12 @@ class PluginVersion:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Everything that made a run.
+    """Versions of neuprim and of the plugins that made a run.
 
     Attributes:
-        neuprim: version.
-        scene: of a scene that another package adds to the task; None for the task's own.
-        loss: of a loss chosen with ``train.loss``; None for the task's own.
+        neuprim: version of neuprim.
+        scene: plugin of a scene that another package adds to the task; None for the task's own.
+        loss: plugin of a loss chosen with ``train.loss``; None for the task's own.
     """
 
     neuprim: _Version
@@ -96,7 +96,7 @@ class Provenance:
 
     @property
     def plugins(self) -> dict[str, PluginVersion]:
-        """Kind -> plugin, without those that the run has not."""
+        """Kind (task, scene, loss) -> plugin, for those that the run has."""
         found = {"task": self.task, "scene": self.scene, "loss": self.loss}
         return {kind: plugin for kind, plugin in found.items() if plugin is not None}
 
@@ -106,11 +106,11 @@ class Provenance:
 
     @classmethod
     def from_dict(cls, value: object) -> Provenance:
-        """Read :meth:`to_dict`'s values from an untrusted file."""
+        """Validate the values of :meth:`to_dict`, which come from an untrusted file."""
         return validate_settings(cls, value, "made_by")
 
     def origins(self) -> dict[str, str]:
-        """Kind -> package and version, for people."""
+        """Return kind -> package and version as readable text."""
         return {"neuprim": self.neuprim, **{kind: plugin.origin for kind, plugin in self.plugins.items()}}
 
 
@@ -120,8 +120,8 @@ def load_recorded_plugin(
     """Load the plugin that made a run, and warn if another version of it is installed.
 
     Args:
-        file: that holds the record, for messages.
-        entry: name of the entry point, if it is not the plugin's.
+        file: file with the record, for messages.
+        entry: name of the entry point, if it differs from the plugin's.
 
     Raises:
         ConfigError: the package is not installed, or no longer has a plugin of that name.

@@ -62,10 +62,10 @@ def installed_version(package: str) -> str | None:
 
 @dataclass(frozen=True)
 class PluginInfo:
-    """What package metadata says about a plugin.
+    """Registration of a plugin, from package metadata.
 
     Attributes:
-        name: of the entry point, such as what the user types after ``task=``.
+        name: name of the entry point, such as what the user types after ``task=``.
         distribution, version: the installed package that registers it.
         target: ``module:attribute`` of its description, such as a :class:`~neuprim.core.task.TaskSpec`.
     """
@@ -88,7 +88,7 @@ class PluginInfo:
 
 @dataclass(frozen=True)
 class PluginReport(Generic[T]):
-    """A registered plugin, loaded, or the reason why it could not be."""
+    """A registered plugin with its loaded description, or with the reason why it cannot be loaded."""
 
     info: PluginInfo
     spec: T | None = None
@@ -135,7 +135,7 @@ class PluginGroup(Generic[T]):
         return self.load_with_info(word)[1]
 
     def load_with_info(self, word: str) -> tuple[PluginInfo, T]:
-        """Return who registers a plugin, and the plugin. Raises as :meth:`load`."""
+        """Return a plugin's registration and its description. Raises as :meth:`load`."""
         info, entry = self._find(word)
         return info, self._load(info, entry)
 
@@ -202,7 +202,7 @@ class PluginGroup(Generic[T]):
                     continue
                 name, version = str(dist.metadata["Name"] or ""), str(dist.metadata["Version"] or "")
                 hidden = metadata.distribution(name).locate_file("") != dist.locate_file("")
-            except Exception:  # a half-removed package must not take the others along
+            except Exception:  # a half-removed package must not hide the others
                 continue
             if hidden or canonicalize_name(name) in packages:  # a copy further down sys.path, which is not imported
                 continue
@@ -269,8 +269,8 @@ def load_task(name: str) -> TaskSpec:
 def list_scene_names(task: PluginInfo) -> list[str]:
     """List the scenes of a task without importing it.
 
-    They are the YAML files of ``conf/scene/NAME`` beside its module, and those that other packages register. Of a task
-    whose files are elsewhere only the latter are known.
+    They are the YAML files of ``conf/scene/NAME`` beside its module, and those that other packages register. If a task
+    has its files elsewhere, only the latter are listed.
     """
     added = [SCENES.typed_name(info.name) for info in SCENES.list_plugins() if info.name.startswith(f"{task.name}.")]
     try:

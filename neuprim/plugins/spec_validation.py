@@ -18,7 +18,7 @@ from neuprim.core.validation import option_type_to_validate, validate_value
 
 _NESTED: dict[str, type] = {kind.__name__: kind for kind in (SceneSpec, ConditionSpec, LayerSpec)}
 _FUNCTIONS = ("Callable", "Display", "Illuminate")
-"""How annotations of functions begin."""
+"""Prefixes of the annotations of members that are functions."""
 
 
 class _InvalidMember(Exception):

@@ -34,7 +34,7 @@ SMALL, LARGE = (360, 210), (540, 300)
 """Sizes of a chart in points. Panels are about as wide in CSS pixels, so text keeps its size."""
 
 _BUCKETS = 120
-"""A band is drawn where there are more than twice so many points: medians, and the range of each of so many groups."""
+"""Groups of a band: each is drawn as its median and range. Up to twice as many points are drawn as they are."""
 
 _FEW = 40  # points of a line up to which each is marked
 
@@ -96,7 +96,7 @@ class Chart:
     least: float = 0.0
 
     def known(self) -> list[ChartPoints]:
-        """Return what can be drawn."""
+        """Return the point sets with at least one finite point, without their other points."""
         return [finite for points in self.points if len((finite := points.finite()).x)]
 
 

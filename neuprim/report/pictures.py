@@ -25,8 +25,8 @@ _INLINE_LIMIT = 400_000
 """Bytes up to which a picture enters the page unchanged; larger ones are compressed as WebP of quality 90."""
 
 _SIDE_SHARE, MIN_SIDE = 0.25, 16  # side of a region over the shorter side of its image, and in pixels
-MAX_REGIONS = 60  # views whose regions are kept: the worst of them
-_STEPS = 8  # places along a region's side at which regions are compared
+MAX_REGIONS = 60  # largest number of views whose regions are kept: those with the worst regions
+_STEPS = 8  # candidate positions per length of a region's side
 
 
 def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> NDArray[np.uint8]:
@@ -68,7 +68,7 @@ class InlinedPicture:
 
 
 def inline_picture(source: Path | Tensor) -> InlinedPicture | None:
-    """Return a picture file, or an (H, W, 3) image, for an ``img`` element; None for a damaged file."""
+    """Return a picture file, or an (H, W, 3) image, as a ``data:`` address; None for a damaged file."""
     if isinstance(source, Tensor):
         buffer = io.BytesIO()
         Image.fromarray(images.to_uint8(source).numpy()).save(buffer, "PNG")

@@ -31,7 +31,7 @@ def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str
     """Return a whole page.
 
     Args:
-        title: of the browser's tab.
+        title: title of the browser's tab.
         sections: HTML, in their order; empty ones leave no gap.
         kind: class of the page's body; ``compared`` for pages that compare runs.
         policy: appended to the content policy.
@@ -75,7 +75,7 @@ def masthead(eyebrow: str, title: str, badge: str = "", more: str = "") -> str:
 
 
 def report_banner(notes: Iterable[str]) -> str:
-    """Return notes, HTML, on what is not as it should be."""
+    """Return a banner with warnings; takes HTML."""
     return "".join(f'<p class="banner" role="status">{text}</p>' for text in notes)
 
 

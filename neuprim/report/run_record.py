@@ -1,4 +1,4 @@
-"""What pages read of a run's directory: its numbers, its curve and its pictures, whether or not the run has ended."""
+"""Read a run directory for report pages: its numbers, curve and pictures, whether or not the run has ended."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neuprim.core.metrics import metric_from_json
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """The pictures of one held-out view: its place in the split, its name as file names spell it, and their paths."""
+    """The pictures of one held-out view: its index in the split, its name as in file names, and their paths."""
 
     index: int
     stem: str
@@ -27,11 +27,11 @@ class ViewFiles:
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """A run directory's content.
+    """Content of a run directory that report pages show.
 
     Attributes:
-        metrics: of ``metrics.json``; empty while the run has not finished.
-        log: of ``metrics.jsonl``, without lines that a kill cut short.
+        metrics: content of ``metrics.json``; empty while the run has not finished.
+        log: lines of ``metrics.jsonl``, without those that a kill cut short.
         views, clips: pictures and films in ``renders/``.
     """
 
@@ -43,7 +43,7 @@ class ReportedRun:
 
     @property
     def shown(self) -> str:
-        """What pictures show of the channels, in words; empty where they are red, green and blue, or grey."""
+        """Text that says which channels pictures show; empty if they are red, green and blue, or grey."""
         return str(self.metrics.get("shown") or "")
 
     @property
@@ -53,12 +53,12 @@ class ReportedRun:
         return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
     def numbers_of(self, view: ViewFiles) -> Mapping[str, Any]:
-        """Metrics of the view that pictures show; empty where there are none."""
+        """Return the metrics of a pictured view; empty if there are none."""
         entries = self.view_numbers
         return entries[view.index] if view.index < len(entries) else {}
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
-        """Values of two keys over the log lines that have finite numbers for both."""
+        """Return the values of two keys, from the log lines that have finite numbers for both."""
         pairs = [(as_reported_number(line.get(x)), as_reported_number(line.get(y))) for line in self.log]
         known = [(a, b) for a, b in pairs if a is not None and b is not None]
         return [a for a, _ in known], [b for _, b in known]
@@ -111,7 +111,7 @@ def _parse_reported_line(text: str) -> Mapping[str, Any] | None:
 
 
 def _find_reported_views(folder: Path) -> list[ViewFiles]:
-    """The error map of a view is written last; so all three of its pictures are there."""
+    """Return the views with pictures. A view's error map is written last, so its other pictures exist, too."""
     views = []
     for error in folder.glob("test_*_error.png"):
         name = error.stem.removesuffix("_error")

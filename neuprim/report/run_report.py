@@ -61,7 +61,7 @@ def write_report(
         conditions: those of the run's task; the commands that the page offers animate them.
         viewer: becomes a part of the page, or ``viewer.html`` beside it where both exceed :data:`VIEWER_LIMIT`.
         regions: the worst regions with their pictures, the worst first.
-        command: that made the run; "" where no single command did.
+        command: command that made the run; "" where no single command did.
 
     Raises:
         DataError: ``metrics.json`` is damaged.
@@ -96,7 +96,7 @@ def write_report(
 
 
 def _embed_viewer(viewer: Viewer) -> tuple[str, str]:
-    """Return the interactive model as HTML, and what the page's content policy allows it."""
+    """Return the interactive model as HTML, and the sources that the page's content policy must allow for it."""
     frame = f'<iframe title="Interactive model" loading="lazy" srcdoc="{escape(viewer.text)}"></iframe>'
     use = "Drag to turn, scroll to zoom, Shift and drag to move."
     return f"<figure>{frame}<figcaption>{use}</figcaption></figure>", f" 'nonce-{viewer.nonce}'; worker-src blob:"

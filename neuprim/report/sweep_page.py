@@ -21,7 +21,7 @@ _LESS = (
     *("lpips", "flip", "model_bytes", "primitives", "parameters", "train_seconds"),
     *("sigma_relative", "sigma_max_error"),
 )
-"""Beginnings of the names of metrics of which more is better, or less. Of any other the page does not say."""
+"""Prefixes of the names of metrics of which a higher, or a lower, value is better. Others are not ranked."""
 
 _FIRST = (
     *("psnr", "ssim", "psnr_worst", "psnr_mask", "lpips"),
@@ -32,7 +32,7 @@ _FIRST = (
 _TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "model_bytes": "model file", "train_seconds": "training"}
 
 _NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
-"""Beginnings of names of numbers that say something of the data or the request."""
+"""Prefixes of the names of numbers that describe the data or the request instead of the result."""
 
 _MOST_PICTURES, _MOST_VIEWS = 8, 3  # runs whose pictures are shown, and held-out views of each
 
@@ -42,11 +42,11 @@ class SweepPageRun:
     """One run of a sweep.
 
     Attributes:
-        name: of its folder in the sweep's.
-        swept: key -> value, as typed, of the words that differ between runs.
+        name: name of its folder in the sweep's.
+        swept: key -> value, as typed, of the settings that differ between runs.
         state, line: how it ended, and why it failed.
-        seconds, attempts: from its start to its end; how often it was started.
-        run: what its directory holds.
+        seconds, attempts: time from its start to its end; number of starts.
+        run: content of its directory.
     """
 
     name: str
@@ -59,14 +59,14 @@ class SweepPageRun:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Metric -> value of the single numbers of ``metrics.json``; none of a run that has not finished."""
+        """Metric -> value, for the entries of ``metrics.json`` that are one number; empty for an unfinished run."""
         metrics = self.run.metrics
         found = {name: metric_from_json(metrics, name) for name in metrics if not name.endswith("_infinite")}
         return {name: value for name, value in found.items() if value is not None}
 
 
 def better_sign(name: str) -> int:
-    """Return 1 where more of a metric is better, -1 where less is; 0 where that is not known."""
+    """Return 1 if a higher value of a metric is better, -1 if a lower one is; 0 if that is not known."""
     if name == "parameters_per_primitive":
         return 0
     signs = {**dict.fromkeys(_MORE, 1), **dict.fromkeys(_LESS, -1)}
@@ -76,10 +76,10 @@ def better_sign(name: str) -> int:
 def write_sweep_page(folder: Path, runs: Sequence[SweepPageRun], words: Sequence[str]) -> Path:
     """Write ``sweep.html`` into a sweep's directory, finished or not, and return its path.
 
-    The page needs nothing else; without scripts it stands in the order of the mean PSNR.
+    The page needs no other files; without scripts its runs are in the order of the mean PSNR.
 
     Args:
-        words: what the sweep was asked for, after ``neuprim run -m``.
+        words: overrides of the sweep, as after ``neuprim run -m``.
     """
     colours = dict(zip((run.name for run in runs), _run_colours(len(runs)), strict=True))
     runs = sorted(runs, key=lambda run: -run.numbers.get("psnr", -math.inf))

@@ -87,7 +87,7 @@ class _TradeoffPage:
         return elements.masthead(eyebrow, title, badge, more)
 
     def fronts(self) -> list[Chart]:
-        """Return PSNR against time and against bytes; of a finished run the latter of smaller points alone."""
+        """Return charts of PSNR against time and bytes; for a finished run the latter has only smaller points."""
         bytes_of = [float(point["bytes"]) for point in self.points]
         sized = [i for i, size in enumerate(bytes_of) if self.trained or i == 0 or size < bytes_of[0]]
         dots = [Dot(bytes_of[i], self.quality(i), 0.0, self._mark("size", i), i == 0) for i in sized]

@@ -1,4 +1,4 @@
-"""Evaluate a trained model: metrics, pictures, films and the report, from the tensors on disk."""
+"""Evaluate a trained model: write its metrics, pictures, films and report."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _ORBIT_FRAMES = 36
 def evaluate_fitted(fitted: Fitted, directory: Path, command: str = "") -> dict[str, Any]:
     """Write ``metrics.json``, ``renders/`` and the report of a model saved in ``directory``; returns the metrics.
 
-    ``command`` made the run, for the report; "" where no single command did.
+    The report shows ``command``, the command line that made the run; "" if there is no single one.
     """
     task, dataset, model, settings = fitted.task, fitted.dataset, fitted.model, fitted.config.renderer
     display = fitted.channels.display
@@ -77,7 +77,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path, command: str = "") -> dict[
 
     views = measure_views(model, task, dataset, settings, fitted.lpips, add_view)
     for clip in clips:
-        if clip.source is not None:  # the frames of others are test views, written above
+        if clip.source is not None:  # frames of the other clips are test views, which are written above
             for i in clip.views:
                 rendered = render_image(model, clip.source.view(i), settings, dataset.background)
                 add_frame(clip, i, rendered, clip.source.pixels(i).over(dataset.background))

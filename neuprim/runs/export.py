@@ -52,7 +52,7 @@ def export_run(
     try:
         exporter = EXPORTERS.load(name)
     except UnknownPlugin:
-        load_run(run)  # that the run's own package is gone says more
+        load_run(run)  # a missing package of the run itself is the more helpful error
         raise
     source = find_plugin_source(EXPORTERS, name)
     final = _run_export_destination(run_dir, exporter, out)
@@ -71,7 +71,7 @@ def export_run(
 
 
 def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None) -> Path:
-    """What the user named, or the exporter's own name for it in the run."""
+    """Return the path to write: ``out``, or ``export/`` in the run directory with the exporter's own name."""
     if out is None:
         return run_dir / "export" / (exporter.default or exporter.name + "".join(exporter.suffixes[:1]))
     fits = any(out.name.lower().endswith(suffix) and len(out.name) > len(suffix) for suffix in exporter.suffixes)
@@ -81,7 +81,7 @@ def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None)
 
 
 def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) -> tuple[Path, ...]:
-    """Where the files of a report will be. Raises PluginError for a wrong report."""
+    """Return the final paths of the files in a report. Raises PluginError for a wrong report."""
     if not isinstance(report, ExportReport):
         raise PluginError(f"{exporter}: write returned {type(report).__name__}; expected an ExportReport")
     files = []
@@ -101,7 +101,7 @@ def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) ->
 def _parse_run_export_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Options of the exporter and texts of conditions."""
+    """Return the exporter's options, with defaults, and the texts of conditions."""
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_conditions(words, specs)
     if conditions and not exporter.conditions:
@@ -123,7 +123,7 @@ def _parse_run_export_options(
 
 
 def _parse_run_export_option(text: str) -> Any:
-    """A number, true, false, null, or the text; unlike YAML's, 1e-3 is a number and 1:40 is text."""
+    """Parse a number, true, false, null, or text. Unlike in YAML, 1e-3 is a number and 1:40 is text."""
     words = {"true": True, "false": False, "null": None, "": None}
     if text in words:
         return words[text]
@@ -171,7 +171,7 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
 
 
 def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
-    """Write a stored model as a run directory and load it once, so that nothing unsound gets the name ``out``."""
+    """Write a stored model as the run directory ``out``. It is loaded once before, so that ``out`` is always valid."""
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
 
@@ -182,7 +182,7 @@ def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
 
 
 def _write_imported_run(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
-    """A run directory with this text of ``config.yaml`` and the model that ``write`` puts there."""
+    """Create and validate a run directory from the text of ``config.yaml`` and a function that writes the model."""
     out.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:
@@ -191,7 +191,7 @@ def _write_imported_run(path: Path, out: Path, config: str, write: Callable[[Pat
         try:
             write(folder)
             load_run(folder, named=False)
-        except (NeuprimError, ValueError, TypeError) as error:  # of a file that is not yet there under this name
+        except (NeuprimError, ValueError, TypeError) as error:  # the message would name the temporary folder
             raise DataError(f"{path}: {str(error).replace(str(folder), 'its model')}") from error
         if out.exists():
             out.rmdir()

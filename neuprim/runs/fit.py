@@ -1,6 +1,6 @@
-"""Fit in memory: data, model and training of a configuration, without a directory.
+"""Train in memory: load the data of a configuration, create its model and train it, without a run directory.
 
-While it works, a run sends events to a listener: a function of one event that is called from the thread that trains.
+A training reports its progress as events. It calls a listener, a function of one event, on the training thread.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from neuprim.runs.measure import measure_views, render_image, summarize_run_metr
 from neuprim.runs.open import load_dataset
 
 _CURVE_VIEWS = 5
-"""Held-out views of the curve."""
+"""Number of held-out views that a point of the held-out curve averages."""
 
 _CURVE_PSNR_MAX = 200.0
-"""dB; equal images have an infinite PSNR, which a line of JSON cannot hold."""
+"""Upper bound of a view's PSNR in the curve, dB: equal images have an infinite PSNR, which JSON cannot represent."""
 
 _TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM = 10_000, 20, 2.0, 3
-"""The training that measures the pace: so many primitives, as far as the data offer points for them, at most so many
-steps and seconds, and steps before the clock starts."""
+"""Trial training that measures the time per step: number of primitives (fewer if the data offer fewer starting points),
+largest number of timed steps, largest time in seconds, and warm-up steps before the clock starts."""
 
 
 __all__ = ["Evaluated", "Finishing", "Fitted", "Note", "Preparing", "Step", "fit"]
@@ -100,7 +100,7 @@ def ignore_run_event(event: Event) -> None:
 
 
 TrainerFactory = Callable[[Job, Dataset, Loss], Trainer]
-"""(job, its data, its loss) -> the trainer of a model that is there already."""
+"""Function (job, its data set, its loss) -> trainer of an existing model."""
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ class Fitted(Job):
         return {"iterations": self.trainer.step, "train_seconds": self.trainer.elapsed}
 
     def unlock_bands(self) -> None:
-        """Set the fields to the end of the budget, with all bands of spherical harmonics in use."""
+        """Set the fields' progress to the end of the budget, where they use all bands of spherical harmonics."""
         for field in (self.model.density, self.model.colour):
             field.set_progress(1.0)
 
@@ -152,7 +152,7 @@ def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset |
 
 
 def train_to_end(fitted: Fitted, events: Events = ignore_run_event) -> Fitted:
-    """Train to the end of the budget; returns what was passed."""
+    """Train to the end of the budget; return ``fitted``."""
     compile_run_kernels(fitted.trainer, events)
     with use_one_torch_thread_for_run():
         for _ in train_run_steps(fitted.trainer, events):
@@ -169,7 +169,7 @@ def prepare_training(
     make: TrainerFactory | None = None,
     group: ProcessGroup | None = None,
 ) -> Fitted:
-    """Do everything up to the first step. Raises as :func:`fit`.
+    """Load the data and create loss, model and trainer, up to the first step. Raises the errors of :func:`fit`.
 
     Args:
         hold_out: n > 1: every n-th training view replaces the test views; 0: the data are taken as they are.
@@ -182,7 +182,7 @@ def prepare_training(
     task = Job.of(config).task
     config = replace(config, made_by=current_config_provenance(config, task))
     job = Job(config, task)
-    # what the loss or the task refuses must not cost the loading of the data or a training
+    # errors of the loss come before the data are loaded, errors of the task before the training
     loss = make_run_loss(job)
     lpips = None if config.metrics.lpips is None else Lpips.load(config.metrics.lpips)
     if dataset is None:
@@ -215,9 +215,9 @@ def prepare_training(
 
 
 def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iterator[tuple[StepReport, float | None]]:
-    """Step until the budget is used; yields each step's report, and the held-out PSNR where the curve gets a point.
+    """Train until the budget is used; yield each step's report, with the held-out PSNR at points of the curve.
 
-    Between two steps the state may be saved or the loop left.
+    Between two steps the caller may save the state or leave the loop.
     """
     next_point = _next_run_curve_progress(trainer)
     for report in trainer.run():
@@ -238,13 +238,13 @@ def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iter
 
 
 def _next_run_curve_progress(trainer: Trainer) -> float:
-    """The progress at which the curve gets its next point."""
+    """Return the progress, 0..1, at the next point of the held-out curve; infinity if ``eval_every`` is 0."""
     every = trainer.settings.eval_every
     return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
 
 
 def measure_run_curve_point(trainer: Trainer) -> float:
-    """Mean PSNR of a few held-out views, at most 200 dB; does not touch the training state."""
+    """Return the mean PSNR of a few held-out views, each at most 200 dB; the training state does not change."""
     views, background = trainer.dataset.test, trainer.dataset.background
     chosen = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
     total = 0.0
@@ -264,7 +264,7 @@ def make_run_loss(job: Job) -> Loss:
 
     Raises:
         ConfigError: no such loss, or an option that it refuses.
-        PluginError: it is another package's and cannot be made.
+        PluginError: the loss of another package cannot be made.
     """
     config, task = job.config, job.task
     chosen = None if config.train.loss is None else LOSSES.load(config.train.loss)
@@ -275,7 +275,7 @@ def make_run_loss(job: Job) -> Loss:
 
 
 def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup | None = None) -> Trainer:
-    """Make a fresh model of a job and its trainer.
+    """Make an untrained model for a job, and return its trainer.
 
     Args:
         group: the ranks that train the model together; None for one process.
@@ -286,7 +286,7 @@ def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup
         PluginError: the task of another package does not build what the data set needs.
     """
     config, task = job.config, job.task
-    if config.train.supervision == "images":  # the model has nothing that only points could teach
+    if config.train.supervision == "images":  # no parameters that only points could train
         dataset = replace(dataset, points=None)
     source = job.plugins.task
     with attribute_errors(source, "build"):
@@ -315,12 +315,12 @@ def drop_unused_run_rates(train: TrainSettings, task: TaskSpec, model: Primitive
 
 
 def _starting_count_of_run(config: RunConfig) -> int:
-    """Primitives at the start of a training."""
+    """Return the number of primitives at the start of the training."""
     return max(round(config.train.population.grow_from * config.model.count), 1)
 
 
 def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> int:
-    """The number of ``model.primitives=auto`` for ``train.max_seconds``, from the pace of a trial training."""
+    """Return the number of primitives that a trial's pace allows in ``train.max_seconds`` (model.primitives=auto)."""
     config = job.config
     whole = replace(config.train, population=replace(config.train.population, grow_from=1.0))
     trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES), train=whole)
@@ -354,7 +354,7 @@ def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> 
 
 @contextmanager
 def use_one_torch_thread_for_run() -> Iterator[None]:
-    """Between kernels torch has only small tensors; its own thread pool would spin on the cores the kernels need."""
+    """Limit PyTorch to one thread: its tensors are small, and its pool would spin on the cores the kernels need."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -364,11 +364,11 @@ def use_one_torch_thread_for_run() -> Iterator[None]:
 
 
 def is_chunked(config: RunConfig) -> bool:
-    """Whether a scene is to be fitted in chunks; scenes without chunks may use the setting for something else."""
+    """Return whether the scene is fitted in chunks. Other scenes may use the setting ``chunks`` for something else."""
     return config.scene.get("chunks") not in (None, 1) and Job.of(config).scene.spec.chunks is not None
 
 
 def refuse_chunks(config: RunConfig, reason: str) -> None:
-    """Raise ConfigError where something that trains one model at once is asked to do it in chunks."""
+    """Raise ConfigError if the scene is to be fitted in chunks; ``reason`` says why the caller cannot do that."""
     if is_chunked(config):
         raise ConfigError(f"scene.chunks={config.scene['chunks']}: {reason}; expected scene.chunks=null")

@@ -1,4 +1,4 @@
-"""Ground truth that a scene renders frame by frame, made by a launcher's workers before runs need it."""
+"""Render the ground truth of scenes frame by frame in a launcher's workers, before runs need it."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _MOST_FRAMES = 16
 """Frames that a worker takes at a time."""
 
 _loaded: dict[str, DatasetImages] = {}
-"""Of this process's last job: all jobs of a launch have one scene."""
+"""Ground truth of this process's last job, by scene key: all jobs of a launch have one scene."""
 
 
 def load_run_ground_truth(
     config: RunConfig, progress: Progress = ignore_progress, known: Mapping[str, Any] | None = None
 ) -> DatasetImages | None:
-    """The ground truth of a configuration's scene; None of a scene whose images are not rendered frame by frame.
+    """Return the ground truth of a configuration's scene; None if its images are not rendered frame by frame.
 
     Raises:
         NeuprimError: files or settings that the scene refuses, or its loader crashed.
@@ -46,14 +46,14 @@ def load_run_ground_truth(
 def launch_ground_truth_jobs(
     config: RunConfig, settings: LauncherSettings, events: Events = ignore_run_event
 ) -> DatasetImages | None:
-    """Have what is missing of the ground truth made where the launcher says; None of a scene that renders none.
+    """Render the missing frames of the ground truth with a launcher; return it, None for a scene that renders none.
 
-    Frames that are there are not made again, and each is kept as it is done. The first frame that cannot be made ends
-    the rest, as no run can do without it. The launcher's files lie beside the run's directory while it works.
+    Existing frames are not rendered again, and each new one is stored at once. The first frame that fails stops the
+    others, as no run can do without it. The launcher's temporary files are in the run directory's parent.
 
     Raises:
         KeyboardInterrupt: Ctrl-C came.
-        NeuprimError: what the launcher or the scene refuses, or a frame that cannot be made.
+        NeuprimError: the launcher or the scene refuses its settings, or a frame cannot be rendered.
         RuntimeError: a bug in a worker, with its traceback.
     """
     truth = load_run_ground_truth(config, lambda text, fraction: events(Preparing(text, fraction)))
@@ -68,13 +68,13 @@ def launch_ground_truth_jobs(
 
 
 def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: LauncherSettings, on_status: OnStatus) -> None:
-    """The ground truth of runs that are to be launched, once for all that share it; ``launcher=inline`` leaves that to
-    the runs.
+    """Render the ground truth of runs before they are launched, once per scene. With ``launcher=inline`` the runs do it
+    themselves.
 
-    What cannot be made is left to the run that needs it, which says why, and holds up no other.
+    Errors are ignored here: the run that needs the ground truth reports them, and other runs go on.
 
     Args:
-        on_status: called with (place of each run that waits, its status).
+        on_status: called with (index of each run that waits, its status).
     """
     if settings.name == "inline":
         return
@@ -95,8 +95,8 @@ def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: Launcher
 
 
 def render_ground_truth_before_run(config: RunConfig, settings: LauncherSettings, progress: Progress) -> None:
-    """The ground truth of trainings in this process, as :func:`render_ground_truth_of_runs`; raises as
-    :func:`launch_ground_truth_jobs`."""
+    """Render the ground truth of a training in this process with a launcher, unless that is ``inline``. Raises the
+    errors of :func:`launch_ground_truth_jobs`."""
 
     def tell(event: Event) -> None:
         if isinstance(event, Preparing):
@@ -107,8 +107,8 @@ def render_ground_truth_before_run(config: RunConfig, settings: LauncherSettings
 
 
 def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
-    """Frames for one job after the other: several at first, and one by one in the end, so that nobody waits long for a
-    slow worker (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
+    """Yield the frames of one job after the other: several at first, single ones at the end, so that a slow worker
+    delays the end little (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
     left = list(missing)
     while left:
         count = min(max(len(left) // (4 * workers), 1), _MOST_FRAMES)
@@ -117,7 +117,7 @@ def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[lis
 
 
 def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> int:
-    """The function of a job; returns how many of its frames are there then."""
+    """Render the frames of a job in its worker; return their number."""
     config = RunConfig.from_dict(data["config"])
     key = _run_scene_key(config)
     if key not in _loaded:
@@ -141,7 +141,7 @@ def _launch_ground_truth_frames(
     config: RunConfig, truth: DatasetImages, missing: Sequence[int], settings: LauncherSettings, events: Events
 ) -> None:
     parts = list(split_frames_into_jobs(missing, count_parallel_jobs(settings, len(missing))[0]))
-    outputs = config.output_dir.parent.absolute()  # which every machine sees
+    outputs = config.output_dir.parent.absolute()  # a folder that every machine can access
     new, folder = not outputs.exists(), outputs / f"truth-{uuid.uuid4().hex[:8]}"
     common = {"config": config.to_dict(), "known": dict(truth.known), "key": truth.key}
     call, names = f"{__name__}:{render_frames_job.__name__}", [truth.frames[part[0]] for part in parts]

@@ -41,15 +41,15 @@ __all__ = ["InspectRequest", "inspect_run"]
 
 FILMS = (".webp", ".gif", ".mp4")
 OUTPUTS = (".png", *FILMS, ".html", ".vdb")
-"""What ``--out`` may end in."""
+"""Suffixes that ``--out`` accepts."""
 
 _SCALE_POINTS = 48  # points along the box's longest side on which the scale of all frames is found
-_DEPTH = 6.0  # optical depth that a volume is shown with where it is deepest
+_DEPTH = 6.0  # largest optical depth of a volume as it is shown
 
 
 @dataclass(frozen=True)
 class InspectRequest:
-    """What to show of a run's density, as the arguments of ``neuprim inspect``.
+    """Request for :func:`inspect_run`, with the arguments of ``neuprim inspect``.
 
     Attributes:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
@@ -120,7 +120,7 @@ def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> l
 
 
 def _load_run_inspector(name: str) -> Inspector:
-    """Load an inspector under the name that the user gave it, with errors attributed and layers checked."""
+    """Load an inspector by name; for a plugin, errors name its package and its layers are checked."""
     inspector, source = INSPECTORS.load(name), find_plugin_source(INSPECTORS, name)
     if source.built_in:
         return inspector
@@ -217,7 +217,7 @@ class _RunFrames:
         return numbers
 
     def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
-        """Return the largest extinction shown, the factor on opacities of volumes, and the middle of the matter."""
+        """Return the largest extinction shown, the factor on opacities of volumes, and the extinction's centroid."""
         matrix, shape = box_lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
@@ -259,7 +259,7 @@ class _RunFrames:
 
 
 def _round_scale_of_run_frames(value: float) -> float:
-    """Return the next number of two digits, for the end of a scale; 1 for 0."""
+    """Round up to two significant digits, for the end of a scale; 1 for 0."""
     if not value > 0:
         return 1.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)

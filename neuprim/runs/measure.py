@@ -2,9 +2,10 @@
 
 PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set of
 red, green and blue also gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``); a task with a display
-of its own gets both of that display (``psnr_display``, ``ssim_display``). Where the task masks a part of a view, the
-error there is also given alone, as a black background flatters. ``ssim_3dgs`` is the SSIM of the displayed image by the
-rule of the tools of 3D Gaussian splatting; ``lpips`` and ``lpips_3dgs`` are LPIPS as published and by that rule.
+of its own gets both of that display (``psnr_display``, ``ssim_display``). If the task masks a part of a view, the error
+inside the mask is also reported alone, because a black background improves the mean. ``ssim_3dgs`` is the SSIM of the
+displayed image by the rule of 3D Gaussian splatting; ``lpips`` and ``lpips_3dgs`` are LPIPS as published and by that
+rule.
 """
 
 from __future__ import annotations
@@ -44,7 +45,8 @@ from neuprim.version import __version__
 __all__ = ["ViewMetrics", "evaluate_run", "measure_views", "render_image"]
 
 _VISIBLE_PSNR = 20 * math.log10(255)
-"""dB: errors below one of 255 levels are not visible, and the black image of an empty frame has no error at all."""
+"""PSNR of an error of one level of 255, dB: smaller errors are invisible. The bound matters for empty frames, whose
+black image has no error."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +114,7 @@ def measure_views(
     """Return the metrics of every view of the test split, composited over the data set's background.
 
     Args:
-        lpips: LPIPS to measure, too.
+        lpips: LPIPS network, if LPIPS is measured, too.
         on_view: function that is called with (index, view, rendered, truth), for example to write pictures.
         render_view: function (model, view, background) -> image, instead of :func:`render_image`.
     """
@@ -137,7 +139,7 @@ def measure_views(
 def _measure_view(
     rendered: Tensor, seconds: float, task: TaskSpec, dataset: Dataset, index: int, lpips: Lpips | None
 ) -> tuple[ViewMetrics, Tensor, Tensor]:
-    """Measure one view of the test split; returns its render, with the truth where a mask hides it, and its truth."""
+    """Return metrics, rendering and ground truth of a test view; outside of its mask the rendering is the truth."""
     view, pixels, background = dataset.test.view(index), dataset.test.pixels(index), dataset.background
     channels = find_channels(task, dataset)
     check_pixels("test", view, pixels, dataset.channels)
@@ -158,7 +160,7 @@ def _measure_view(
 def measure_quality(
     model: Primitives, task: TaskSpec, dataset: Dataset, settings: RenderSettings
 ) -> tuple[float, float]:
-    """Mean PSNR and SSIM of the held-out views, as ``metrics.json`` has them, rendered on the fastest device."""
+    """Return the mean PSNR and SSIM of the held-out views, as in ``metrics.json``, on the device that renders them."""
     views = measure_views(move_to_render_device(model, settings, dataset.test.view(0)), task, dataset, settings)
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
@@ -188,7 +190,7 @@ def _mask_metrics(rendered: Tensor, truth: Tensor, dataset: Dataset, mask: Tenso
 
 
 def _table_metrics(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips | None) -> dict[str, float]:
-    """The displayed image by the rules of other people's tables."""
+    """Return SSIM and LPIPS of the displayed image by the conventions of published tables."""
     a, b = (channels.display(x).clamp(0.0, 1.0) for x in (rendered, truth))
     found = {"ssim_3dgs": ssim_3dgs(a, b)}
     if lpips is not None and min(a.shape[:2]) >= lpips.least:
@@ -232,11 +234,11 @@ def summarize_run_metrics(
     lpips: Lpips | None = None,
     split: str = "test",
 ) -> dict[str, Any]:
-    """The content of ``metrics.json``.
+    """Return the content of ``metrics.json``.
 
     Args:
         training: iterations and train_seconds as the run recorded them.
-        split: which views are measured; only the data set's own test views make the task's films.
+        split: the measured views; only "test", the data set's own, has means per frame of the task's clips.
     """
     config, task, channels = job.config, job.task, find_channels(job.task, dataset)
     worst, first = min(views, key=lambda v: v.psnr), dataset.test.view(0)
@@ -296,7 +298,7 @@ def _run_view_metrics_entry(view: ViewMetrics) -> dict[str, Any]:
 
 
 def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
-    """Which network measured LPIPS, or why none did: a missing number is not a zero."""
+    """Return which network measured LPIPS, or why none did."""
     if lpips is None:
         why = "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"
         return {"lpips": None, "not_measured": {"lpips": why}}
@@ -307,7 +309,7 @@ def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dic
 
 
 def _run_frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Means over the clips of the test views of each of their frames, if all clips have one length."""
+    """Return the metrics of each frame, averaged over the test views' clips, if all clips have the same length."""
     own = [[views[i] for i in clip.views] for clip in clips if clip.source is None]
     if not own or len({len(clip) for clip in own}) != 1:
         return {}

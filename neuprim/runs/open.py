@@ -42,13 +42,13 @@ from neuprim.plugins.registry import PluginError
 __all__ = ["StoredRun", "load_dataset", "load_run", "open_run", "read_metrics"]
 
 COMPRESSED = "model.neuprim"
-"""A run's model in few bits, as ``neuprim compress`` writes it."""
+"""File name of a run's compressed model, as ``neuprim compress`` writes it."""
 
 PRUNED = "pruned.json"
-"""In the directory of a pruned model: how it was pruned."""
+"""File in the run directory of a pruned model: how it was pruned."""
 
 LOCK_FILE = ".lock"
-"""In the directory while it is locked; it names the process."""
+"""File in a run directory while it is locked; it names the process that holds the lock."""
 
 _RESULT_FILES = ("metrics.json", "report.html", "viewer.html")
 _RESULT_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst_\d{3,}\.png|preview\.png")
@@ -76,7 +76,7 @@ class StoredRun(Job):
 
 
 def model_file(run_dir: Path) -> Path:
-    """The model of a run directory: ``model.safetensors``, or the compressed one where that is the only one."""
+    """Return the path of a run's model: ``model.safetensors``, or the compressed file if it is the only one."""
     full, compressed = run_dir / "model.safetensors", run_dir / COMPRESSED
     return compressed if compressed.exists() and not full.exists() else full
 
@@ -114,10 +114,10 @@ def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
 
 
 def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContext:
-    """What a run's scene is loaded with.
+    """Return the context of a run's scene loader: seed, cache directory and progress function.
 
     Raises:
-        ConfigError: a stored configuration has the scene contact an address, or write outside of the run
+        ConfigError: a stored configuration makes the scene contact an address, or write outside of the run
         (:mod:`neuprim.config.stored_run`).
     """
     refuse_untrusted_settings(config)
@@ -170,7 +170,7 @@ def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> Tra
 
 
 def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
-    """The model on the device where views like this one are best drawn."""
+    """Return the model on the device on which views like this one are rendered."""
     return model.to(best_render_backend_device(model, settings, view.camera, view.conditions))
 
 
@@ -193,7 +193,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
 
 
 def kept_shares(model: Primitives) -> dict[str, float]:
-    """Group of prunable units -> share of its numbers that pruning kept, 0 to 1, as ``density.neuron 0``."""
+    """Return group of prunable units (e.g. ``density.neuron 0``) -> share of its parameters that pruning kept, 0..1."""
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
     for name, unit in prunable_units_of_model(model.density, model.colour).items():
@@ -208,18 +208,18 @@ def kept_shares(model: Primitives) -> dict[str, float]:
 
 @contextmanager
 def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
-    """Lock a directory, so that one process at a time works in it. It is made if it is missing, and removed again if it
-    is left empty.
+    """Lock a directory for one process at a time. A missing directory is created, and removed again if it stays
+    empty.
 
     The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``), which ends with its process. On
     shared folders it works between machines where their file system has such locks: NFS from version 4 on, CephFS,
     GPFS, Lustre mounted with ``flock``.
 
     Args:
-        what: is in the directory, for the message.
+        what: noun for the directory's content in the error message.
 
     Raises:
-        ConfigError: another process, or another thread, holds it.
+        ConfigError: another process, or another thread, holds the lock.
         OSError: the directory cannot be made or written.
     """
     new = not directory.exists()
@@ -241,7 +241,7 @@ def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
         yield
     finally:
         with suppress(OSError):
-            # while it is locked: a process that opened it meanwhile sees that it is gone and makes a new one
+            # before the release: a process that opened the file meanwhile sees that it is gone and makes a new one
             file.unlink()
         lock.release()
         with suppress(OSError):  # not empty
@@ -275,7 +275,7 @@ def discard_results(run_dir: Path) -> None:
 
 
 def refuse_run_results(run_dir: Path, targets: Iterable[Path]) -> None:
-    """Raise ConfigError if a command would write over one of them."""
+    """Raise ConfigError if a command that writes ``targets`` would replace one of the run's results."""
     own = {path.resolve() for path in result_files(run_dir)}
     for target in targets:
         if target.resolve() in own:

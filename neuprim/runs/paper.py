@@ -1,4 +1,4 @@
-"""The paper's tables, and the runs that stand for their rows: ``neuprim bench paper``.
+"""The paper's tables, and the runs that reproduce their rows, for ``neuprim bench paper``.
 
 Runs are compared by ``psnr``, ``ssim_3dgs`` and ``lpips_3dgs``, the rules by which such tables are made. Numbers of a
 run are those of its last checkpoint; the paper's are the best of a run on the test views.
@@ -24,7 +24,7 @@ _OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run that stands for a row of a table in one scene; both as in :func:`load_paper_run_tables`."""
+    """A run that reproduces a table's row in one scene; table and row are from :func:`load_paper_run_tables`."""
 
     table: Mapping[str, Any]
     row: Mapping[str, Any]
@@ -33,7 +33,7 @@ class PlannedRun:
 
 
 def load_paper_run_tables() -> list[dict[str, Any]]:
-    """All of the paper's tables, as shipped in ``paper_tables.yaml``, whose lists are in the order of the scenes."""
+    """Load the paper's tables from ``paper_tables.yaml``. Lists in a row are in the order of the table's scenes."""
     tables: list[dict[str, Any]] = yaml.safe_load(
         (resources.files(__package__) / "paper_tables.yaml").read_text(encoding="utf-8")
     )
@@ -41,7 +41,7 @@ def load_paper_run_tables() -> list[dict[str, Any]]:
 
 
 def find_paper_figure(table: Mapping[str, Any], row: Mapping[str, Any], scene: str, kind: str) -> float | None:
-    """The paper's psnr, ssim, lpips or primitives of a scene in a row; None for one that is not there."""
+    """Return the paper's psnr, ssim, lpips or primitives (``kind``) of a scene in a row; None if there is none."""
     figure: float | None = row[kind][table["scenes"].index(scene)] if kind in row else None
     return figure
 
@@ -56,16 +56,16 @@ def plan_paper_runs(
     out: Path,
     words: Sequence[str],
 ) -> list[PlannedRun]:
-    """Every run of the rows whose data are there, checked before one starts.
+    """Return the runs of all rows and scenes whose data exist; every configuration is checked before a run starts.
 
     Args:
-        data: holds a folder per scene, named like it in any case.
-        scenes: those to take; empty for all.
+        data: folder with a folder per scene, named like the scene in upper or lower case.
+        scenes: names of scenes; empty for all.
         rows: names of rows; empty for all.
-        budget: a run's time of training as 90s, 10m or 2h; None for the preset's own steps.
-        seeds: runs of each, with the seeds from 0.
-        out: gets a run directory for each.
-        words: ``key=value`` settings over the protocol's.
+        budget: training time of a run as 90s, 10m or 2h; None for the preset's own steps.
+        seeds: number of runs per row and scene, with seeds from 0.
+        out: folder for the run directories.
+        words: overrides ``key=value``, on top of those of the table and row.
 
     Raises:
         ConfigError: no such scene, row or folder, nothing found, or a setting that is refused.
@@ -108,9 +108,9 @@ def plan_paper_runs(
 def compare_run_with_paper(
     planned: PlannedRun, metrics: Mapping[str, Any]
 ) -> Iterator[tuple[str, float | None, float | None, float | None]]:
-    """(what, ours, the paper's, that of what the paper puts beside it) of a finished run; None for what is not there.
+    """Yield (metric, our value, the paper's value, the value of its baseline) of a finished run; None if missing.
 
-    LPIPS of another network than the paper's tools', VGG, is left out.
+    LPIPS is left out unless it was measured with VGG, as by the paper's tools.
     """
     table, row, scene = planned.table, planned.row, planned.scene
     for kind, name in _OWN_NAMES.items():

@@ -1,11 +1,11 @@
-"""How a finished model is drawn, as ``key=value`` overrides of ``neuprim render``, ``eval`` and ``tradeoff``.
+"""Render configurations of finished models: ``key=value`` overrides of ``neuprim render``, ``eval``, ``tradeoff``.
 
 renderer.KEY=VALUE       any setting of the renderer, over the run's own
 resolution=0.5           render at half the width and height, and upsample bilinearly
 density.NAME=N           a smaller density, for example fewer neurons (Field.reductions)
 colour.NAME=N            a smaller colour: bands of spherical harmonics, lobes, terms in time
 
-A view is drawn as an image, or as layers of one OpenEXR file: linear light, numbers beside it, and the camera and
+A view is rendered as an image, or as layers of one OpenEXR file: linear light, data such as depth, and the camera and
 conditions in its header.
 """
 
@@ -48,13 +48,14 @@ _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0,
 __all__ = ["RenderConfig", "parse_run_rendering"]
 
 _MOST_LIGHTS = 128
-_REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # those of sRGB: x and y of red, green, blue, white
+_REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # sRGB primaries: x and y of red, green, blue, white
 
 
 def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -> int:
     """Return the bytes of a run's model file if it held ``reduced`` instead of the ``full`` model.
 
-    An unchanged model has its file's own size. Otherwise a compressed file, or one without zeros, counts as tensors.
+    A model of unchanged size has the size of its file. Otherwise a compressed file, or one without zeros, counts as
+    uncompressed float32 tensors.
     """
     before, after = (4 * model.count * model.parameters_per_primitive for model in (full, reduced))
     size = path.stat().st_size
@@ -169,17 +170,17 @@ def _format_run_render_override(key: str, value: Any) -> str:
 
 @dataclass(frozen=True)
 class RunExrLayers:
-    """Which layers of a run's views are written, and how.
+    """Writer of a run's views as layers of OpenEXR files.
 
     Attributes:
-        names: as after ``--layers``; None: all but a layer per light.
-        half: 16-bit floats for light and alpha.
-        background: (C,) in the model's colour space. Beauty lies over it where alpha is not among the layers.
-        lights: conditions of frames that add up, of light from all around; empty: the view's own light.
-        world: in whose coordinates and units the file has cameras, positions and depths.
+        names: layers, as after ``--layers``; None: all except one layer per light.
+        half: whether light and alpha are 16-bit floats.
+        background: (C,) in the model's colour space. Without an alpha layer, beauty is composited over it.
+        lights: conditions of the lights of an environment map, whose images are summed; empty: the view's own light.
+        world: coordinates and units of cameras, positions and depths in the file.
 
     Raises:
-        ConfigError: no such layer, or one of light where the model's colours are no linear light.
+        ConfigError: an unknown layer, or a layer of light although the model's colours are not linear light.
     """
 
     run_dir: Path
@@ -220,11 +221,11 @@ class RunExrLayers:
     def write(
         self, path: Path, model: Primitives, view: View, on_alpha: Callable[[Tensor], None] = lambda alpha: None
     ) -> None:
-        """Draw and write one view; ``on_alpha`` is called after each of its lights, with the image's alpha.
+        """Render and write one view; ``on_alpha`` is called after each of its lights, with the image's alpha.
 
         Raises:
-            ConfigError: a layer was asked for by name that the model does not have.
-            DataError: values that the file cannot hold, or it cannot be written.
+            ConfigError: the user named a layer that the model does not have.
+            DataError: the file cannot hold the values, or it cannot be written.
         """
         small, settings = self.point.scale_view(view), self.point.settings
         found: dict[str, Tensor] = {}
@@ -252,13 +253,13 @@ class RunExrLayers:
     def _exr_channels(
         self, found: Mapping[str, Tensor], specs: Mapping[str, LayerSpec], alpha: Tensor, view: View
     ) -> tuple[dict[str, ExrChannel], dict[str, str]]:
-        """Channel -> values of the view's own size, and the attributes that say what each layer is."""
+        """Return channel -> values at the view's full resolution, and header attributes that describe each layer."""
         channels: dict[str, ExrChannel] = {}
         summaries: dict[str, str] = {}
         large_alpha = self.point.upsample(alpha[..., None], view.camera)
         for name, image in found.items():
             spec, image = specs.get(name), image.float()
-            if name == "depth":  # as the mean that it is: nothing of the 0 beside a silhouette
+            if name == "depth":  # alpha-weighted, so that the 0 outside a silhouette has no effect
                 weighted = self.point.upsample(image * alpha[..., None], view.camera)
                 image = mean_depth(weighted, large_alpha) / self.world.scale
             else:
@@ -280,7 +281,7 @@ class RunExrLayers:
         return channels, summaries
 
     def _exr_attributes(self, model: Primitives, view: View) -> dict[str, Any]:
-        """What the file says about itself: camera, conditions, where it comes from and what its numbers are."""
+        """Return the file's header: camera, conditions, the run that it comes from, and the colour space."""
         space = self.channels.color_space
         near = resolve_near(self.point.settings, model.params["means"], [view.camera]).near_plane
         origin = "" if space == "linear" else ", of a model whose colours are sRGB values"
@@ -304,7 +305,7 @@ class RunExrLayers:
         return found
 
     def _condition_values(self, conditions: Conditions) -> Iterator[tuple[str, Any]]:
-        """Conditions as users write them and as OpenEXR takes them: one number, two or three as a vector, others as a
+        """Yield conditions in the user's coordinates and OpenEXR's types: one number, a vector of two or three, or a
         list."""
         specs = {spec.name: spec for spec in self.task.conditions}
         for name, value in conditions.items():
@@ -316,7 +317,7 @@ class RunExrLayers:
 
 
 def _linear_light_of_run_layer(image: Tensor, color_space: str, alpha: Tensor | None = None) -> Tensor:
-    """(H, W, C) linear light of an image in a data set's colour space; sRGB values lose what is below 0.
+    """Convert an (H, W, C) image from ``color_space`` to linear light; negative sRGB values become 0.
 
     Args:
         alpha: (H, W) that the image is premultiplied by. The curve applies to the colour without it.

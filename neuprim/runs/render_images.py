@@ -31,20 +31,20 @@ from neuprim.runs.render_config import RunExrLayers, parse_run_rendering
 __all__ = ["RenderRequest", "render_run"]
 
 SPACES = WORLD, SCENE = ("world", "scene")
-"""Whose coordinates a file of cameras has, after ``--space``."""
+"""Values of ``--space``: the coordinates of cameras in a file."""
 
 SETS = ("orbit", "test")
-"""Cameras of the run's own."""
+"""Values of ``--camera`` that select cameras of the run."""
 
 ANIMATIONS = ("webp", "gif", "mp4")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
-"""What ``neuprim render`` writes: pictures of what the task's channels look like, but all channels as they are in EXR
-and npy."""
+"""Formats that ``neuprim render`` writes. EXR and npy hold all channels as they are; the others hold the displayed
+image."""
 
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What to render of a run, as the arguments of ``neuprim render``.
+    """Request for :func:`render_run`, with the arguments of ``neuprim render``.
 
     Attributes:
         camera: "orbit", "test" (the held-out views) or a file of cameras.
@@ -144,10 +144,10 @@ class _RunRenderSession:
         self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")
-        self._passes, self._visible = 0, False  # images rendered so far, one per view and light; whether one shows it
+        self._passes, self._visible = 0, False  # images so far, one per view and light; any shows the model
 
     def _load_lights(self, environment: EnvironmentFile) -> Sequence[Conditions]:
-        """Conditions of the lights that replace an environment."""
+        """Return the conditions of the lights that together replace an environment map."""
         with self.run.plugins.attribute_errors():
             illumination = self._illuminate(environment)
         lights = illumination.frames(environment.guesses)
@@ -180,7 +180,7 @@ class _RunRenderSession:
         return illumination
 
     def _load_views(self) -> tuple[list[View], float | None]:
-        """The views of the request's cameras, in the model's coordinates, and the frames per second of an animation."""
+        """Return the request's views, in the model's coordinates, and the frames per second of an animation."""
         request, fps = self.request, self.request.fps
         if request.camera not in SETS:
             file = read_camera_file(Path(request.camera), request.size)
@@ -197,12 +197,12 @@ class _RunRenderSession:
                     views = [dataset.test.view(i) for i in range(len(dataset.test))]
         if request.size is not None:
             views = [replace(view, camera=view.camera.resized(*request.size)) for view in views]
-        if self.lights:  # they replace the views' own; the first stands for all where only their presence counts
+        if self.lights:  # they replace the views' own; where only the presence matters, the first is used
             views = [replace(view, conditions={**view.conditions, **self.lights[0]}) for view in views]
         return views, fps
 
     def choose_targets(self) -> list[Path]:
-        """Files to write, one per view or one for an animation."""
+        """Return the files to write, one per view or one for an animation."""
         out, suffix = self.request.out, f".{self.format}"
         single = out is not None and out.suffix.lower() == suffix
         if single and len(self.views) > 1 and not self.animate:
@@ -239,7 +239,7 @@ class _RunRenderSession:
             raise
 
     def _write_image(self, path: Path, pixels: Tensor) -> None:
-        """Write all channels as the data set has them in npy, or what its channels look like."""
+        """Write one image: npy holds the data set's channels unchanged, other formats the displayed image."""
         shown = pixels if self.format == "npy" else self.channels.display(pixels)
         if self.format == "npy":
             write_npy(path, shown.contiguous().numpy())
@@ -258,14 +258,14 @@ class _RunRenderSession:
             return config.upsample(image, view.camera)
 
     def _count_pass(self, alpha: Tensor) -> None:
-        """Called after every image of a view under a light, with its alpha."""
+        """Count one rendered image, of a view under a light with this alpha, and report the progress."""
         lights, count = max(len(self.lights), 1), len(self.views)
         self._visible |= bool((alpha > 0).any())
         self._passes += 1
         self.progress(f"view {-(-self._passes // lights)} of {count}", self._passes / (lights * count))
 
     def _refuse_empty_images(self) -> None:
-        """Raise DataError, which says where the model is and where the first camera looks, if no image shows it."""
+        """Raise DataError if no image shows the model; say where the model is and where the first camera looks."""
         if self._visible:
             return
         view, where = self.views[0], "no primitive is there under these conditions"
@@ -286,8 +286,8 @@ class _RunRenderSession:
 
 
 def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
-    """A view per camera; each at its own time where the file has times, the task has one, and the user gave no
-    other."""
+    """Return a view per camera of a file. A view has the file's time if the task has a time and the user gave
+    none."""
     has_time = any(spec.name == "time" and not spec.shape for spec in task.conditions)
     timed = file.times is not None and "time" not in conditions and has_time
     times = [{"time": torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
@@ -297,9 +297,9 @@ def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Map
 def set_run_view_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
-    """Views with the conditions the user gave, and whether one of these is animated. Animated conditions go along
-    together, frame by frame; where there are more frames than cameras, or the other way round, the fewer are spread
-    evenly over the more.
+    """Return the views with the user's conditions, and whether a condition is animated. Animated conditions advance
+    together, frame by frame. If the numbers of frames and cameras differ, the smaller number is spread evenly over the
+    larger.
 
     Raises:
         ConfigError: a view lacks a condition that the task needs, or as
@@ -327,7 +327,7 @@ def set_run_view_conditions(
 
 
 def _view_file_names(names: Sequence[str]) -> list[str]:
-    """File names of views, with their numbers where two would share a file."""
+    """Return file names of views, numbered if two views would share a file."""
     names = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in names]
     if len({name.lower() for name in names}) == len(names):
         return list(names)

@@ -1,7 +1,7 @@
-"""One run in a directory: fit, measure, draw and report, at once or in chunks.
+"""Train, measure, render and report a run in its directory, as one model or in chunks.
 
-Every chunk of a scene is a run of its own; then all of them are trained together as one model for the last part of the
-budget. ``chunks.json`` records what became of each chunk, so that nothing is done twice.
+Every chunk of a scene is a run of its own. Then the chunks' models are joined, and trained together as one model for
+the last part of the budget. ``chunks.json`` records the state of each chunk, so that nothing is done twice.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from neuprim.runs.training import (
 )
 
 CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
-"""In a run's directory: the record, and the runs of the chunks."""
+"""File with the record of the chunks, and folder with their runs, in a run's directory."""
 
 __all__ = ["run"]
 
@@ -49,7 +49,7 @@ JOINT_SHARE = 0.2
 to each other. More of it makes the result worse."""
 
 _MIN_PRIMITIVES = 8
-"""Primitives of a chunk, at least: their sizes follow from the distances between them."""
+"""Smallest number of primitives in a chunk: their sizes follow from the distances between them."""
 
 
 class ChunksMissing(NeuprimError):
@@ -108,7 +108,7 @@ def summarize_run(run_dir: Path) -> str:
 
 
 def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
-    """Do a run as a job; returns its directory. After its worker died it resumes from its checkpoint, if any."""
+    """Run a configuration as a job; return its directory. A retry after a worker's death resumes the checkpoint."""
     config = RunConfig.from_dict(data)
     return str(run(replace(config, resume=config.resume or attempt > 0), events))
 
@@ -118,12 +118,12 @@ def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
 
 @dataclass(frozen=True)
 class ChunkPlan:
-    """How a run is divided.
+    """Plan of a run in chunks: the runs of the chunks, and the budget of the joined model's training.
 
     Attributes:
-        chunks: how the scene's task divides it and puts it together.
-        configs: of the chunks' runs. runs: their entries in the record.
-        steps: of the joined model's training; None: as many as fit into ``seconds``.
+        chunks: the scene's chunks, with the function that joins their models.
+        configs: configurations of the chunks' runs. runs: their entries in the record.
+        steps: steps of the joined model's training; None: as many as fit into ``seconds``.
     """
 
     chunks: Chunks
@@ -134,8 +134,8 @@ class ChunkPlan:
 
 
 def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
-    """The runs of the chunks, with their shares of primitives and budget; each has as many interventions into its
-    population as the whole run.
+    """Plan the chunks' runs, each with its share of primitives and budget, and with as many interventions of population
+    control as the whole run.
 
     Raises:
         ConfigError: fewer primitives than the chunks need.
@@ -168,7 +168,7 @@ def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
 
 
 def _divide_primitives_among_chunks(total: int, shares: list[float]) -> list[int]:
-    """Whole numbers close to these shares of ``total`` that add up to it."""
+    """Split ``total`` in proportion to ``shares`` into whole numbers that add up to it."""
     ends = [round(total * sum(shares[: n + 1]) / sum(shares)) for n in range(len(shares))]
     return [end - begin for begin, end in zip([0, *ends], ends, strict=False)]
 
@@ -179,19 +179,19 @@ def train_in_chunks(
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     between: BetweenSteps = lambda fitted, stop: None,
 ) -> tuple[Fitted, bool]:
-    """Fit the chunks that ``scene.chunks`` asks for, join them and train what they make together; as
-    :func:`~neuprim.runs.training.train_in_directory`, where ``auto`` finds one run better.
+    """Fit the chunks of ``scene.chunks``, join their models, and train the joined model. If ``auto`` finds one run
+    better, this is :func:`~neuprim.runs.training.train_in_directory`.
 
-    What is done is kept: the command with ``resume=true`` makes what is missing.
+    Finished chunks are kept: the same command with ``resume=true`` fits the missing ones.
 
     Args:
-        launcher: where chunks are fitted, and their ground truth made. What follows works here.
+        launcher: where chunks are fitted, and their ground truth is rendered. The joined model is trained here.
 
     Raises:
-        ChunksMissing: some of them failed; the others went on.
-        KeyboardInterrupt: Ctrl-C came before all chunks were there; those at work have their checkpoints.
-        NeuprimError: what a run may raise, a launcher that cannot work here, or chunks other than those that the run
-        was begun with.
+        ChunksMissing: some chunks failed; the others were completed.
+        KeyboardInterrupt: Ctrl-C came before all chunks were done; unfinished ones have checkpoints.
+        NeuprimError: errors of a run, a launcher that cannot work here, or chunks that differ from those of the
+        interrupted run.
     """
 
     def progress(text: str, fraction: float) -> None:
@@ -230,7 +230,7 @@ def train_in_chunks(
 
 
 def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher: LauncherSettings) -> LaunchRecord:
-    """Have every chunk fitted that is not there yet."""
+    """Launch the runs of all chunks that are not done yet; return the updated record."""
     folder, count = record.file.parent, len(plan.configs)
     statuses = [JobStatus()] * count
 

@@ -1,6 +1,6 @@
-"""Runs that are launched together: those of a sweep, compared at the end, or the chunks of one run.
+"""Launch several runs together: those of a sweep, which are compared at the end, or the chunks of one run.
 
-A record says what was asked for and what became of each run while they work: ``sweep.json`` or ``chunks.json``.
+A record, ``sweep.json`` or ``chunks.json``, has the requested settings and the state of each run, also during the work.
 ``sweep.csv`` and ``sweep.html`` are written at the end.
 """
 
@@ -30,10 +30,10 @@ from neuprim.runs.open import lock_run_directory, model_file
 __all__ = ["run_sweep"]
 
 SWEEP_FILE = "sweep.json"
-"""In a sweep's directory."""
+"""File name of the record in a sweep's directory."""
 
 FIT_JOB = "neuprim.runs.run:fit_job"
-"""What the worker of a run does."""
+"""Function that the worker of a run calls."""
 
 _FORMAT = 1
 
@@ -43,16 +43,16 @@ _FORMAT = 1
 
 @dataclass(frozen=True)
 class LaunchedRun:
-    """One run.
+    """Record of one launched run.
 
     Attributes:
-        name: of its folder.
-        words: what was asked for, without those of its place.
-        swept: key -> value, as typed, of those that differ between the runs.
+        name: name of its folder.
+        words: its overrides, without ``output_dir`` and ``resume``.
+        swept: key -> value, as typed, of the settings that differ between the runs.
         state: waiting, done, failed or interrupted.
         line: why it failed.
         seconds: from its start to its end, measuring included.
-        attempts: how often it was started, as its worker died.
+        attempts: number of starts; it is started again if its worker dies.
     """
 
     name: str
@@ -66,12 +66,12 @@ class LaunchedRun:
 
 @dataclass(frozen=True)
 class LaunchRecord:
-    """Runs that are launched together.
+    """Record of runs that are launched together.
 
     Attributes:
-        file: of the record; its folder is that of the launch.
-        words: what was asked for, without those of its place.
-        joined_steps: of a run in chunks: steps of the joined model's training, once they are known.
+        file: file of the record, in the folder of the launch.
+        words: the requested overrides, without ``output_dir`` and ``resume``.
+        joined_steps: for a run in chunks: steps of the joined model's training, once they are known.
     """
 
     file: Path
@@ -80,25 +80,25 @@ class LaunchRecord:
     joined_steps: int | None = None
 
     def write(self) -> None:
-        """Raises OSError where it cannot be written; what was there is intact."""
+        """Write the record to its file. Raises OSError if that fails; the old file is then intact."""
         runs = [{**asdict(run), "words": list(run.words), "seconds": round(run.seconds, 3)} for run in self.runs]
         joined = {} if self.joined_steps is None else {"joined_steps": self.joined_steps}
         write_json(self.file, {"format": _FORMAT, "words": list(self.words), "runs": runs, **joined})
 
     def end_run(self, number: int, result: JobResult) -> LaunchRecord:
-        """The record after a run has ended."""
+        """Return the record with the result of run ``number``."""
         runs, (state, line) = list(self.runs), (result.state, result.line)
         runs[number] = replace(runs[number], state=state, line=line, seconds=result.seconds, attempts=result.attempts)
         return replace(self, runs=tuple(runs))
 
     def resume(self, before: LaunchRecord | None, more: bool) -> LaunchRecord:
-        """Take the states of an earlier record, and append the runs that only that one has.
+        """Return this record with the states of an earlier one, and with the runs that only the earlier one has.
 
         Args:
             more: whether the two may have different runs.
 
         Raises:
-            ConfigError: a run of the same name had other words, or there are other runs.
+            ConfigError: a run of the same name had other overrides, or the runs differ without ``more``.
         """
         if before is None:
             return self
@@ -141,24 +141,24 @@ def read_launch_record(file: Path) -> LaunchRecord | None:
 
 
 def make_run_job(config: RunConfig) -> LaunchJob:
-    """Make a run a job."""
+    """Return the job that runs a configuration."""
     return LaunchJob(config.output_dir.name, FIT_JOB, config.to_dict())
 
 
 def launch_missing_runs(
     record: LaunchRecord, configs: Sequence[RunConfig], settings: LauncherSettings, on_status: OnStatus
 ) -> tuple[LaunchRecord, list[JobResult | None]]:
-    """Launch the runs of a record that are not done, each in its own directory, their ground truth first.
+    """Render the ground truth of a record's unfinished runs, then launch them, each in its own directory.
 
-    The record is written at the first status, so that a launcher that is refused leaves nothing, and whenever a run
+    The record is written at the first status, so that a launcher that fails to start leaves no file, and whenever a run
     ends.
 
     Args:
-        configs: of the record's first runs.
-        on_status: called with (place in ``configs``, status) whenever it is new; once for each run that is kept.
+        configs: configurations of the record's first runs.
+        on_status: called with (index in ``configs``, status) whenever it is new; once for each finished run.
 
     Returns:
-        the record, and a result for each configuration; None of those that Ctrl-C came before.
+        the record, and a result for each configuration; None for runs that Ctrl-C prevented.
 
     Raises:
         NeuprimError: a launcher that cannot work here.
@@ -197,7 +197,7 @@ def launch_missing_runs(
 
 
 def _is_finished_run(run_dir: Path) -> bool:
-    """Whether a directory has all that the end of a run writes."""
+    """Return whether a directory has the configuration, metrics and model of a finished run."""
     return all(file.is_file() for file in (run_dir / "config.yaml", run_dir / "metrics.json", model_file(run_dir)))
 
 
@@ -205,10 +205,10 @@ def _is_finished_run(run_dir: Path) -> bool:
 
 
 def read_sweep_overrides(words: Sequence[str]) -> list[str]:
-    """Return the overrides that a sweep was begun with, plus these, which name its directory and ``resume=true``.
+    """Return the overrides of an earlier sweep plus ``words``, which contain its ``output_dir`` and ``resume=true``.
 
     Raises:
-        ConfigError: there is no sweep.
+        ConfigError: there is no sweep, or its overrides contain ``${``.
     """
     given = {a.key: a.value for a in parse_overrides(words)}
     before = None
@@ -257,7 +257,7 @@ def write_sweep_csv(path: Path, runs: Sequence[SweepPageRun]) -> None:
 
 
 def _sweep_csv_number(value: float | None) -> str:
-    """With every digit, and whole numbers as such."""
+    """Format a number with all its digits, a whole number as an integer; None as an empty cell."""
     return "" if value is None else str(int(value)) if value.is_integer() else repr(value)
 
 

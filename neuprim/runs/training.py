@@ -1,6 +1,6 @@
-"""Train in a directory, with steps that go on where they were left, and train a changed model further.
+"""Train in a run directory, resume from its checkpoint, and fine-tune a changed model.
 
-Fine-tuning is the end of a run once more, at the rates of its end, with the primitives that there are.
+Fine-tuning repeats the end of a run, with learning rates like those of its end and a fixed population.
 """
 
 from __future__ import annotations
@@ -56,27 +56,27 @@ _PREVIEW_PROGRESS = (0.05, 0.5)
 """Progress at which :data:`PREVIEW_FILE` is written; the end of the run replaces it."""
 
 BEGIN = 0.8
-"""Progress of the run that the first step stands for."""
+"""Progress of the run, 0..1, to which the first step of fine-tuning corresponds."""
 
 START, COOL = 3.0, 0.02
-"""The rates at the first step over those at the end of the run, and those at the last step over these at the first.
-With next to none at the end, numbers settle, which improves quality by itself (row "trained as long" of
-docs/tradeoffs.md) and decides where numbers are rounded."""
+"""Ratios of fine-tuning's learning rates: first step over the end of the run, and last step over first step.
+Rates near zero at the end let the parameters settle. This improves quality by itself, and matters most where
+parameters are rounded."""
 
 LONG, LEAST_START = 2000, 1.0
-"""Steps from which on rates begin so high. Fewer steps begin lower, in proportion, but not below
-:data:`LEAST_START`: a few hundred steps at high rates leave a well trained volume worse than they found it."""
+"""Number of steps from which the rates begin at :data:`START`. With fewer steps they begin proportionally lower, but at
+least at :data:`LEAST_START`: a few hundred steps at high rates degrade a well trained volume."""
 
 VOXELS_EVERY = 8
-"""Largest number of steps between two uses of voxels, where a run learned from them. In a few hundred steps with uses
-as rare as in a run some frames are hardly met, and their extinction drifts; at every fourth step images get worse."""
+"""Largest number of steps between two steps with voxels, if the run trained with them. At a run's longer interval a few
+hundred steps hardly reach some frames, and their extinction drifts; at an interval of four, images get worse."""
 
 _PACE_WARMUP, _PACE_STEPS = 5, 20
-"""Steps before the pace is measured, and those that it is measured over."""
+"""Number of warm-up steps, and of the steps after them whose pace is measured."""
 
 BetweenSteps = Callable[[Fitted, threading.Event], None]
-"""Called on the training's thread before its first step and after every one, with what is trained and the event that
-ends the training as Ctrl-C does. It may read the state, save it and wait, and must not change it."""
+"""Callback on the training thread, before the first step and after every step. It gets what is trained, and an event
+that ends the training as Ctrl-C does. It may read and save the state, and wait; it must not change the state."""
 
 
 def train_in_directory(
@@ -88,8 +88,8 @@ def train_in_directory(
     group: ProcessGroup | None = None,
     make: TrainerFactory | None = None,
 ) -> tuple[Fitted, bool]:
-    """Train until the budget is used or Ctrl-C, which finishes the step; leaves configuration, curve, checkpoint and
-    model in the run's directory either way. Of several ranks the first one writes them.
+    """Train until the budget is used or Ctrl-C, which finishes the step. Either way write configuration, curve,
+    checkpoint and model into the run's directory; of several ranks the first one writes them.
 
     Args:
         dataset, hold_out, make, group: as of :func:`~neuprim.runs.fit.prepare_training`.
@@ -174,12 +174,12 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
 
 
 class RunPreview:
-    """A function to call between steps, which writes a picture of a held-out view early in the training and again
-    halfway: ground truth on the left, the model on the right.
+    """Callback between steps that writes a picture of a held-out view early in the training and again halfway: ground
+    truth on the left, the model on the right.
 
     Args:
-        events: gets the name of the file when it is there.
-        between: is called, too.
+        events: receives a note with the name of the file, after the first picture.
+        between: another callback, which is called before.
     """
 
     def __init__(self, events: Events, between: BetweenSteps) -> None:
@@ -216,8 +216,7 @@ def _train_run_as_follower(trainer: Trainer) -> bool:
 
 @contextmanager
 def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
-    """Warn once of a file that cannot be written during the training, as on a full disk. Only at the end it is an
-    error."""
+    """Warn once if a file cannot be written during the training, as on a full disk. At the end it is an error."""
     try:
         yield
     except (CheckpointError, OSError) as error:
@@ -226,7 +225,7 @@ def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
 
 
 def cut_run_curve(path: Path, step: int) -> None:
-    """Cut ``metrics.jsonl`` back to the lines up to a checkpoint's step; without lines it is empty."""
+    """Remove the lines after a checkpoint's step from ``metrics.jsonl``; a missing file is created empty."""
     kept = []
     if step and path.exists():
         for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -239,7 +238,7 @@ def cut_run_curve(path: Path, step: int) -> None:
 
 
 def add_run_curve_line(path: Path, line: str) -> None:
-    """Add a line whole or not at all. Raises OSError; the lines before it are intact."""
+    """Append a line completely or not at all. Raises OSError; the lines before it are intact."""
     with open(path, "ab", buffering=0) as file:
         data, end = line.encode(), os.fstat(file.fileno()).st_size
         try:
@@ -278,7 +277,7 @@ def save_run_training(fitted: Fitted) -> None:
 def make_run_finetune_trainer(
     job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
-    """Make a trainer of a copy of a finished run's model that is ``steps`` steps before the end of its budget.
+    """Make a trainer for a copy of a finished run's model, with ``steps`` steps left of its budget.
 
     Schedules are those of a run from the progress ``begin`` on, except for the rates (:data:`START`, :data:`COOL`);
     the population is fixed, and views keep their resolution. Exposures and corrections of views go on from the
@@ -312,7 +311,7 @@ def make_run_finetune_trainer(
 
 
 def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
-    """How many steps of fine-tuning fit into some seconds, at the measured pace; none in 0 seconds."""
+    """Return the number of fine-tuning steps that fit into ``seconds`` at the measured pace; 0 for 0 seconds."""
     if seconds <= 0:
         return 0
     trainer = make_run_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)

@@ -1,4 +1,4 @@
-"""Generated scenes, written in layouts that loaders read: solids, room, lit solids and smoke. They know no task."""
+"""Generated scenes (solids, room, lit solids, smoke), in layouts that loaders read; no task is used."""
 
 __all__ = ["PIXEL_CLASSES"]
 

@@ -27,26 +27,26 @@ Supersampling = Annotated[int, Range(1, 16)]
 Progress = Callable[[str, float], None]
 
 RAYS_AT_ONCE = 1 << 15  # small enough for the arrays to stay in the CPU's cache
-_MAX_THREADS = 4  # images in work at once need memory
+_MAX_THREADS = 4  # each image in work needs memory
 
 T = TypeVar("T")
 V = TypeVar("V")
 
 
 def hash_scene_settings(settings: Any, version: int) -> str:
-    """A short hash of every field of a settings dataclass and the generator's version."""
+    """Return a short hash of every field of a settings dataclass and the generator's version."""
     text = json.dumps({"version": version, **asdict(settings)}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def scene_direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
-    """(3,) unit vector at this cosine of the angle from the zenith, ``azimuth`` radians from x towards y."""
+    """Return the (3,) unit vector of a zenith cosine and ``azimuth``, radians from x towards y."""
     across = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     return np.array([across * math.cos(azimuth), across * math.sin(azimuth), cosine])
 
 
 def scene_camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) that looks at the origin, z up."""
+    """Return the (4, 4) camera to world, OpenGL axes, at ``eye`` (3,), facing the origin, z up."""
     view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -54,9 +54,10 @@ def scene_camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
 def scene_ray_bands(
     pose: NDArray[np.float64], field_of_view: float, size: int, samples: int
 ) -> Iterator[NDArray[np.float64]]:
-    """Yield (N, 3) unit directions in the scene, rows of pixels from the top, ``samples`` rays per pixel side.
+    """Yield (N, 3) unit ray directions, whole rows of pixels at a time, from the top.
 
-    ``pose`` (4, 4) is camera to world, OpenGL axes; ``field_of_view`` in radians holds along both axes.
+    There are ``samples`` rays per pixel side. ``pose`` (4, 4) is camera to world, OpenGL axes; ``field_of_view`` in
+    radians holds along both axes.
     """
     fine = size * samples
     plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(field_of_view / 2)  # at distance 1
@@ -69,7 +70,7 @@ def scene_ray_bands(
 
 
 def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArray[np.float32]:
-    """(rows, size, C) means over the rays of each pixel, of the (N, C) values of one of :func:`scene_ray_bands`."""
+    """Average (N, C) ray values of a band of :func:`scene_ray_bands` to (rows, size, C) pixels."""
     channels = values.shape[1]
     rows = len(values) // (size * samples * samples)
     across = values.reshape(rows, samples, size, samples * channels).mean(axis=1)
@@ -87,13 +88,13 @@ def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: C
 
 
 def scene_drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
-    """What progress shows while images are drawn."""
+    """Return the progress text that is shown while images are drawn."""
     slow = "" if scene.engine == "embree" else " (without embreex, which would be faster)"
     return f"{name}: drawing {width}x{height} images{slow}"
 
 
 def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Have ``write`` fill the folder ``final``, which appears when complete, unless all ``files`` exist."""
+    """Fill the folder ``final`` by ``write`` unless all ``files`` exist; it appears when complete."""
     names = tuple(files)
     try:
         publish_folder(final, write, lambda folder: all((folder / name).is_file() for name in names))

@@ -64,7 +64,7 @@ CIRCLE_FRAMES = 36
 _CAMERA_POLAR, _LIGHT_POLAR = math.radians(75.0), math.radians(60.0)
 
 _BRIGHT = 0.5 / (np.pi * (sum(DISTANCE) / 2) ** 2)
-"""Radiance per unit intensity from which a highlight counts as one, 1/length^2."""
+"""Least radiance per unit intensity of a pixel of the class "highlight", 1/length^2."""
 
 _LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shadow", "attached_shadow", "highlight"))
 
@@ -86,7 +86,7 @@ class LitSettings:
 
 
 class LitView(NamedTuple):
-    """One image to take: (3,) positions of camera and light, of test views also of the nearest baseline light."""
+    """View to render: (3,) positions of camera, light and, for test views, nearest baseline light."""
 
     name: str
     camera: NDArray[np.float64]
@@ -159,7 +159,7 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
     cameras, lights = _draw_lit_positions(1, train_views)
     train = [LitView(f"r_{i:0{digits}d}", cameras[i], lights[i]) for i in range(train_views)]
     new_cameras, new_lights = _draw_lit_positions(2, test_views)
-    # The baseline's own lights are no test of it, so training ones come from the rest where there is one.
+    # Test views with a training light do not use the lights that the baseline knows, if there are others.
     first = NEAR_LIGHTS if train_views > NEAR_LIGHTS else 0
     counts = [(test_views + 2 - part) // 3 for part in range(3)]
     digits = max(2, len(str(test_views)) - 1)
@@ -181,7 +181,7 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 
 
 def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
+    """Draw positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
     return [_position_above_lit_solids(n[:3], _CAMERA_POLAR) for n in numbers], [
         _position_above_lit_solids(n[3:], _LIGHT_POLAR) for n in numbers
@@ -231,7 +231,7 @@ def draw_lit_solids(
 
 
 class ShadedRays(NamedTuple):
-    """(N, 3) linear radiance of N rays, the same without cast shadows, and (N,) pixel classes."""
+    """Shaded rays: (N, 3) linear radiance, the same without cast shadows, and (N,) pixel classes."""
 
     rgb: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -244,8 +244,8 @@ def shade_point_light(
     """Cast N rays and shade them under one point light at ``light`` (3,).
 
     Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. A highlight is brighter than
-    the
-    diffuse part and :data:`_BRIGHT`; attached shadow faces away; in cast shadow something lies between.
+    the diffuse part and :data:`_BRIGHT`. Surfaces in attached shadow face away from the light, those in cast shadow are
+    occluded.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)

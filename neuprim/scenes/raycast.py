@@ -1,4 +1,4 @@
-"""Ray casting against solids by Embree (``embreex``), or where it has no wheel by a hierarchy compiled with numba."""
+"""Ray casting by Embree (``embreex``), or where it has no wheel by a box hierarchy in numba."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Engine = Literal["auto", "embree", "numba"]
 LIFT = 2e-4
 """How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of float32 there."""
 
-_LEAF = 4  # triangles
-_DEPTH = 64  # of the traversal's stack; median splits of 2^31 triangles need 32
+_LEAF = 4  # most triangles per leaf
+_DEPTH = 64  # size of the traversal's stack; median splits of 2^31 triangles need 32
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Hits:
     emission: NDArray[np.float32] | None = None  # (M, 3) float32 linear RGB of emitted light, if any
 
     def lifted(self) -> NDArray[np.float32]:
-        """(M, 3) positions just off the surface, where shadow rays start."""
+        """Return (M, 3) positions just off the surface, where shadow rays start."""
         return self.position + np.float32(LIFT) * self.face
 
 
@@ -65,7 +65,7 @@ class Scene:
         self.engine, self._search = _open_ray_engine(vertices, np.concatenate(faces).astype(np.int32), engine)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """The first surface that each ray meets; (N, 3) scene units, directions of any length."""
+        """Return the first hit of each (N, 3) ray; scene units, directions of any length."""
         o, d = _broadcast_raycast_rays(origins, directions)
         triangle, u, v, distance = self._first_hits(o, d)
         hit = triangle >= 0
@@ -84,11 +84,14 @@ class Scene:
         return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
 
     def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """(N,) each: triangle or -1, barycentric u and v, distance in lengths of ``d`` (N, 3)."""
+        """Return (N,) triangles or -1, barycentric u and v, and distances in lengths of ``d``."""
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """(N,) whether a surface lies within ``distance`` (in lengths of the direction) of points off a surface."""
+        """Return (N,) bool: whether a surface is within ``distance``, in lengths of the direction.
+
+        Points must lie off a surface, see :meth:`Hits.lifted`.
+        """
         o, d = _broadcast_raycast_rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
 
@@ -135,7 +138,7 @@ class _EmbreeEngine:
 
 
 class _BoxHierarchy:
-    """Triangles ``faces`` (F, 3) of ``vertices`` (V, 3), with the queries of :class:`_EmbreeEngine`."""
+    """Box hierarchy of triangles (F, 3) of vertices (V, 3), with the queries of :class:`_EmbreeEngine`."""
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         corners = vertices[faces].astype(np.float64)
@@ -155,7 +158,7 @@ class _BoxHierarchy:
 
 
 def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Order of triangles, node boxes, and per node (first of two children, 0) or (first triangle, count)."""
+    """Return triangle order, node boxes, and per node (first child of two, 0) or (first triangle, count)."""
     order = np.arange(len(low))
     middle = (low + high) / 2
     boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]
@@ -182,7 +185,7 @@ def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDAr
 
 @numba.njit(nogil=True, error_model="numpy")
 def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
-    """Distance at which a ray enters the box of a node, or infinity."""
+    """Return the distance at which a ray enters the box of a node; infinity if it does not."""
     near, far = 0.0, limit
     for axis in range(3):
         a, b = (low[node, axis] - o[axis]) * inverse[axis], (high[node, axis] - o[axis]) * inverse[axis]
@@ -195,7 +198,7 @@ def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-u
 
 @numba.njit(nogil=True, error_model="numpy")
 def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
-    """Barycentric u and v of a ray's meeting with a triangle (3, 3), and its distance; -1 where there is none."""
+    """Return barycentric u, v and distance of a ray's hit on a triangle (3, 3); -1 without a hit."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx
@@ -235,7 +238,7 @@ def _trace_rays(corners, low, high, links, origins, directions, limits, any_hit)
                 near_b = _raycast_box_entry(low, high, a + 1, o, inverse, best)
                 nearer = a if near_a <= near_b else a + 1
                 near, far = min(near_a, near_b), max(near_a, near_b)
-                if far < best:  # below the nearer one
+                if far < best:  # under the nearer one in the stack
                     stack[top], entry[top] = 2 * a + 1 - nearer, far
                     top += 1
                 if near < best:

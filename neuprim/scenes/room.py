@@ -1,7 +1,7 @@
 """The scene ``room`` on disk: photographs through a lens, from a walk around the solids, and reconstructed points.
 
 transforms.json, images/...    the layout of nerfstudio, with OpenCV's distortion and a split
-points.ply                     what a reconstruction would know: points where there is detail, a few of them wrong
+points.ply                     simulated reconstruction: points where there is detail, a few of them wrong
 exposures.json                 the factor that each image is multiplied by
 """
 
@@ -94,12 +94,12 @@ def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = 
 
 
 def build_room(settings: RoomSettings) -> Room:
-    """The room, for rays as close as those of the images."""
+    """Build the room, its textures filtered for the spacing of the images' rays."""
     return Room(build_solids(), furnish_room(), 1 / (room_lens(settings).focal * settings.supersampling))
 
 
 def room_exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
-    """(count,) factors of training images, whose binary logarithms are even between minus and plus ``stops``."""
+    """Return (count,) gains of training images, their log2 uniform in -``stops``..``stops``."""
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
 
 
@@ -167,28 +167,28 @@ class RoomLens:
 
     @property
     def focal(self) -> float:
-        """In pixels, along both axes: 75 degrees of view across."""
+        """Focal length in pixels, both axes: 75 degrees of horizontal field of view."""
         return 0.65 * self.width
 
     @property
     def camera(self) -> Camera:
-        """The pinhole of the undistorted image, in its own frame; the principal point is a little off the middle."""
+        """Pinhole of the undistorted image at the identity pose, its principal point slightly off centre."""
         centre = 0.504 * self.width, 0.495 * self.height
         return Camera(torch.eye(4, dtype=torch.float64), self.focal, self.focal, *centre, self.width, self.height)
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M, 2) photographed pixels of (M, 2) undistorted directions (x/z, y/z), OpenCV axes; centres at +0.5."""
+        """Return (M, 2) distorted pixels of directions (x/z, y/z), OpenCV axes; centres at +0.5."""
         return self.distortion.project(points, self.camera)
 
     def rays(self, pose: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(M, 3) unit directions in the scene of (M, 2) photographed pixels; ``pose`` (4, 4) as everywhere."""
+        """Return (M, 3) unit ray directions of (M, 2) distorted pixels; ``pose`` (4, 4): camera to world."""
         x, y = self._undistort(pixels).T
         local = np.stack([x, -y, -np.ones_like(x)], axis=1)
         local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
         return local @ pose[:3, :3].T
 
     def _undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """The inverse of :meth:`pixels`, by fixed-point iteration: the lens moves nothing far."""
+        """Invert :meth:`pixels` by fixed-point iteration, as the lens displaces little."""
         middle = [self.camera.cx, self.camera.cy]
         bent = (pixels - middle) / self.focal
         points = bent.copy()
@@ -200,7 +200,7 @@ class RoomLens:
         return points
 
     def ray_bands(self, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
-        """(N, 3) unit directions in the scene, whole rows of pixels at a time, ``samples`` rays per pixel side."""
+        """Yield (N, 3) unit ray directions by whole pixel rows, ``samples`` rays per pixel side."""
         across = (np.arange(self.width * samples) + 0.5) / samples
         down = (np.arange(self.height * samples) + 0.5) / samples
         rows = max(1, RAYS_AT_ONCE // (len(across) * samples)) * samples
@@ -210,14 +210,14 @@ class RoomLens:
 
 
 def room_lens(settings: RoomSettings) -> RoomLens:
-    """The lens that the images are taken with."""
+    """Return the lens that the images are taken with."""
     return RoomLens(settings.size, LENS if settings.distortion else RadialDistortion())
 
 
 def photograph_room(
     room: Room, lens: RoomLens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
 ) -> NDArray[np.uint8]:
-    """(H, W, 3) sRGB, of linear light that is averaged over the rays of each pixel and multiplied by ``gain``."""
+    """Render (H, W, 3) uint8 sRGB of linear light, averaged over rays and multiplied by ``gain``."""
     bands = (room_lamplight_radiance(room, pose[:3, 3], d) for d in lens.ray_bands(pose, supersampling))
     mean = np.concatenate([average_scene_rays(band, lens.width, supersampling) for band in bands])
     return np.round(encode_scene_srgb(mean * np.float32(gain)) * 255).astype(np.uint8)
@@ -227,7 +227,7 @@ def photograph_room(
 
 
 def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
-    """Where on the walk, 0 to 1, photographs are taken: test ones evenly, training ones between them."""
+    """Return positions on the walk, 0..1, by split: test views evenly, training views between them."""
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
     first = np.searchsorted(gap, gap)
@@ -236,7 +236,7 @@ def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]
 
 
 def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
-    """Camera-to-world matrices (4, 4), OpenGL axes, of both splits; the test ones depend on their own number alone."""
+    """Return (4, 4) camera-to-world matrices, OpenGL axes, by split; test poses ignore ``train``."""
     poses = {}
     for split, times in room_walk_positions(train, test).items():
         shake = 2 * np.random.default_rng(_WALKS_SEEDS[split]).random((len(times), 7)) - 1
@@ -245,7 +245,7 @@ def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float6
 
 
 def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(4, 4) at ``t`` of two rounds; ``shake`` (7,) of -1..1 moves hand, aim and horizon."""
+    """Return the (4, 4) pose at ``t``, 0..1, of two rounds; ``shake`` (7,), -1..1, moves eye, aim, roll."""
     turn = 2 * math.pi
     distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
     height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]
@@ -264,7 +264,7 @@ def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class ReconstructedPoints(NamedTuple):
-    """N points."""
+    """N points of a simulated reconstruction."""
 
     # surface, position: (N, 3) float64 where they really are, and where they are said to be
     surface: NDArray[np.float64]
@@ -283,9 +283,8 @@ def reconstruct_room_points(
 ) -> ReconstructedPoints:
     """Return ``count`` points, each seen by the training camera that found it and at least one other.
 
-    ``poses`` (4, 4) are camera to world; detail is looked for in ``luma``: camera -> (H, W) brightness. Raises
-    ConfigError
-    if the cameras have too little in view together.
+    ``poses`` (4, 4) are camera to world; points are drawn where ``luma``, camera -> (H, W) brightness, has detail.
+    Raises ConfigError if the cameras have too little in view together.
     """
     chances = [_room_pixel_detail_chances(luma(i)) for i in range(len(poses))]
     directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)
@@ -322,7 +321,7 @@ def reconstruct_room_points(
 
 
 def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(H * W,) running sum, up to 1, of the chance of every pixel: as much as brightness changes there."""
+    """Return the (H * W,) cumulative probability of pixels, which grows with the brightness gradient."""
     down, across = np.gradient(luma.astype(np.float64))
     detail = np.hypot(down, across)
     total = np.cumsum((detail + _PLAIN * max(detail.mean(), 1e-6)).ravel())
@@ -332,7 +331,7 @@ def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]
 def _room_seen_by_another(
     room: Room, lens: RoomLens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """(M,) whether what ``camera`` sees in these directions (M, 3) is visible to another camera, in its picture."""
+    """Return (M,) bool: whether what ``camera`` sees along ``directions`` is visible in another image."""
     hits = room.intersect(poses[camera][:3, 3], directions)
     starts = hits.lifted()
     seen = np.zeros(len(starts), dtype=np.bool_)
@@ -353,12 +352,14 @@ def _room_seen_by_another(
 
 # ---------------------------------------------------------------- rays in the room
 
-_GRAZING = np.float32(0.04)  # least cosine between a ray and a surface's normal for the width that the ray stands for
+_GRAZING = np.float32(0.04)  # least cosine of the angle of incidence in the width of a ray's footprint
 
 
 class Room(Scene):
-    """Solids, and furnishings whose textures are averaged over what a ray covers; rays are ``spacing`` apart at
-    distance 1."""
+    """Solids and furnishings, with textures averaged over ray footprints.
+
+    Rays are ``spacing`` apart at distance 1.
+    """
 
     def __init__(
         self, solids: Sequence[Solid], around: Sequence[Furnishing], spacing: float, engine: Engine = "auto"
@@ -370,11 +371,10 @@ class Room(Scene):
         self._spacing = np.float32(spacing)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """As of any scene, for directions of unit length."""
+        """Intersect as :meth:`Scene.intersect`, for directions of unit length."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
-        # A pixel covers an ellipse of the surface; its area decides, so grazing views blur across rather than flicker
-        # along.
+        # The footprint is an ellipse; the width is the root of its area, so grazing views blur instead of flickering.
         root: NDArray[np.float32] = np.sqrt(np.maximum(np.abs(shading_dot(hits.face, towards)), _GRAZING))
         width = hits.distance * self._spacing / root
         albedo = hits.albedo.copy()
@@ -386,7 +386,7 @@ class Room(Scene):
 
 
 def room_lamplight_radiance(room: Room, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
-    """(N, 3) linear RGB that N rays (``origins`` (N, 3) or (3,), unit ``directions``) see."""
+    """Return (N, 3) linear RGB of rays with ``origins`` (N, 3) or (3,), unit ``directions``."""
     d = np.asarray(directions, dtype=np.float32)
     hits = room.intersect(origins, d)
     to_eye = -d[hits.hit]

@@ -28,7 +28,10 @@ _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 
 def stripes(x: Array, period: float, part: float, width: Array) -> Array:
-    """(M,) share of intervals of ``width`` about ``x`` that the first ``part`` (0..1) of every ``period`` covers."""
+    """Return (M,) box-filtered stripes: the share of ``width`` about ``x`` that stripes cover.
+
+    A stripe is the first ``part``, 0..1, of every ``period``.
+    """
 
     def covered(t: Array) -> NDArray[np.float64]:  # of 0..t, in double precision, as nearly equal values are subtracted
         wide = t.astype(np.float64)
@@ -41,9 +44,10 @@ def stripes(x: Array, period: float, part: float, width: Array) -> Array:
 
 
 def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
-    """(M,) smooth noise about -1..1 of mean 0 at ``points`` (M, D), on lattices of edge ``cell``, ``cell``/2, ...
+    """Return (M,) smooth noise, about -1..1, of mean 0 at ``points`` (M, D).
 
-    Each is ``fall`` times weaker. An octave is left out where its cells are smaller than about ``width`` (M,).
+    Octaves have lattices of edge ``cell``, ``cell``/2, ...; each is ``fall`` times as strong as the last, and left out
+    where its cells are smaller than about ``width`` (M,).
     """
     total, strength = np.zeros(len(points), dtype=np.float32), 1.0
     for octave in range(octaves):
@@ -56,7 +60,7 @@ def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: 
 
 
 def cell_random(index: NDArray[np.integer], seed: int) -> Array:
-    """(M,) numbers 0..1, evenly spread and without pattern, one for each of the whole coordinates ``index`` (M, D)."""
+    """Return (M,) uniform numbers 0..1, hashed from the integer coordinates ``index`` (M, D)."""
     h = np.full(len(index), (seed * 0x27D4EB2F + 0x165667B1) & 0xFFFFFFFF, dtype=np.uint32)
     for axis in range(index.shape[1]):
         h = (h ^ index[:, axis].astype(np.int64).astype(np.uint32)) * np.uint32(_PRIMES[axis % 3])
@@ -69,13 +73,16 @@ def cell_random(index: NDArray[np.integer], seed: int) -> Array:
 
 
 def mix_colours(one: Array, other: Array, share: Array) -> Array:
-    """(M, 3) from ``one`` where ``share`` (M,) is 0 to ``other`` where it is 1; both (3,) or (M, 3)."""
+    """Blend from ``one`` at ``share`` (M,) 0 to ``other`` at 1, both (3,) or (M, 3), to (M, 3)."""
     t = np.clip(share, 0, 1)[:, None].astype(np.float32, copy=False)
     return one + t * (other - one)
 
 
 def _lattice_noise(points: Array, seed: int) -> Array:
-    """(M,) values of -1..1 at integer coordinates, blended in between by a quintic with two smooth derivatives."""
+    """Return (M,) random values -1..1 of a lattice, interpolated by a quintic.
+
+    Its first two derivatives are smooth.
+    """
     base = np.floor(points)
     t = points - base
     t = t * t * t * (t * (t * 6 - 15) + 10)
@@ -102,7 +109,7 @@ def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) ->
 def planks(
     dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2
 ) -> Texture:
-    """Boards along one axis beside each other along another, each of its own tone, with a grain and narrow gaps."""
+    """Boards along ``along``, side by side ``across``, each of its own tone, with grain and gaps."""
     one, other = parse_solid_srgb(dark), parse_solid_srgb(light)
 
     def texture(p: Array, w: Array) -> Array:
@@ -223,7 +230,7 @@ def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5
 
 
 def marble(seed: int) -> Texture:
-    """Dark veins through something light, in all three dimensions."""
+    """Dark veins through light stone, in all three dimensions."""
     light, vein = parse_solid_srgb("#e4e0d8"), parse_solid_srgb("#5a6470")
 
     def texture(p: Array, w: Array) -> Array:
@@ -241,7 +248,7 @@ def rug(radius: float, seed: int) -> Texture:
     def texture(p: Array, w: Array) -> Array:
         r: Array = np.hypot(p[:, 0], p[:, 1])
         turn = (np.arctan2(p[:, 1], p[:, 0]) / np.float32(2 * np.pi)).astype(np.float32)
-        around: Array = w / np.maximum(np.float32(2 * np.pi) * r, np.float32(0.1))  # what the width is in turns
+        around: Array = w / np.maximum(np.float32(2 * np.pi) * r, np.float32(0.1))  # the width in turns
         ring = stripes(r, radius / 4, 0.5, w)
         wedge = stripes(turn, 1 / 36, 0.5, around)
         colour = mix_colours(mix_colours(red, cream, wedge), navy, ring)
@@ -254,7 +261,7 @@ def rug(radius: float, seed: int) -> Texture:
 
 
 def sky(seed: int, low: float, high: float) -> Texture:
-    """Clouds before a blue that pales from the height ``high`` down to ``low``; what is behind a window."""
+    """View through a window: clouds on a blue that pales from height ``high`` down to ``low``."""
     zenith, horizon, cloud = parse_solid_srgb("#4f8fd6"), parse_solid_srgb("#cfe3f2"), parse_solid_srgb("#ffffff")
 
     def texture(p: Array, w: Array) -> Array:
@@ -268,7 +275,7 @@ def sky(seed: int, low: float, high: float) -> Texture:
 Corner = tuple[float, float, float]
 
 LOW, HIGH = (-6.0, -6.0, -1.6), (6.0, 6.0, 3.4)  # opposite corners of the room's inside; solids are in [-1, 1]^3
-LAMP = (1.5, -1.9, 2.55)  # the middle of the lamp's bulb, which is a point for shading
+LAMP = (1.5, -1.9, 2.55)  # the middle of the lamp's bulb, a point light in shading
 LAMP_POWER = (39.0, 35.8, 30.0)  # linear RGB irradiance at distance 1; it falls with the distance squared
 ABOVE, BELOW = (0.31, 0.32, 0.34), (0.27, 0.25, 0.23)  # linear RGB radiance from straight above and straight below
 BULB = 0.14
@@ -276,7 +283,7 @@ _UP = [0, 0, 1]
 
 
 class Furnishing(NamedTuple):
-    """One closed body of the room; its ``texture`` glows, if ``glow`` is above 0, and then shows no other light."""
+    """One closed body; with ``glow`` above 0 its ``texture`` emits light and reflects none."""
 
     name: str
     mesh: trimesh.Trimesh
@@ -286,19 +293,22 @@ class Furnishing(NamedTuple):
 
 
 def furnish_room() -> list[Furnishing]:
-    """All of the room but the solids, the same at every call. A cylinder of radius 4.7 about z is free of furniture."""
+    """Build the room but the solids, the same at every call.
+
+    A cylinder of radius 4.7 about z is free of furniture.
+    """
     inside = [*_wall_furnishings(), *_table_furnishings(), *_lamp_furnishings()]
     inside += [*_brick_side_furnishings(), *_plaster_side_furnishings()]
     return [*inside, *_wallpaper_side_furnishings(), *_tile_side_furnishings()]
 
 
 def _room_corner_box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
-    """A box with these opposite corners."""
+    """Build a chamfered box with these opposite corners."""
     return chamfered_box(np.subtract(high, low), np.add(low, high) / 2, chamfer)
 
 
 def _wall_slab(low: Corner, high: Corner) -> trimesh.Trimesh:
-    """A box whose edges are not cut."""
+    """Build a box without chamfers."""
     mesh = trimesh.creation.box(extents=np.subtract(high, low))
     mesh.apply_translation(np.add(low, high) / 2)
     return mesh
@@ -311,7 +321,7 @@ def _room_corner_boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -
 def _picture_frame(
     x: float, y: float, low: float, high: float, half: float, along: int, width: float, depth: float
 ) -> trimesh.Trimesh:
-    """Four bars around an opening of half width ``half`` between two heights, on a wall along an axis."""
+    """Build four bars on a wall around an opening of half width ``half``, from ``low`` to ``high``."""
     middle = np.array([x, y, (low + high) / 2])
     side = np.eye(3)[along]
     upright, level = np.full(3, depth), np.full(3, depth)

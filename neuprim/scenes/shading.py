@@ -1,4 +1,4 @@
-"""How the solids reflect light: Lambert's reflectance plus Blinn and Phong's highlight in its energy-scaled form,
+"""Reflectance of the solids: Lambert's reflectance plus Blinn and Phong's highlight in its energy-scaled form,
 
 f = albedo / pi + k (n + 8) / (8 pi) (N.H)^n,     k = specular gloss,  n = 6 + 110 gloss^2.
 """
@@ -31,12 +31,15 @@ DAYLIGHT = Daylight()
 
 
 def shading_dot(a: Array, b: Array) -> Array:
-    """(M,) products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
+    """Return (M,) dot products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
     return np.einsum("nc,nc->n", a, np.broadcast_to(b, a.shape))  # several times faster than a sum over three
 
 
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """(M,) cosine to the light, at least 0, and pi times the highlight's reflectance; directions are unit vectors."""
+    """Return (M,) cosines to the light, at least 0, and pi times highlight reflectance.
+
+    Directions are unit vectors.
+    """
     eye, light = np.asarray(to_eye, dtype=np.float32), np.asarray(to_light, dtype=np.float32)
     cosine = np.maximum(shading_dot(hits.normal, light), 0)
     half: Array = eye + light
@@ -49,7 +52,7 @@ def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tup
 
 
 def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
-    """(M, 3) linear RGB radiance towards the eye per unit irradiance of a surface that faces the light."""
+    """Return (M, 3) linear RGB radiance to the eye, per unit irradiance of a surface facing the light."""
     cosine, highlight = reflectance_lobes(hits, to_eye, to_light)
     return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
 
@@ -57,7 +60,7 @@ def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
 def scene_daylight_radiance(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """(N, 3) linear RGB that N rays see, zero where nothing is hit, and (N,) bool of hits."""
+    """Return (N, 3) linear RGB of N rays, zero where nothing is hit, and an (N,) bool hit mask."""
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)
     to_eye = -d[hits.hit]
@@ -74,7 +77,10 @@ def scene_daylight_radiance(
 
 
 def scene_light_visibility(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> NDArray[np.bool_]:
-    """(M,) whether light from ``to_light`` (M, 3), ``away`` lengths of it far, reaches the surfaces."""
+    """Return (M,) bool: whether light from ``to_light`` (M, 3) reaches the hits.
+
+    ``away`` is its distance in lengths of ``to_light``.
+    """
     lit: NDArray[np.bool_] = shading_dot(hits.face, to_light) > 0  # what faces away is in its own shadow: no ray needed
     lit[lit] = ~scene.occluded(hits.lifted()[lit], to_light[lit], np.broadcast_to(away, len(lit))[lit])
     return lit
@@ -96,7 +102,7 @@ def add_scene_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, g
 
 
 def encode_scene_srgb(linear: Array) -> Array:
-    """Display values 0..1 of linear ones, clipped (IEC 61966-2-1)."""
+    """Convert linear values, clipped to 0..1, to sRGB display values (IEC 61966-2-1)."""
     x = np.clip(linear, 0, 1)
     curve = 1.055 * np.maximum(x, np.float32(0.0031308)) ** np.float32(1 / 2.4) - 0.055
     return np.where(x <= 0.0031308, 12.92 * x, curve).astype(np.float32)

@@ -85,10 +85,10 @@ def arc_tube(
     radii: ArrayLike,
     sections: int = 64,
 ) -> trimesh.Trimesh:
-    """Sweep a tube along a circular arc of the plane of ``first`` (angle 0) and ``second``, at (n,) ascending
-    ``angles``.
+    """Sweep a tube along a circular arc in the plane of ``first`` (angle 0) and ``second``.
 
-    ``radii`` are (n, 2) half axes in the arc's plane and across it; (n,) or a number for a round cross-section.
+    ``angles`` (n,) are ascending. ``radii`` are (n, 2) half axes in the arc's plane and across it; (n,) or a number
+    for a round cross-section.
     """
     one, two = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     outward = np.cos(angles)[:, None] * one + np.sin(angles)[:, None] * two
@@ -102,7 +102,7 @@ def arc_tube(
 
 
 def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
-    """Rings about ``path`` (n, 3) in the planes of ``side`` (n, 3) and ``across`` (3,), joined and capped."""
+    """Build a capped tube of rings about ``path`` (n, 3), in the planes of ``side`` and ``across``."""
     turn = 2 * np.pi * np.arange(sections) / sections
     in_plane = (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
     rings = path[:, None] + in_plane + (half[:, 1:] * np.sin(turn))[..., None] * across  # (n, sections, 3)
@@ -120,14 +120,14 @@ def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sec
 
 
 def merge_solid_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """All of them as one mesh, each with vertices of its own even where they touch, so that each stays closed."""
+    """Merge meshes without sharing vertices where they touch, so that each stays closed."""
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start[:-1], strict=True)]
     return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), process=False)
 
 
 def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals at corners: the angle-weighted mean of the vertex's faces that turn by little."""
+    """Return (F, 3, 3) unit corner normals: angle-weighted means of faces within the crease angle."""
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
     places = (np.arange(corners), faces.ravel())
@@ -141,7 +141,7 @@ def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
         blend = sparse.csr_matrix((angles[pairs.col] * smooth, (pairs.row, other)), shape=(pairs.shape[0], len(faces)))
         normals[begin : begin + _CORNERS_AT_ONCE] = blend @ flat
     length = np.linalg.norm(normals, axis=1, keepdims=True)
-    own_face = np.repeat(flat, 3, axis=0)  # for needles, which have no angle
+    own_face = np.repeat(flat, 3, axis=0)  # for degenerate triangles, which have no angle
     normals = np.where(length > 0, normals / np.where(length > 0, length, 1.0), own_face)
     return normals.reshape(-1, 3, 3)
 
@@ -160,19 +160,19 @@ class Solid:
 
 
 def parse_solid_srgb(code: str) -> NDArray[np.float32]:
-    """(3,) linear RGB of a display colour "#rrggbb" (IEC 61966-2-1)."""
+    """Return (3,) linear RGB of a display colour "#rrggbb" (IEC 61966-2-1)."""
     value = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def uniform_colour(code: str) -> Albedo:
-    """One colour everywhere."""
+    """Return an albedo of one colour everywhere."""
     colour = parse_solid_srgb(code)
     return lambda position: np.broadcast_to(colour, position.shape)
 
 
 def _two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], NDArray[np.bool_]]) -> Albedo:
-    """``other`` where ``is_other`` (positions (M, 3) -> (M,) bool) holds, else ``code``."""
+    """Return an albedo: ``other`` where ``is_other``, positions (M, 3) -> (M,) bool, else ``code``."""
     first, second = parse_solid_srgb(code), parse_solid_srgb(other)
     return lambda position: np.where(is_other(position)[:, None], second, first)
 
@@ -181,7 +181,7 @@ def _two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], N
 
 
 def build_solids() -> list[Solid]:
-    """All solids of the scene, the same at every call."""
+    """Build all solids of the scene, the same at every call."""
     # Enlarged about the plate and turned, so that the bit ends over the wire cube.
     pose = trimesh.transformations.rotation_matrix(np.radians(24.0), [0.0, 0.0, 1.0])
     pose[:3, :3] *= 1.16
@@ -196,7 +196,7 @@ def build_solids() -> list[Solid]:
 
 
 def _place_solid(solid: Solid, pose: NDArray[np.float64]) -> Solid:
-    """The solid moved by a (4, 4) similarity ``pose``, its pattern moving along."""
+    """Return the solid, with its pattern, moved by the (4, 4) similarity ``pose``."""
     mesh = solid.mesh.copy()
     mesh.apply_transform(pose)
     back = np.linalg.inv(pose).astype(np.float32)

@@ -35,7 +35,7 @@ from neuprim.scenes.shading import encode_scene_srgb, scene_daylight_radiance
 from neuprim.scenes.shapes import build_solids
 
 Radiance = Callable[[Any, NDArray[np.float64], NDArray[np.float64]], tuple[NDArray[np.float32], NDArray[np.bool_]]]
-"""(scene, origins, directions) -> what :func:`~neuprim.scenes.shading.scene_daylight_radiance` returns."""
+"""(scene, origins, directions) -> radiance and hits, as :func:`~neuprim.scenes.shading.scene_daylight_radiance`."""
 
 GENERATOR_VERSION = 1  # part of the cache's key: raise it with every change to shapes, light, cameras or file layout
 
@@ -119,7 +119,7 @@ def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
 def draw_solids(
     scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = scene_daylight_radiance
 ) -> NDArray[np.uint8]:
-    """(size, size, 4) RGBA, sRGB with straight alpha. Rays are averaged premultiplied and linear, then encoded."""
+    """Render (size, size, 4) uint8 sRGB, straight alpha; rays are averaged premultiplied and linear."""
     bands = []
     for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         rgb, hit = seen(scene, pose[:3, 3], directions)

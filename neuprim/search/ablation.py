@@ -66,7 +66,7 @@ _PACES, _TRAINING = 0.2, 0.5
 """Shares of the budget for measuring step times, and, of the rest, for training single changes."""
 
 _SINGLES, _TIMES, _COMBINED = 0.58, 0.64, 0.88
-"""Shares of the rest by which single changes are trained and timed, and combinations trained."""
+"""Shares of the rest by which single changes are trained, single changes are timed, and combinations are trained."""
 
 _MAX_COMBINATIONS = 12
 
@@ -113,7 +113,7 @@ def run_ablation(
         identity = {"kind": "models", **models.identity(), "lpips": lpips, **describe_tradeoff_conditions(views)}
         record = _resume_ablation_set(folder, before, identity, tell)
         session = _AblationSession(models, (dataset, views), request, record, progress, plan)
-        # The first of every knob, then the second, so that short budgets change as many knobs as possible.
+        # The first value of every knob, then the second, so that short budgets change as many knobs as possible.
         rungs = zip_longest(*session.choose_knobs(variants).values())
         session.run([Variant(CENTRE), *(variant for rung in rungs for variant in rung if variant is not None)])
     return folder, record
@@ -171,7 +171,7 @@ class _AblationSession(TradeoffSession):
 
     def run(self, wanted: Sequence[Variant]) -> None:
         """Train single changes, then combinations, find the fronts and write them."""
-        with limit_process_threads(self._threads):  # as the trainings have
+        with limit_process_threads(self._threads):  # as many threads as a training has
             wanted = self._measure_step_times(wanted)
         alone = len({variant.knob for variant in wanted}) <= 2  # the centre and one knob: nothing to combine
         self._planned_at = self.spent
@@ -197,7 +197,7 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ step times
 
     def _measure_step_times(self, wanted: Sequence[Variant]) -> list[Variant]:
-        """Return the variants whose step time is known; makes the plan."""
+        """Measure step times and plan the training lengths; return the variants whose step time is known."""
         kept, latest = list[Variant](), self.spent + _PACES * (self.request.budget - self.spent)
         paces = {CENTRE: 1.0} if self._plan is None else dict(self._plan.paces)
         for number, variant in enumerate(wanted):
@@ -220,7 +220,7 @@ class _AblationSession(TradeoffSession):
         return AblationStepTimes(self.centre, self._loaded[0])
 
     def _find_pace(self, variant: Variant, paces: dict[str, float]) -> str | None:
-        """Measure a variant's step time; returns why it cannot be trained."""
+        """Measure a variant's step time; return why it cannot be trained, None if it can."""
         if not variant.turned:
             paces[variant.name] = 1.0
         if variant.name in paces:
@@ -240,7 +240,7 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ training
 
     def _train(self, wanted: Sequence[Variant], part: float) -> None:
-        """Train and measure what is missing and fits; the centre and begun trainings always do."""
+        """Train and measure missing variants for which there is time; the centre and begun trainings always go on."""
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
         for first in range(0, len(todo), self._workers):
@@ -339,7 +339,7 @@ def _compose_ablation_set(request: TradeoffRequest, launcher: LauncherSettings) 
 
 
 def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) -> None:
-    """Refuse a folder that holds something else, or another set."""
+    """Raise an error if the folder holds something else, or another set."""
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
@@ -354,7 +354,7 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
 def _resume_ablation_set(
     folder: Path, before: TradeoffRecord | None, identity: Mapping[str, Any], tell: Tell
 ) -> TradeoffRecord:
-    """Return the earlier record; without points if they were measured otherwise."""
+    """Return the earlier record, without its points if they were measured under other conditions."""
     record = TradeoffRecord(dict(identity))
     if before is None:
         return record

@@ -52,7 +52,7 @@ class Variant:
 
     @property
     def label(self) -> tuple[str, ...]:
-        """Its overrides as the record of what is left out has them."""
+        """Overrides as listed in the record of points that are left out."""
         return (*self.turned, *((f"{self.length:g} of the length",) if self.length != 1.0 else ()))
 
 
@@ -72,20 +72,20 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
 
 
 def merge_variant_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
-    """Return overrides with others over them, each setting once."""
+    """Return ``words`` followed by ``over``, without the overrides of ``words`` that ``over`` replaces."""
     again = {assignment.key for assignment in parse_overrides(over)}
     return [*(a.text for a in parse_overrides(words) if a.key not in again), *over]
 
 
 @dataclass
 class AblationPlan:
-    """Training lengths; a continued set keeps them.
+    """Training lengths of a set of models; a continued set keeps them.
 
     Attributes:
-        steps: of the centre.
-        seconds: of the full length, about.
-        whole: steps of the centre's configuration; 0 where its budget is in seconds.
-        paces: name of a variant -> seconds per step over the centre's.
+        steps: training steps of the centre.
+        seconds: approximate time of a training of full length.
+        whole: steps of the centre's configuration; 0 if its budget is in seconds.
+        paces: name of a variant -> its seconds per step, divided by the centre's.
     """
 
     steps: Annotated[int, Range(at_least=1)]
@@ -94,7 +94,7 @@ class AblationPlan:
     paces: dict[str, Annotated[float, Range(above=0)]] = field(default_factory=lambda: {CENTRE: 1.0})
 
     def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
-        """Return what trains a variant; interventions into the population are as many as in a full run."""
+        """Return the overrides that train a variant, with as many population interventions as in a full run."""
         steps = max(1, round(self.steps * variant.length / self.paces[variant.name]))
         budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
         every, key = centre.train.population.every, "train.population.every"
@@ -115,7 +115,7 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
 
     Args:
         pace: seconds per step of the centre.
-        lengths: of all trainings, as shares of the full length.
+        lengths: lengths of all trainings, as shares of the full length.
     """
     if centre.train.iterations is None:
         assert centre.train.max_seconds is not None, "a configuration has a budget"
@@ -128,11 +128,11 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
 
 
 class AblationStepTimes:
-    """Step times relative to the centre's, at half of the training, where every band of colour is in use.
+    """Measurement of step times relative to the centre's, at half of the training, where all colour bands are in use.
 
     Attributes:
-        seconds: per step of the centre.
-        compiling: seconds of compiling kernels.
+        seconds: seconds per step of the centre.
+        compiling: seconds that kernels took to compile.
     """
 
     def __init__(self, centre: RunConfig, dataset: Dataset) -> None:

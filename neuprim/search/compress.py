@@ -41,11 +41,11 @@ Progress = Callable[[str, float], None]
 DEFAULT_TOLERANCE = 0.1  # dB that training views may lose
 
 _SENSITIVITY_VIEWS = 48  # training views for the effects of numbers; sums over all primitives need few
-_FIRST_LOSS = 2.0  # tolerances that a model may lose at once before training, to begin with
+_FIRST_LOSS = 2.0  # loss by rounding before the first round of training, in units of the tolerance
 _ROUND_STEPS, _MAX_ROUNDS = 500, 3  # least steps of a round, and most rounds; each shows how much training recovers
 
 _SLOPE, _AIM = 0.7, 0.95
-"""dB that a trained model loses for one more dB at once; share of the tolerance that the next round aims at."""
+"""dB that a trained model loses per dB lost before training; share of the tolerance that the next round aims at."""
 
 _MAX_TRIES = 16
 
@@ -54,7 +54,7 @@ _FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the m
 
 @dataclass(frozen=True)
 class CompressRequest:
-    """What to compress, as the arguments of ``neuprim compress``.
+    """Request for :func:`compress_run`, with the arguments of ``neuprim compress``.
 
     Without level and bits, the PSNR of training views decides how many bits every number gets, within ``tolerance``.
     Without the run's data as well, a default level is used.
@@ -186,7 +186,7 @@ def _search_quantized_model(
 
 
 class TrainingData(NamedTuple):
-    """What fine-tuning trains with."""
+    """Configuration, task and data set of fine-tuning."""
 
     config: RunConfig
     task: TaskSpec
@@ -203,13 +203,13 @@ class QuantizedModel(NamedTuple):
 
 
 def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
-    """Return a canonical model as a file would hold it."""
+    """Return a canonical model with parameters rounded as a compressed file stores them."""
     params = {name: value.detach() for name, value in fake_quantize(model.params, quantizers).items()}
     return Primitives(model.density, model.colour, params)
 
 
 class QuantizationSearch:
-    """Quantize by one number: the squared error that rounding may add, as a share of the model's own."""
+    """Search for quantizers by one number: the squared error that rounding may add, as a share of the model's own."""
 
     def __init__(self, model: Primitives, dataset: Dataset, quality: SearchQuality) -> None:
         self.model = canonical_model(model)
@@ -260,7 +260,7 @@ class QuantizationSearch:
 def finetune_for_table(
     data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
 ) -> QuantizedModel:
-    """Train a model for the bits of a table; returns it untrained where training views are better so."""
+    """Fine-tune a model for a table of bits; return the untrained model if its training views are better."""
     whole = canonical_model(model)
     quantizers, quality = fit_quantizers(whole, table), SearchQuality.of_run(data.config, data.dataset)
     before = quality(dequantize(whole, quantizers))
@@ -278,10 +278,10 @@ def finetune_for_table(
 def search_fewest_bits(
     data: TrainingData, model: Primitives, tolerance: float, steps: int, progress: Progress
 ) -> QuantizedModel:
-    """Return the model in the fewest bits with which training views lose at most ``tolerance`` dB, trained for them.
+    """Fine-tune and quantize with the fewest bits at which training views lose at most ``tolerance`` dB.
 
     Args:
-        steps: of training; 0 for none.
+        steps: steps of training; 0 for none.
     """
     quality = SearchQuality.of_run(data.config, data.dataset)
     base = quality(model)
@@ -316,7 +316,7 @@ def search_fewest_bits(
 
 
 def _tolerated_error_share(decibels: float) -> float:
-    """Return the added share of the squared error that loses so many dB."""
+    """Return the increase of the squared error, as a share of it, that costs this many dB."""
     return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
 
 

@@ -81,7 +81,7 @@ _SENSITIVITY_VIEWS = 160  # views for sensitivities, at most; primitives of a sh
 _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
 """Frames with known extinction, how many of them intermediate evaluations use, and points of each."""
 
-_DRAWS_PER_FRAME = 6  # each draw is of a random frame; so many times the frames find most of them
+_DRAWS_PER_FRAME = 6  # number of draws over that of frames; each draw is of a random frame, and these find most
 
 
 class SearchQuality:
@@ -105,11 +105,11 @@ class SearchQuality:
 
     @classmethod
     def of_run(cls, config: RunConfig, dataset: Dataset) -> SearchQuality:
-        """Return the quality that decides for a run; inside volumes too, where it was trained on them."""
+        """Return the quality measure of a run; it includes the extinction if the run was trained on voxels."""
         return cls(dataset, config.renderer, config.train.supervision != "images")
 
     def __call__(self, model: Primitives, quick: bool = False) -> float:
-        """Return dB: of images, or of points if they lost more since the first model evaluated.
+        """Return the quality in dB: that of images, or of points if these lost more since the first evaluated model.
 
         Args:
             quick: evaluate fewer views and frames.
@@ -133,7 +133,7 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return dB of the extinction's error against its typical size, mean over frames."""
+        """Return -10 log10 of the mean squared error of the extinction over its scale, dB, as a mean over frames."""
         values = []
         with torch.no_grad():
             for samples in self.draws[:: max(len(self.draws) // _QUICK_FRAMES, 1) if quick else 1]:
@@ -145,7 +145,7 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_weight(self, model: Primitives) -> float:
-        """Return the error of images over that inside: the weight of changes inside."""
+        """Return the weight of changes inside: the squared error of images over that of the extinction."""
         return 10 ** ((self.inside_quality(model) - self.image_quality(model)) / 10)
 
 

@@ -1,4 +1,4 @@
-"""Prune a finished run: cut, fine-tune, evaluate, and go back where the cut was too large; write the rest as a run."""
+"""Prune a finished run: cut, fine-tune, evaluate, and undo cuts that are too large; write the result as a run."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ the rates of the run's end, so that evaluated models are as well trained."""
 
 __all__ = ["PruneRequest", "Pruning", "prune_run"]
 
-_PATIENCE = 2.0  # a model that lost at most this many tolerances is trained for another round before it is taken back
+_PATIENCE = 2.0  # a model that lost at most this many tolerances gets another round before its cut is undone
 
 _FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
 """Loss of the first cut over the tolerance; factor of the next cut; dB up to which a cut without effect is doubled."""
@@ -56,7 +56,7 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PruningStage:
-    """One round: reductions of fields, what is left, dB after the cut and after training, and whether it is kept."""
+    """One round: reductions of fields, remaining size, dB after the cut and after training, and whether it is kept."""
 
     words: tuple[str, ...]
     primitives: int
@@ -68,13 +68,13 @@ class PruningStage:
 
 @dataclass(frozen=True)
 class _PruningState:
-    """A model on the way.
+    """Intermediate model of pruning.
 
     Attributes:
         words: all reductions of its fields.
-        bite: dB that its last cut was to lose at once; cut: quality after it.
-        lost: dB since the beginning; rounds: of training since the cut.
-        fields_only: whether the cut was of whole fields alone.
+        bite: intended loss of its last cut before training, dB; cut: quality after that cut, dB.
+        lost: loss since the beginning, dB; rounds: rounds of training since the cut.
+        fields_only: whether the cut only reduced fields.
     """
 
     model: Primitives
@@ -91,7 +91,7 @@ class _PruningState:
 
 
 def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
-    """Return the share saved of a file's numbers, or of those that every frame evaluates."""
+    """Return the saved share of a file's values, or of the values per primitive (evaluated every frame) if larger."""
     per_primitive = smaller.parameters_per_primitive / model.parameters_per_primitive
     return max(1 - count_unpruned_numbers(smaller) / numbers, 1 - per_primitive)
 
@@ -101,10 +101,10 @@ class ModelShrinker:
     """Search the smallest model whose training views lose at most a tolerance.
 
     Attributes:
-        tolerance: dB.
-        steps: of fine-tuning in all; 0 for none.
-        base: dB of the full model, once evaluated.
-        stages: what was tried, in order.
+        tolerance: largest loss, dB.
+        steps: steps of fine-tuning in all rounds together; 0 for none.
+        base: quality of the full model, dB, once evaluated.
+        stages: the rounds so far, in order.
     """
 
     config: RunConfig
@@ -158,11 +158,11 @@ class ModelShrinker:
     def _next_state(
         self, best: _PruningState, untried: tuple[str, ...], bite: float, progress: float
     ) -> _PruningState | None:
-        """Return what to train next; None where nothing more can be cut."""
+        """Return the state to train next; None if nothing more can be cut."""
         if untried:  # reductions that failed together with other cuts are tried alone
             return self._reduce_fields(best, untried, bite)
         left = self.tolerance - max(best.lost, 0.0)
-        if left < _ENOUGH * self.tolerance:  # a round of training wins a little back
+        if left < _ENOUGH * self.tolerance:  # without a cut: a round of training recovers a little
             return replace(best, cut=self.base - best.lost)
         state = self._cut(best, bite if self.steps else left, progress)
         while state.numbers >= best.numbers and 0.0 < state.bite < _LARGEST_CUT and self.steps:
@@ -170,13 +170,13 @@ class ModelShrinker:
         return None if state.numbers >= best.numbers else state
 
     def _max_loss(self, before: _PruningState, now: _PruningState, best: _PruningState) -> float:
-        """Return the dB of loss after a round beyond which a cut is taken back: more than another round would win."""
+        """Return the loss after a round, dB, beyond which a cut is undone: more than another round would recover."""
         if best.rounds and best.lost < 0:  # the model before has room, so a smaller cut saves something
             return self.tolerance
         return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
 
     def _cut(self, state: _PruningState, bite: float, progress: float) -> _PruningState:
-        """Return a model that is ``bite`` dB worse before training."""
+        """Return the state after a cut that costs about ``bite`` dB before training."""
 
         def quick(model: Primitives) -> float:
             return self.quality(model, quick=bool(self.steps))
@@ -237,7 +237,7 @@ class ModelShrinker:
 
 @dataclass(frozen=True)
 class PruneRequest:
-    """What to prune, as the arguments of ``neuprim prune``.
+    """Request for :func:`prune_run`, with the arguments of ``neuprim prune``.
 
     Attributes:
         tolerance: PSNR that training views may lose, dB.

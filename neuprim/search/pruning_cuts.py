@@ -28,7 +28,7 @@ def _units(model: Primitives) -> dict[str, PrunableUnit]:
 
 
 def count_unpruned_numbers(model: Primitives) -> int:
-    """Return how many numbers a file holds: all but units that are zero."""
+    """Return how many parameter values a file stores: all except those of units that are zero."""
     zeros = sum(
         count_unit_numbers(unit, model.params) * int((~primitives_with_unit(unit, model.params)).sum())
         for unit in _units(model).values()
@@ -37,7 +37,7 @@ def count_unpruned_numbers(model: Primitives) -> int:
 
 
 def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
-    """Return parameter -> (N, ...) bool of the numbers in units that are zero."""
+    """Return parameter -> (N, ...) bool mask of the values in units that are zero."""
     masks: dict[str, Tensor] = {}
     for unit in _units(model).values():
         gone = ~primitives_with_unit(unit, model.params)
@@ -60,7 +60,7 @@ def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
 def price_cuts(
     model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: SearchQuality
 ) -> Sensitivity:
-    """Return mean squared changes of images without each primitive and unit; changes inside count by their weight."""
+    """Return the mean squared change of images if a primitive or unit is removed, plus weighted changes inside."""
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
@@ -80,7 +80,7 @@ def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQu
 
 
 class _Sizes(NamedTuple):
-    """Nonzero numbers of each primitive, (N,); of each unit who has it, (N,) bool, and its numbers."""
+    """Number of nonzero values per primitive, (N,); per unit which primitives have it, (N,) bool, and its values."""
 
     whole: Tensor
     present: dict[str, Tensor]
@@ -90,10 +90,10 @@ class _Sizes(NamedTuple):
 def cut_to_loss(
     model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
 ) -> Primitives:
-    """Remove everything below a price per number, the price at which the model loses ``loss`` dB now.
+    """Remove primitives and units below the highest price per value at which the model loses at most ``loss`` dB.
 
     Args:
-        prices: of this model, see :func:`price_cuts`.
+        prices: changes of images for this model, see :func:`price_cuts`.
     """
     units = _units(model)
     present = {name: primitives_with_unit(unit, model.params).cpu() for name, unit in units.items()}

@@ -54,7 +54,7 @@ _COMBINATIONS = 24
 
 
 def format_tradeoff_render_command(run_dir: str, overrides: Sequence[str]) -> str:
-    """Return the command that draws the test views so."""
+    """Return the command that renders the test views with these overrides."""
     return shlex.join(["neuprim", "render", run_dir, "--camera", "test", *overrides])
 
 
@@ -130,7 +130,7 @@ class _RenderTradeoffSession(TradeoffSession):
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
-        """Yield what can be drawn here and differs; the record says what is left out."""
+        """Yield (knob, configuration) that can be rendered here and differ; the record lists the others."""
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
             for config in configs:
@@ -154,7 +154,7 @@ class _RenderTradeoffSession(TradeoffSession):
             self.write_record()
 
     def draws_the_reference(self, point: TradeoffPoint) -> bool:
-        """Return whether a point draws as the reference does, so that only its bytes differ."""
+        """Return whether a point has the reference's settings and resolution, so that only its bytes differ."""
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 

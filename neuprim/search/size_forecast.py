@@ -75,7 +75,7 @@ def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
 
 
 def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> tuple[float, float]:
-    """Return two close numbers of primitives, of which the first is low; bisects their logarithms."""
+    """Bisect on a logarithmic scale; return two close numbers of primitives, of which the first ``is_low``."""
     for _ in range(60):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if is_low(middle) else (low, middle)
@@ -110,7 +110,7 @@ class SizeCurve:
 
     @property
     def slope(self) -> float:
-        """dB per doubling at the upper end."""
+        """dB per doubling of the primitives at the largest size."""
         return self._end_slope(-1)
 
     def at(self, primitives: float) -> float:
@@ -138,7 +138,7 @@ class SizeCurve:
 
 
 class SizeProposal(NamedTuple):
-    """Try another size, take this one, or report the target as unreachable with this one as the best."""
+    """Next step of a search: try this size, take it, or report the target as unreachable with it as the best."""
 
     kind: Literal["try", "take", "unreachable"]
     primitives: int

@@ -1,6 +1,6 @@
 """Search the smallest model that meets a target: short trials of several sizes, changed settings, then full runs.
 
-Every stage reads the record and requests the next training, so an interrupted search takes the same way again.
+Every stage reads the record and requests the next training, so a resumed search makes the same decisions again.
 """
 
 from __future__ import annotations
@@ -51,15 +51,15 @@ _SHORTER, _PACE_STEPS, _MIN_STEPS = 8, 24, 16
 _MAX_SIZES, _MAX_CHANGES, _MAX_FULL = 6, 4, 5
 
 _MIN_SLOPE = 0.8  # dB that twice as many primitives gain in full runs, at least; short trials may show less
-_BEYOND, _BELOW = 2.0, 3.0  # a full run has at most and least this factor of the sizes tried
+_BEYOND, _BELOW = 2.0, 3.0  # a full run has at most this many times the largest, and 1/this of the smallest size tried
 
 _MIN_STEP, _MORE_STEPS = 1.07, 0.75
 """Least factor between the sizes of two full runs, and least share of the steps of another to compare with it."""
 
 _MORE = 1.25  # factor by which limits must allow more primitives for another full run
 _SLOWER = 1.5  # a full run that becomes this many times slower is cut short
-_PAYS = 0.97  # share of the bytes that a changed setting must leave, at most
-_MAX_REFUSED = 2  # values of a setting that may fail before it is left
+_PAYS = 0.97  # largest share of the bytes that a changed setting may leave to be adopted
+_MAX_REFUSED = 2  # values of a setting that may fail before the search leaves it
 
 
 # ---------------------------------------------------------------- settings that save bytes
@@ -125,7 +125,7 @@ def setting_change_pays(loss: float, size: float, slope: float) -> bool:
 
 @dataclass
 class SizeSearch:
-    """One search; resumes from its record."""
+    """Search for the smallest model that meets a target; resumes from its record."""
 
     config: RunConfig
     target: SearchTarget
@@ -157,7 +157,7 @@ class SizeSearch:
                 self.record.stage = number
 
     def _measure_pace(self) -> None:
-        """Choose the length of trials from a few steps."""
+        """Measure the time of a few steps, and choose the number of steps of a trial from it."""
         if self.record.length:
             return
         (first,) = self.runner.run(Attempt("pace", {}, self.config.model.count, int(min(_PACE_STEPS, self.max_steps))))
@@ -177,7 +177,7 @@ class SizeSearch:
         )
 
     def _highest(self) -> int:
-        """Return the primitives whose full run has twice the steps of a trial, and that limits allow."""
+        """Return the largest number of primitives that limits allow, and whose full run has twice a trial's steps."""
         low = high = self.config.model.count
         while self.full_steps(high) > 2 * self.record.length and high < 2**24:
             low, high = high, 2 * high
@@ -204,12 +204,12 @@ class SizeSearch:
         self._try_size(first)
         lengthened = False
         while not self.record.turns and self.full_steps(first) >= 1.9 * _SHORTER * self.record.length:
-            self.record.length, lengthened = 2 * self.record.length, True  # steps are faster than the first few were
+            self.record.length, lengthened = 2 * self.record.length, True  # steps are faster than the first ones
         if lengthened:
             self._try_size(first)
         own = [a.primitives for a in self.record.attempts if a.purpose == "size" and a.words == self.record.words]
         begun = list(dict.fromkeys(own))
-        for count in begun:  # before an interruption
+        for count in begun:  # sizes of an interrupted search
             self._try_size(count)
         for _ in range(_MAX_SIZES - len(begun)):
             proposal = self._propose()
@@ -257,7 +257,7 @@ class SizeSearch:
         return max(found, 1)
 
     def _least_useful(self) -> int:
-        """Return the least size of another full run while all have more than the target.
+        """Return the smallest useful size of another full run, while all full runs exceed the target.
 
         Short trials of different sizes are often alike, and full runs are not.
         """
@@ -343,7 +343,7 @@ class SizeSearch:
         return MIN_MARGIN <= margin <= _MAX_MARGIN and attempt.count <= _NEAR * self._wanted()
 
     def _plan_full(self) -> Attempt | None:
-        """Return the next full run; None where another has no time or would not differ."""
+        """Return the next full run; None if there is no time for it or it would not differ."""
         finished, wanted, budget = self.record.finished("full"), self._wanted(), self.record.asked["budget"]
         pace, left = self.runner.pace(wanted), self.runner.seconds_left - self._reserve(wanted)
         share = left if finished else max(left / 2, min(left, _FULL * budget))

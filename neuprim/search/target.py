@@ -54,7 +54,7 @@ __all__ = ["run_target"]
 _FIRST_SHARE = 0.05  # share of the squared error at which the search for coarse numbers begins
 
 _MAX_TUNING, _MIN_TUNING = 3, 600
-"""Most steps of fine-tuning over those of the full run, and least steps with which a model is pruned."""
+"""Largest number of fine-tuning steps over those of the full run; least number of steps to prune a model."""
 
 _KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
 
@@ -112,7 +112,7 @@ def run_target(
 
 
 def choose_target_hold_out(dataset: Dataset) -> int:
-    """Return n: every n-th training view is held out; one of eight, more of few views."""
+    """Return n, where every n-th training view is held out: 8, or fewer (2 at least) below 64 training views."""
     count = len(dataset.train)
     if count < 4:
         raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out")
@@ -158,7 +158,7 @@ def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetR
 
 @dataclass(frozen=True)
 class _TargetResult:
-    """The model after a stage.
+    """Result of the search after a stage.
 
     Attributes:
         run_dir: the run directory, or that of the pruned model in it.
@@ -217,7 +217,7 @@ def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None
 
 
 def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
-    """Write the run directory from the training's."""
+    """Write the run directory from the directory of the chosen full run; measure test views."""
     config, folder = runner.configure(attempt), runner.config.output_dir
     runner.events(Finishing("measuring test views"))
     resumed = replace(config, resume=True)
@@ -246,7 +246,7 @@ def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str
 def _prune_full_run(
     runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _TargetResult
 ) -> _TargetResult:
-    """Prune as far as the target allows, in half of the time left; returns the result before if that fails."""
+    """Prune as far as the target allows, in half of the time left; return ``before`` if that does not help."""
     record, margin = runner.record, predictor.margin(before.held)
     if not predictor.target.quality or margin < 0:
         return before
@@ -277,9 +277,9 @@ def _prune_full_run(
 
 
 def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
-    """Quantize as coarsely as the target allows, at little cost if it is missed anyway.
+    """Quantize as coarsely as the target allows; if it is missed anyway, lose at most :data:`ALLOWANCE` dB more.
 
-    With a limit of bytes alone, quantize as finely as it allows.
+    With a limit of bytes alone, quantize as finely as that limit allows.
     """
     target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model_checkpoint(before.run_dir / "model.safetensors", task)

@@ -1,4 +1,4 @@
-"""Trainings of a target search: their record ``target.json``, from which a search resumes, and what runs them."""
+"""Trainings of a target search: their record ``target.json``, from which a search resumes, and their runner."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ class Attempt:
         predicted: measure -> [value, doubt], predicted before a full run.
         outcome: fields of :class:`neuprim.search.trials.Outcome`, on held-out training views.
         packed: bytes of the model compressed at the default level.
-        seconds: of all of it, by the search's clock.
+        seconds: time of the whole attempt, by the search's clock.
     """
 
     purpose: Purpose
@@ -71,7 +71,7 @@ class Attempt:
 
     @property
     def count(self) -> int:
-        """Primitives at the end."""
+        """Number of primitives at the end of the training."""
         return int(self.measured("primitives"))
 
     def repeats(self, other: Attempt) -> bool:
@@ -86,7 +86,7 @@ class SettingChange:
 
     Attributes:
         loss: measure -> dB that it costs at equal primitives.
-        size: bytes of a primitive over those before.
+        size: bytes of a primitive, divided by those before the change.
         adopted: whether the model is smaller with it, with the primitives that make up for the loss.
     """
 
@@ -104,7 +104,7 @@ class TargetRecord:
 
     Attributes:
         asked: the target and its budget, seconds.
-        same: what must be equal to keep trainings.
+        same: configuration that must be equal to keep trainings.
         hold_out: every n-th training view is held out and evaluates trainings.
         stage: number of finished stages of the search.
         length: steps of a trial; 0 until the step time is known.
@@ -192,10 +192,10 @@ def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> floa
 
 @dataclass
 class TrialRunner:
-    """Train what a search requests, unless its record has the outcome.
+    """Runner that trains what a search requests, unless its record has the outcome.
 
     Attributes:
-        config: where the search starts; dataset: the whole scene.
+        config: configuration from which the search starts; dataset: the whole scene.
         clock: seconds, monotonic; begun: its value at the start of the budget.
     """
 
@@ -249,7 +249,7 @@ class TrialRunner:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)
 
     def run(self, *wanted: Attempt) -> list[Attempt]:
-        """Return the attempts with outcomes; those of the record where it has equal ones.
+        """Train the attempts that the record does not have; return all with outcomes.
 
         KeyboardInterrupt leaves an attempt unfinished in the record; it resumes from its checkpoint.
         """
@@ -305,7 +305,7 @@ class TrialRunner:
         return forecast_time(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
 
     def overhead(self) -> float:
-        """Return the seconds of a trial beside its steps: initialization, evaluation."""
+        """Return the seconds of a trial without its steps: initialization, evaluation."""
         finished = self.record.finished("size") or self.record.finished("pace")
         return max([0.0, *(a.seconds - a.measured("pace") * a.steps for a in finished[-3:])])
 

@@ -35,7 +35,7 @@ __all__ = ["TradeoffRequest"]
 
 _MAX_CACHED = 1 << 29  # bytes of prepared models that are kept between rounds
 _PER_REFERENCE = 6  # points per drawing of the reference in a round
-_WARM_UP_SIZE = 16  # pixels of the side of a first image, so that compiling and loading are no part of a frame's time
+_WARM_UP_SIZE = 16  # side of a first image, pixels; it compiles and loads what would slow down the timed frames
 
 Renderer = Callable[[View], Tensor]
 Progress = Callable[[str, float], None]  # text, fraction 0..1 of what it names
@@ -58,14 +58,14 @@ class TradeoffSetup:
     _prepared: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
     def overrides(self, config: RenderConfig) -> tuple[str, ...]:
-        """Return what reproduces a configuration with ``neuprim render``."""
+        """Return the overrides with which ``neuprim render`` reproduces a configuration."""
         return config.to_overrides(self.config.renderer)
 
     def parse(self, overrides: Sequence[str]) -> RenderConfig:
         return parse_run_rendering(overrides, self.config.renderer, self.model)
 
     def prepare_model(self, config: RenderConfig) -> Primitives:
-        """Return the model as a configuration draws it, on its device; recent ones are cached."""
+        """Return the model for a configuration, on the configuration's device; recent models are cached."""
         key = (tuple(config.reduced.items()), config.settings.backend, config.settings.device)
         if key not in self._prepared:
             model = move_to_render_device(config.prepare_model(self.model), config.settings, self.views[0].view)
@@ -91,7 +91,7 @@ class TradeoffSetup:
         return None
 
     def renderer(self, config: RenderConfig) -> Renderer:
-        """Return what draws views of a configuration, with its model prepared."""
+        """Return a function that renders a view with a configuration, whose model it prepares beforehand."""
         model = self.prepare_model(config)
         return lambda view: config.render_view(model, view, self.dataset.background)
 
@@ -110,8 +110,8 @@ def load_tradeoff_setup(
     """Load a finished run for measuring.
 
     Args:
-        overrides: of the reference configuration, over how the run draws.
-        views: evaluation views, evenly spread.
+        overrides: overrides of the reference configuration, on top of the run's render settings.
+        views: number of evaluation views, evenly spread.
         lpips: weights for LPIPS; None for those of the run.
         loaded: data set and evaluation views, if they are loaded already.
 
@@ -165,7 +165,7 @@ def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
 
 
 def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> TradeoffPoint:
-    """Measure images, means over views, and size of a configuration."""
+    """Measure a configuration: image metrics as means over the views, and bytes of the model file."""
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
     for view in setup.views:
@@ -186,7 +186,7 @@ def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> Trad
 
 
 class TimedPoint(NamedTuple):
-    """A point to time, and what returns its renderer."""
+    """A point to time, and a function that returns its renderer."""
 
     point: TradeoffPoint
     renderer: Callable[[], Renderer]
@@ -206,9 +206,9 @@ def time_tradeoff_points(
     over views of its time over the reference's in the same view, so that brief load of the machine has no effect.
 
     Args:
-        repeats: rounds that each point should have, with those that it has already.
-        deadline: of :func:`time.monotonic`; no round starts after it, except the first.
-        done: called with (round, of how many) after each.
+        repeats: number of rounds that each point should have, including those that it has already.
+        deadline: value of :func:`time.monotonic`; a round after the first must be expected to end before it.
+        done: called with (round, number of rounds) after each round.
     """
     order = torch.Generator().manual_seed(len(timed[0].point.ms))
     most = max(repeats - len(one.point.ms) for one in timed)
@@ -246,7 +246,7 @@ def _warm_up_tradeoff_renderer(draw: Renderer, view: View) -> None:
 
 @dataclass(frozen=True)
 class TradeoffRequest:
-    """What to measure, as the arguments of ``neuprim tradeoff``.
+    """Request for a trade-off, with the arguments of ``neuprim tradeoff``.
 
     Attributes:
         words: overrides of the reference: render settings of a run, or all settings of models to train.
@@ -271,7 +271,7 @@ class TradeoffSession:
     """Measure points within a budget, find the fronts, and write record and page.
 
     Args:
-        folder: of the record and its pages.
+        folder: folder of the record and its pages.
     """
 
     def __init__(self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress) -> None:
@@ -288,7 +288,7 @@ class TradeoffSession:
 
     @property
     def no_time(self) -> str:
-        """Why a point is not measured for which no time is left."""
+        """Reason in the record for points that are not measured, as no time is left."""
         return f"no time left of the budget of {self.request.budget:g} s"
 
     def write_record(self) -> None:
@@ -317,7 +317,7 @@ class TradeoffSession:
         time_tradeoff_points(timed, self.request.repeats, views, deadline, note_round)
 
     def write_results(self, command: Callable[[Sequence[str]], str]) -> None:
-        """Write record, page and chart of the fronts; ``command`` gives the one that draws or trains a point."""
+        """Write record, page and chart of the fronts; ``command`` returns the command that makes a point."""
         self.write_record()
         self.progress("pictures of the front", 0.0)
         write_tradeoff_page(self.folder, self.record.to_dict(), self._render_front_pictures(), command)
@@ -338,7 +338,7 @@ class TradeoffSession:
 
 
 def check_knobs(request: TradeoffRequest, known: Iterable[str], owner: str) -> None:
-    """Refuse a knob that a run, or a task's models, do not have."""
+    """Raise ConfigError for a requested knob that is not ``known``; ``owner`` names the run or model that lacks it."""
     for name in request.knobs:
         if name not in (names := list(known)):
             raise ConfigError(f"--vary {name}: no such setting of {owner}{nearest(name, names)}")

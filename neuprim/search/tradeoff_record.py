@@ -20,7 +20,7 @@ TRADEOFF_FILE, TRADEOFF_FOLDER = "tradeoff.json", "tradeoff"
 """Name of the record, and its folder in the directory of a finished run."""
 
 REFERENCE, COMBINED = "reference", "combined"
-"""In place of a knob's name: the point that others are compared with, and points that change several knobs."""
+"""Values of ``knob`` of the point that others are compared with, and of points that change several knobs."""
 
 _DIGITS = 2  # decimals of PSNR that count on a front
 
@@ -29,7 +29,7 @@ _TRAINED = (
     *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
     *("centre_ms", "run_dir"),
 )
-"""Fields of every point, and those of trained models."""
+"""Fields that the file has of every point, and more fields of trained models."""
 
 _Positive = Annotated[float, Range(above=0)]
 T = TypeVar("T")
@@ -126,12 +126,12 @@ class TradeoffPoint:
     """A measured point: a way to draw a finished model, or a trained model.
 
     Attributes:
-        knob: what it changes; :data:`REFERENCE` and :data:`COMBINED` are none.
+        knob: the setting that it changes, or :data:`REFERENCE` or :data:`COMBINED`.
         words: overrides that reproduce it.
         quality: psnr, ssim, ssim_3dgs; lpips and lpips_3dgs where there are weights.
         bytes: size of the model file.
-        ms: mean milliseconds per frame of each round of timing; ratios: the same over the reference's of that round.
-        turned, length: of a trained model, the overrides over the centre's, and the share of the full training.
+        ms: mean milliseconds per frame in each round of timing; ratios: frame time over the reference's in each round.
+        turned, length: for trained models: overrides in addition to the centre's, and share of the full training.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         run_dir: run directory, relative to the record's folder; empty unless trained.
     """
@@ -164,7 +164,7 @@ class TradeoffPoint:
 
     @property
     def time(self) -> float:
-        """Milliseconds per frame; of models the centre's times the ratio, as rounds differ in load."""
+        """Milliseconds per frame; for trained models the centre's times the ratio, as rounds differ in load."""
         if self.centre_ms:
             return self.ratio * self.centre_ms
         return statistics.median(self.ms) if self.ms else float("nan")
@@ -175,7 +175,7 @@ class TradeoffPoint:
 
     @property
     def spread(self) -> float | None:
-        """Half of the interquartile range of the ratios; None of fewer than three."""
+        """Half of the interquartile range of the ratios; None for fewer than three ratios."""
         if len(self.ratios) < 3:
             return None
         low, _, high = statistics.quantiles(self.ratios, n=4, method="inclusive")
@@ -183,7 +183,7 @@ class TradeoffPoint:
 
     @property
     def doubt(self) -> float:
-        """Uncertainty of the median ratio (McGill's notches); the ratio itself of fewer than three."""
+        """Uncertainty of the median ratio (McGill's notches); the ratio itself for fewer than three ratios."""
         if self.spread is None:
             return self.ratio if self.ratios else 0.0
         return 3.14 * self.spread / len(self.ratios) ** 0.5
@@ -245,7 +245,7 @@ class TradeoffRecord:
     size: list[int] = field(default_factory=list)
 
     def changes(self, same: Mapping[str, Any]) -> list[str]:
-        """Return the names of what is another than in ``same``."""
+        """Return the names whose values differ from those in ``same``."""
         return [name for name in same if self.same.get(name) != same[name]]
 
     def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
@@ -255,7 +255,7 @@ class TradeoffRecord:
         self.left_out = [*others, LeftOutPoint(knob, words, reason)]
 
     def find_fronts(self, in_size: Callable[[TradeoffPoint], bool] = lambda point: True) -> None:
-        """Compute both fronts; that of size has the points that may be on it."""
+        """Compute both fronts; that of size only considers points for which ``in_size`` is true."""
         costs = [
             (Objectives(p.ratio, psnr := round(p.quality["psnr"], _DIGITS), p.doubt), Objectives(float(p.bytes), psnr))
             for p in self.points

@@ -58,8 +58,8 @@ class Outcome:
     Attributes:
         psnr, ssim: means over the evaluation views, in the data set's colour space.
         bytes: size of ``model.safetensors``.
-        seconds: of training; pace: of a step.
-        ms_per_frame: median over the evaluation views.
+        seconds: time of training; pace: seconds per step.
+        ms_per_frame: median render time over the evaluation views.
     """
 
     psnr: float
@@ -75,7 +75,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """Content of ``trial.json``: the settings that were asked for, the most evaluation views, and the outcome."""
+    """Content of ``trial.json``: requested settings, largest number of evaluation views, and outcome."""
 
     asked: dict[str, Any]
     views: int
@@ -101,7 +101,7 @@ def read_trial(folder: Path) -> TrialRecord | None:
 
 
 def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_run_event) -> Outcome:
-    """Train and evaluate, or read the outcome back.
+    """Train and evaluate a trial, or read its stored outcome; return the outcome.
 
     Ctrl-C finishes the step, writes a checkpoint and raises KeyboardInterrupt; the same call resumes.
 
@@ -128,7 +128,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
             return before.outcome
         record = TrialRecord(asked, trial.views)
         write_json(folder / TRIAL_FILE, {"format": _FORMAT, **asdict(record)})
-        ends: list[float] = []  # of the steps
+        ends: list[float] = []  # seconds at the end of each step
 
         def note_steps(event: Event) -> None:
             events(event)

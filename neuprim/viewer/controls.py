@@ -44,7 +44,7 @@ def format_viewer_condition(spec: ConditionSpec, value: Tensor, world: World) ->
 
 
 class ConditionControls:
-    """Per condition: a text, a slider if its range is bounded, a handle if it is a position, and a play button."""
+    """Controls of each condition: text, slider if its range is bounded, handle if it is a position, play button."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -154,7 +154,7 @@ class ConditionControls:
 
 
 class RenderControls:
-    """Quantity, resolution and render settings."""
+    """Controls of the quantity, the resolution and the render settings."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -293,7 +293,7 @@ class PrimitiveControls:
         self._show_meshes("/chosen", found, wire=True)
 
     def _show_meshes(self, name: str, found: FrameEllipsoids | None, wire: bool) -> None:
-        """Replace the ellipsoids of this name."""
+        """Replace the ellipsoids of the scene node ``name``; None removes them."""
         if name in self._meshes:
             self._meshes.pop(name).remove()
         if found is None or not len(found.rows):
@@ -331,7 +331,7 @@ class SessionManager:
 
         Args:
             server: a :class:`~neuprim.viewer.server.ViewerServer`.
-            add_training: fills the tab of a training.
+            add_training: function that fills the tab of a training.
         """
         self.server, self.scene, self.queue, self._add_training = server, scene, queue, add_training
         self.sessions: dict[int, Session] = {}

@@ -131,7 +131,10 @@ class TokenAuth:
         return None
 
     def _is_own_name(self, host: str) -> bool:
-        """A server that listens on every address also answers to any IP address, which nobody can rebind."""
+        """Return whether ``host`` is a name of this server.
+
+        A server that listens on every address also answers to any IP address, which nobody can rebind.
+        """
         name = re.sub(r":\d+$", "", host).lower()
         return name in self._hosts or (_is_unspecified_viewer_host(self._hosts[-1]) and _parse_ip(name) is not None)
 
@@ -149,13 +152,13 @@ def _is_unspecified_viewer_host(host: str) -> bool:
 
 
 def _cookie_name(host: str) -> str:
-    """Browsers send cookies to all ports of a host, so each port has its own name."""
+    """Return the cookie's name. It contains the port, because browsers send cookies to all ports of a host."""
     return f"neuprim-{host.rpartition(':')[2] if re.search(r':[0-9]+$', host) else '80'}"
 
 
 # ------------------------------------------------------------ messages
 
-MAX_MESSAGE_BYTES = 2**16  # a page sends some hundred
+MAX_MESSAGE_BYTES = 2**16  # messages of a page have some hundred bytes
 
 _MAX_TEXT = 4096
 
@@ -166,7 +169,7 @@ _Name = Annotated[str, Meta(max_length=1024)]
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """The messages that the page needs. viser knows more: uploads, commands, tunnels that share a page."""
+    """Base class of the messages that the page needs. viser has more: uploads, commands, tunnels that share a page."""
 
 
 class ViewerCameraMessage(_Message):
@@ -220,7 +223,7 @@ _DECODER = msgspec.msgpack.Decoder(_KINDS)
 
 
 class ViewerConnection(websocket_server.ServerConnection):
-    """Drops messages for which ``check_message`` returns a reason, and calls ``on_refusal`` with itself and it."""
+    """Connection that drops messages if ``check_message`` returns a reason, and calls ``on_refusal(self, reason)``."""
 
     def __init__(
         self,
@@ -286,7 +289,7 @@ def refuse_control_value(handle: Any, value: Any) -> str | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Whether only this machine reaches a server on this host."""
+    """Return whether only this machine can reach a server on this host."""
     address = _parse_ip(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
@@ -296,7 +299,7 @@ class ViewerServer:
 
     Attributes:
         viser: the ``ViserServer``.
-        address: of the page, with the token.
+        address: address of the page, with the token.
 
     Raises:
         ConfigError: host or port are unavailable.

@@ -25,8 +25,8 @@ from neuprim.viewer.viewer_scene import COLOUR, ViewerScene, Viewpoint
 
 DEFAULT_LONGEST = 960  # pixels
 
-_SMOOTH_SECONDS = 0.05  # that an image may take while the camera moves
-_STILL_SECONDS = 0.2  # without a change before the full image is drawn
+_SMOOTH_SECONDS = 0.05  # largest time of an image while the camera moves
+_STILL_SECONDS = 0.2  # time without a change after which the full image is drawn
 _REDRAW_SECONDS, _REDRAW_SHARE = 1.0, 9.0  # a growing model is redrawn after this time, or this many drawing times
 _FULL_QUALITY, _FAST_QUALITY = 95, 75  # of JPEG
 _MIN_RESOLUTION = 1 / 16
@@ -39,7 +39,7 @@ class _Job(NamedTuple):
 
 
 class RenderQueue:
-    """Jobs by key. A new job replaces a waiting job of the same key, so a moving camera leaves no backlog.
+    """Queue of jobs by key. A new job replaces a waiting job of its key, so a moving camera leaves no backlog.
 
     All methods are thread-safe. Jobs run on the one thread that may use the model, which calls :meth:`work`.
     """
@@ -105,7 +105,7 @@ class RenderQueue:
 
 
 def next_resolution(resolution: float, seconds: float) -> float:
-    """Return the part of the resolution for the next image while something moves, by the time of the last one."""
+    """Return the fraction of the resolution for the next image during motion, from the time of the last image."""
     if seconds > _SMOOTH_SECONDS:
         return max(resolution / 2, _MIN_RESOLUTION)
     return min(resolution * 2, 1.0) if seconds < _SMOOTH_SECONDS / 4 else resolution
@@ -113,7 +113,7 @@ def next_resolution(resolution: float, seconds: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ViewerPose:
-    """A camera as a page knows it, without its window.
+    """A page's camera without the size of its window.
 
     Attributes:
         wxyz: (4,) unit quaternion, camera to world, OpenCV axes (x right, y down, z forward).
@@ -163,7 +163,7 @@ class Session:
         closed: whether the page was closed.
         quantity: one of :func:`~neuprim.viewer.viewer_scene.list_viewer_quantities`.
         conditions: every condition of the task.
-        settings: of the image.
+        settings: render settings of the image.
         longest: pixels on the longer side of the full image.
         on_full_image: called after every full image, on the thread that has the model.
     """
@@ -220,7 +220,7 @@ class Session:
             camera.fov = pose.fov
 
     def viewpoint(self, resolution: float = 1.0) -> Viewpoint:
-        """Return what the page shows now, at a part of its resolution."""
+        """Return the viewpoint that the page shows now, at a fraction of its resolution."""
         camera = self.client.camera
         pose = ViewerPose(camera.wxyz.copy(), camera.position.copy(), float(camera.fov))
         size = fit_viewer_size((camera.image_width or 1, camera.image_height or 1), self.longest)
@@ -242,11 +242,11 @@ class Session:
         self.queue.submit((self.client.client_id, kind), run, self.report_error, delay, replace)
 
     def redraw(self) -> None:
-        """Draw as well as time allows, and fully once nothing changes any more."""
+        """Queue an image at the resolution that time allows, and then the full image if nothing changes any more."""
         self.submit("picture", self._draw_fast)
 
     def draw(self, full: bool = False) -> bool:
-        """Draw and send an image, by default as well as is smooth; on the thread that has the model.
+        """Draw and send an image, by default at a resolution that is smooth; only for the thread that has the model.
 
         Returns:
             Whether it had the full resolution.

@@ -1,7 +1,7 @@
 """Viewers of a finished run, ``neuprim view``, and of a running training.
 
-A training is drawn between two steps, on its own thread. The model keeps every bit that it has without a viewer. Time
-spent here does not count towards the budget. Without open pages a step costs one check of the queue.
+A training is drawn between two steps, on its own thread. The model is bit-identical to one trained without a viewer.
+Time spent here does not count towards the budget. Without open pages a step costs one check of the queue.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def view_run(
 
 
 class TrainingProgress:
-    """Collect what a page shows from a run's events.
+    """Event listener that collects a run's progress for its pages.
 
     Attributes:
         fraction: used part of the budget, 0..1.
@@ -157,7 +157,7 @@ class LiveTraining:
     def __init__(
         self, settings: ViewerSettings, config: RunConfig, on_open: Callable[[str], None], events: Events
     ) -> None:
-        """Start the server; ``on_open`` gets the address, ``events`` every event, too."""
+        """Start the server; call ``on_open`` with its address. Every event is passed on to ``events``."""
         self.config, self.events = config, events
         self.queue, self.progress, self.paused = RenderQueue(), TrainingProgress(), False
         self._steps, self._save, self._stop = 0, False, False
@@ -221,7 +221,7 @@ class LiveTraining:
             self._update_pages()
 
     def _carry_out_orders(self, fitted: Fitted, stop: threading.Event) -> bool:
-        """Carry out orders; return whether the training stays paused."""
+        """Carry out what pages requested (stop, save, one step); return whether the training stays paused."""
         if self._stop:
             stop.set()
         if self._save:

@@ -41,12 +41,12 @@ _MAX_RAYS = 2**26  # the renderer draws them at once in 2 GB
 _MIN_ALPHA = 0.05  # below, a pixel has no meaningful depth
 _START_CANDIDATES = 8
 _START_FOV = 0.7  # radians
-_MAX_NUMBERS = 24  # of a parameter that are written out
+_MAX_NUMBERS = 24  # values of a parameter that are written out
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """What a page shows: a camera, every condition of the task, and one of :func:`list_viewer_quantities`."""
+    """Viewpoint of a page: camera, every condition of the task, and one of :func:`list_viewer_quantities`."""
 
     camera: Camera
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
@@ -62,16 +62,16 @@ class Picture(NamedTuple):
 
 
 def list_viewer_quantities(channels: Channels) -> list[str]:
-    """Colour, alpha, depth, and each channel if there are several."""
+    """Return the names of the quantities to show: colour, alpha, depth, and each channel if there are several."""
     return [COLOUR, ALPHA, DEPTH, *(f"channel {name}" for name in channels.names if channels.count > 1)]
 
 
 @dataclass(eq=False)
 class ViewerScene:
-    """A model with what its task and data say about it. One thread at a time may call the methods.
+    """A model to show, with facts from its task and data. One thread at a time may call the methods.
 
     Attributes:
-        name: of the run.
+        name: name of the run.
         model: returns the current model.
         settings: render settings of the run.
         background: (C,) colour behind everything.
@@ -150,7 +150,7 @@ class ViewerScene:
 
     @cached_property
     def start_view(self) -> View:
-        """The first view: the held-out view with most contrast, else the whole model from the side."""
+        """Initial view: the held-out view with most contrast, else the whole model from the side."""
         if self.dataset is not None:
             views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES)
             if views:
@@ -209,7 +209,7 @@ def _to_viewer_grey(values: Tensor) -> np.ndarray:
 
 
 def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return (H, W, 3) uint8, near is bright and empty is black; and a caption."""
+    """Return depth as (H, W, 3) uint8 colours, bright where near and black where empty, and a caption."""
     solid = alpha > _MIN_ALPHA
     image = np.zeros((*depth.shape, 3), np.uint8)
     if not solid.any():

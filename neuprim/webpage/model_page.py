@@ -45,7 +45,7 @@ _QUANTILE_ROWS = 100_000  # torch.quantile is limited
 _TRUTH_PIXELS, _STILL_PIXELS = 320, 640
 
 DrawView = Callable[[Primitives, Camera, Mapping[str, Tensor]], Tensor]
-"""(model, camera, conditions) -> (H, W, C), over the scene's background."""
+"""Function (model, camera, conditions) -> (H, W, C) image over the scene's background."""
 
 
 class Condition(NamedTuple):
@@ -67,7 +67,7 @@ class PageView:
 
 @dataclass(frozen=True)
 class PageScene:
-    """What a page shows beside the model.
+    """Scene of a page: background, upward axis, conditions and views, in addition to the model.
 
     Attributes:
         background: (C,) in the model's colour space.
@@ -89,11 +89,11 @@ class PageScene:
 
 @dataclass(frozen=True)
 class WebPage:
-    """A page.
+    """A finished page.
 
     Attributes:
-        text: of the file.
-        model: the model in the numbers that the page holds.
+        text: content of the HTML file.
+        model: the model with its parameters as the page stores them.
         nonce: identifies its scripts in its security policy, for a page that embeds it.
     """
 
@@ -114,7 +114,7 @@ def make_model_webpage(
 
     Args:
         rgb: which of the model's channels are red, green and blue.
-        settings: of these, only the cuts and the near plane are used.
+        settings: render settings; only ``alpha_min``, ``alpha_max`` and the near plane are used.
         level: see :func:`pack_webpage_model`.
 
     Raises:
@@ -212,7 +212,7 @@ def initial_webpage_conditions(
 
 
 def webpage_subtitle(task: str, data_source: str) -> str:
-    """Name the task, and the kind of data unless they are real."""
+    """Return the name of the task, and the kind of data unless they are real."""
     return task if data_source == "real" else f"{task}, {data_source} data"
 
 
@@ -225,7 +225,7 @@ def scene_page(
     scene: PageScene,
     level: int = 1,
 ) -> WebPage:
-    """Make the page of a scene; its still, drawn by ``draw``, and its colour space are set here.
+    """Make the page of a scene; this sets its colour space and its still image, which ``draw`` renders.
 
     Raises:
         ConfigError: channels that are not red, green and blue, or a field without a script for browsers.
@@ -254,7 +254,7 @@ def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
-    """Return the initial conditions; if no primitive is active there, those along one range where most are."""
+    """Return the initial conditions; if no primitive is active there, vary one condition until most are active."""
     start = {condition.spec.name: condition.value for condition in conditions}
     if model.active(start).geometry.count:
         return start

@@ -1,4 +1,4 @@
-"""Cameras of files: JSON with frames or a camera path, USD stages and COLMAP models.
+"""Read cameras from files: JSON with frames or a camera path, USD stages and COLMAP models.
 
 Pixar's library reads stages in a process of its own, with limits of time and memory.
 """
@@ -102,12 +102,12 @@ def _read_camera_image_size(record: JsonReader, keys: tuple[str, str], size: tup
 
 
 def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
-    """The times of all cameras, where all have one."""
+    """Return the times of all cameras; None unless all have one."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
 def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
-    """``fps``, else ``count`` frames over ``seconds``; None without either."""
+    """Return ``fps``, else ``count`` frames over ``seconds``; None without either."""
     for key in ("fps", "seconds"):
         if document.has(key):
             value = document.number(key, "a number above 0", 0.0)
@@ -167,7 +167,7 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
 
 
 def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
-    """(4, 4) of 16 numbers row by row, or of rows."""
+    """Read (4, 4) from 16 numbers row by row, or from rows."""
     value = record.values.get(key)
     if isinstance(value, list) and len(value) == 16:
         return JsonReader({key: [value[i : i + 4] for i in (0, 4, 8, 12)]}, record.where).matrix(key)
@@ -179,11 +179,11 @@ def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
 _USD_MAGIC = (b"#usda ", b"PXR-USDC", b"PK\x03\x04")
 _MAX_USD_BYTES = 1 << 30
 _USD_SECONDS = 120.0
-_UNEQUAL_SCALES = 1e-3  # how unequal the axes of a pose may be
+_UNEQUAL_SCALES = 1e-3  # largest relative deviation of a pose's axis scales from their mean
 
 
 def is_usd(path: Path) -> bool:
-    """Whether a file begins as one of USD's three formats does."""
+    """Return whether a file begins as one of USD's three formats does."""
     try:
         with open(path, "rb") as file:
             return file.read(8).startswith(_USD_MAGIC)
@@ -219,10 +219,10 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
 
 
 def _read_usd_stage(path: Path, prim: str) -> JsonReader:
-    """What the process printed."""
+    """Run the USD reader in its own process and return the JSON that it printed."""
     if path.stat().st_size > _MAX_USD_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_USD_BYTES}")
-    # -P: modules beside the script are none of pxr's
+    # -P: pxr must not import modules from the script's folder
     words = [sys.executable, "-P", str(_USD_SCRIPT), str(path.resolve()), prim, str(MAX_CAMERAS)]
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=_USD_SECONDS)
@@ -267,7 +267,7 @@ def _usd_camera(record: JsonReader, size: tuple[int, int]) -> Camera:
 
 
 def _remove_pose_scale(matrix: Tensor, where: str) -> Tensor:
-    """The pose without the one scale of all its axes, which a camera's image does not depend on."""
+    """Return the pose without its uniform scale, on which a camera's image does not depend; else raise DataError."""
     lengths = matrix[:3, :3].norm(dim=0)
     mean = lengths.mean()
     if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _UNEQUAL_SCALES:

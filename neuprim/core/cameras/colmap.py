@@ -118,7 +118,7 @@ def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
 
 
 def _count_colmap_images(model: Path) -> int:
-    """Number of images in a model, from its file alone; 0 if damaged or missing."""
+    """Return the number of images in a model, from its file alone; 0 if damaged or missing."""
     try:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as file:
@@ -180,7 +180,7 @@ def _read_colmap_cameras_only(folder: Path) -> Any:
             raise DataError(str(error).replace(name, str(folder))) from None
 
 
-_MAX_PARAMS = 64  # of a camera model
+_MAX_PARAMS = 64  # most parameters of a camera model
 
 
 class _ColmapRecordReader:
@@ -212,7 +212,10 @@ class _ColmapRecordReader:
 
 
 def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
-    """Check all ``.bin`` files of a model record by record; ``parameter_count`` knows a camera model's, or -1."""
+    """Check all ``.bin`` files of a model record by record.
+
+    ``parameter_count``: function (number of a camera model) -> number of its parameters, -1 if unknown.
+    """
     records = (lambda file: _skip_camera(file, parameter_count), _skip_image, _skip_point, _skip_rig, _skip_frame)
     for part, skip_record in zip(_PARTS, records, strict=True):
         path = folder / f"{part}.bin"

@@ -31,18 +31,18 @@ PRINCIPAL_POINT = ("cx", "cy")
 SIZE = ("w", "h")
 
 _TOLERANCE = 0.01
-_SHORTEST = 0.5 / math.tan(math.radians(85))  # focal length over the image's side: no photograph of a pinhole sees more
+_SHORTEST = 0.5 / math.tan(math.radians(85))  # least focal length over image side: no pinhole photograph shows more
 
 Say = Callable[[str], None]
 
 
 @dataclass(frozen=True)
 class CameraTarget:
-    """The pixels that a camera is for: of an image file, or of a picture to draw."""
+    """Image for which a camera is read: an image file, or an image to render."""
 
     width: int
     height: int
-    image: str = ""  # the file; empty for a picture
+    image: str = ""  # the file; empty for an image to render
     hint: str = ""  # end of messages about the size
 
     @property
@@ -61,7 +61,7 @@ class _IntrinsicsSource:
         return any(self.record.has(key) for key in group)
 
     def scales(self, keys: str, target: CameraTarget) -> tuple[float, float]:
-        """Target pixels per pixel of this size, horizontally and vertically."""
+        """Return target pixels per pixel of this size, horizontally and vertically."""
         if not is_resized_camera_size(self.size, target.size):
             own, other = _format_camera_image_size(self.size), _format_camera_image_size(target.size)
             found = f"{keys} belong to w, h {own}, and the image is {other}"
@@ -75,13 +75,13 @@ def _format_camera_image_size(size: tuple[int, int]) -> str:
 
 
 def is_resized_camera_size(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Whether one size is a resized copy of the other, up to rounding to whole pixels."""
+    """Return whether one size is a resized copy of the other, up to rounding to whole pixels."""
     scale = max(other[0] / size[0], other[1] / size[1])
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
 
 def _record_with_camera_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
-    """The record that provides a whole group of keys."""
+    """Return the record that provides a whole group of keys: the frame if it has any of them, else the file."""
     return frame if any(frame.has(key) for key in group) else file
 
 
@@ -117,7 +117,7 @@ def read_camera(
 
 
 def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
-    """The size that a record states."""
+    """Return the size that a record states, completed from ``default``."""
     return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
 
 
@@ -127,7 +127,7 @@ def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[in
 def _read_focal_lengths(
     frame: JsonReader, level: _IntrinsicsSource, target: CameraTarget, say: Say
 ) -> tuple[float, float]:
-    """fx, fy in pixels of the target."""
+    """Return fx, fy in pixels of the target; raises DataError if keys contradict each other."""
     x, y = _stated_camera_focal_lengths(level, 0, target), _stated_camera_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
@@ -171,7 +171,7 @@ def _read_focal_lengths(
 
 
 def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: CameraTarget) -> dict[str, float]:
-    """Every focal length along an axis that a record states, in target pixels, by key; lengths in pixels first."""
+    """Return every focal length along an axis that a record states, by key, in target pixels; pixel keys come first."""
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
     if record.has(key := f"fl_{name}"):
@@ -190,7 +190,7 @@ def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: Ca
 
 
 def _read_camera_intrinsics(record: JsonReader) -> list[float]:
-    """[cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
+    """Return [cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
         expected = "[cx, cy, fx, fy], focal lengths above 0"
@@ -208,7 +208,7 @@ def _focal_lengths_agree(a: float, b: float) -> bool:
 def _read_principal_point(
     frame: _IntrinsicsSource, file: _IntrinsicsSource, focal: _IntrinsicsSource, target: CameraTarget
 ) -> tuple[float, float]:
-    """cx, cy in pixels of the target."""
+    """Return cx, cy in pixels of the target; the middle of the image if no key states them."""
     array = focal.record.has("camera_intrinsics")
     level = frame if frame.has(PRINCIPAL_POINT) else focal if array else file
     array = array and level is focal
@@ -227,7 +227,7 @@ def _read_principal_point(
         if any(d > _TOLERANCE * side for d, side in zip(differences, target.size, strict=True)):
             found = f"cx, cy are {plain}, and camera_intrinsics begins with {stated}"
             raise DataError(f"{record.where}: {found}; expected the same")
-    if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # a picture of a stated size may look past its edge
+    if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # an image to render may have it outside
         _check_principal_point(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
     return cx, cy
 
@@ -285,7 +285,7 @@ def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, flo
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
-    """Whether the lens is OpenCV's fisheye; refuses models that are no pinhole, offering ``others`` too."""
+    """Return whether the lens is OpenCV's fisheye; refuses models that are no pinhole, offering ``others`` too."""
     record = _record_with_camera_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
     if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:
@@ -339,7 +339,7 @@ _REFUSED = {
     "normal_mts_args": "Mitsuba's axes; expected OpenGL's, x right, y up, z backward",
     "driver_parameters": "a light of its own in every frame; expected task=relight scene=olat, with pl_pos",
 }
-"""Keys that change the picture where they say something other than nothing, and what they state."""
+"""Keys that change the picture if they are set, and what they state."""
 
 _KINDS = ("camera_type", "lens_model", "distortion_model", "projection")
 _ELSEWHERE = {"time": "task=dynamic scene=multiview reads it", "pl_pos": "task=relight scene=olat reads it"}
@@ -361,7 +361,7 @@ def refuse_unsupported_camera_keys(record: JsonReader) -> None:
 
 
 def _is_camera_key_set(value: Any) -> bool:
-    """Whether a value is more than zeros, false or nothing."""
+    """Return whether a value is more than zeros, false or nothing."""
     return any(map(_is_camera_key_set, value)) if isinstance(value, list) else bool(value)
 
 

@@ -135,7 +135,7 @@ def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation
     return views
 
 
-MAX_CAMERAS = 100_000  # of one file
+MAX_CAMERAS = 100_000  # most cameras of one file
 MAX_IMAGE_SIDE = 32768  # pixels
 FRAME_RATES = (0.1, 240.0)  # least and most frames per second of a film, as ``--fps`` takes them
 
@@ -261,7 +261,7 @@ def _check_ray_camera_size(name: str, width: int, height: int) -> None:
 
 
 def _pixel_centre_grid(width: int, height: int) -> tuple[Tensor, Tensor]:
-    """(y, x) of the pixel centres, each (H, W), float64."""
+    """Return (y, x) of the pixel centres, each (H, W), float64."""
     ys, xs = torch.arange(height, dtype=torch.float64) + 0.5, torch.arange(width, dtype=torch.float64) + 0.5
     y, x = torch.meshgrid(ys, xs, indexing="ij")
     return y, x

@@ -10,11 +10,11 @@ import math
 import sys
 from typing import Any
 
-MEMORY = 4 << 30  # of the process: what a file may claim
+MEMORY = 4 << 30  # limit of the process in bytes, as a file may claim any size
 
 
 def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
-    """``{"frames": [...], ...}``; see :mod:`neuprim.core.cameras.camera_files`, which reads it."""
+    """Return ``{"frames": [...], ...}``, which :mod:`neuprim.core.cameras.camera_files` reads."""
     from pxr import Tf, Usd, UsdGeom
 
     try:
@@ -46,7 +46,7 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
 
 
 def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
-    """Every whole time code from start to end where anything of the camera moves; else the default, or the start."""
+    """Return every whole time code from start to end if the camera moves; else the start, or the earliest time."""
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
         moves, prim = (
@@ -66,7 +66,7 @@ def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any)
 
 
 def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
-    """Pose (camera to world, column vectors), focal length and aperture, all three in one unit, at a time."""
+    """Return pose (camera to world, column vectors), focal length, aperture and its offset, in one unit, at a time."""
     found = camera.GetCamera(moment)
     matrix = found.transform
     return {
@@ -79,7 +79,7 @@ def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
 
 
 def usd_camera_resolution(stage: Any) -> list[int] | None:
-    """Of the stage's render settings, if it names any."""
+    """Return [width, height] of the stage's render settings, or None."""
     from pxr import UsdRender
 
     settings = UsdRender.Settings.GetStageRenderSettings(stage)
@@ -88,7 +88,7 @@ def usd_camera_resolution(stage: Any) -> list[int] | None:
 
 
 def limit_usd_memory() -> None:
-    """At most :data:`MEMORY`, where the system knows such a thing."""
+    """Limit the memory of this process to :data:`MEMORY`, if the system supports limits."""
     try:
         import resource
     except ImportError:  # Windows

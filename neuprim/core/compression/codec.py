@@ -1,4 +1,4 @@
-"""A model as sections of codes, and what training may use of the same: ``Primitives`` -> schemes -> codes -> bytes."""
+"""Encode a model, ``Primitives`` -> quantizers -> codes -> sections of bytes, and quantize parameters in training."""
 
 from __future__ import annotations
 
@@ -37,12 +37,12 @@ from neuprim.core.model.fields import prunable_units_of_model
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.model.prunable import primitives_with_unit
 
-Quantizers = dict[str, ColumnQuantizer | RotationQuantizer]  # parameter -> how its numbers are coded
+Quantizers = dict[str, ColumnQuantizer | RotationQuantizer]  # parameter -> its quantizer
 
 
 @dataclass(frozen=True)
 class StoredSize:
-    """What a file has of a parameter: bits of a number, as text, and bytes."""
+    """Size of a parameter in a file: bits per number, as text, and bytes."""
 
     bits: str
     size: int
@@ -52,13 +52,13 @@ _SPIKY = 12.0  # A column whose error is this many times the usual one has outli
 
 _LABEL = 16  # bits of a number that is not learned, such as a label, at every level
 
-_MIN_MASKED = 0.02  # A piece that a smaller share of the primitives lacks has no bit mask
+_MIN_MASKED = 0.02  # A unit that is zero in a smaller share of the primitives gets no bit mask
 
 _POSITION_STEPS = 50.0  # smallest number of position steps in the median of the primitives' longest semi-axes
 
 
 def canonical_model(model: Primitives) -> Primitives:
-    """Return the equal model in the numbers that files store, detached, on the CPU.
+    """Return an equivalent model whose parameters are canonical, as files store them; detached, on the CPU.
 
     Raises CheckpointError for numbers that cannot be stored, FormError for what a field's own code returned.
     """
@@ -154,7 +154,7 @@ def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
 
 
 def _sparse_quantized_parameters(model: Primitives) -> set[str]:
-    """Return the parameters of pieces that some primitives lack; their zeros must stay zeros."""
+    """Return the parameters of units that are zero in some primitives; their zeros must stay zeros."""
     pieces = prunable_units_of_model(model.density, model.colour).values()
     return {
         name for piece in pieces if not bool(primitives_with_unit(piece, model.params).all()) for name in piece.places
@@ -162,7 +162,7 @@ def _sparse_quantized_parameters(model: Primitives) -> set[str]:
 
 
 def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
-    """Return columns of positions, without clipping; distant primitives raise the bits of all."""
+    """Return the quantizer of positions, without clipping; distant primitives raise the bits of all."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
@@ -203,7 +203,7 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSecti
 def _sparse_column_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Return bit masks of pieces that some primitives lack, and parameter -> each column's mask number (0: none)."""
+    """Return bit masks of units that are zero in some primitives, and parameter -> mask number by column (0: none)."""
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])
@@ -228,7 +228,7 @@ def _sparse_column_masks(
 
 
 def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, Tensor]:
-    """Quantize and dequantize tensors, with straight-through gradients; numbers beyond a range become its end."""
+    """Quantize and dequantize tensors, with straight-through gradients; numbers beyond a range are clamped."""
     return {
         name: made[name].fake_quantize(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
         for name, x in params.items()

@@ -1,4 +1,4 @@
-"""Read and write ``.neuprim`` files: a JSON header, a table of sections, their bytes through zstd.
+"""Read and write ``.neuprim`` files: a JSON header, a table of sections, and their bytes compressed by zstd.
 
 Little-endian; docs/data_formats.md describes every byte. Files may be hostile: every size is checked against the file's
 own before memory is allocated, and the expansion is limited (:data:`MAX_EXPANSION`).
@@ -45,7 +45,7 @@ CONFIG = "config.yaml"  # name of the one text section: the configuration of the
 MAX_EXPANSION = 64  # largest number of float32 bytes for each byte of the file, beyond the first MiB
 
 _PLAIN, _ZSTD = 0, 1
-_MAX_PLANES = 3  # of a column's codes
+_MAX_PLANES = 3  # most byte planes of a column's codes
 _START = struct.Struct("<IIQIII")  # version, sections, primitives, bytes of header and table, their check sum
 _SIZES = struct.Struct("<QQI")
 _MAX_HEADER, _MAX_TABLE = 2**22, 2**20  # bytes
@@ -98,7 +98,7 @@ def write_compressed(
     for i in sorted(range(len(sections)), key=lambda i: len(plain[i]) - len(packed[i])):
         if _decompression_allowed(numbers, sum(map(len, packed))):
             break
-        packed[i] = plain[i]  # a model of zeros would exceed the limit of expansion
+        packed[i] = plain[i]  # a model of zeros would exceed MAX_EXPANSION
     packings = [_PLAIN if len(a) == len(b) else _ZSTD for a, b in zip(packed, plain, strict=True)]
     stored = [s.head + data for s, data in zip(sections, packed, strict=True)]
     rows = zip(sections, packings, plain, stored, strict=True)

@@ -30,7 +30,7 @@ _MANTISSA = 24  # bits of a float32
 _LARGEST = float(torch.finfo(torch.float32).max)
 
 CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
-"""Candidate shares of a column beyond either end; the one of least mean squared error is taken."""
+"""Candidate shares of a column's values to clip at either end; the one with the least mean squared error is used."""
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ class ColumnQuantizer:
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
     """Fit the ends of every column of x (N, C), finite, on the CPU.
 
-    ``clips``: candidate shares of the column beyond either end; the first wins a tie.
+    ``clips``: candidate shares of the column's values to clip at either end; the first wins a tie.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
     best = ColumnQuantizer(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
@@ -110,7 +110,7 @@ def snap_to_zero(columns: ColumnQuantizer) -> ColumnQuantizer:
     """Move the ends inwards, by two steps at most, so that 0 is one of the values and decodes to exactly 0."""
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
-    place = -low / torch.where(width > 0, width, 1.0) * last  # of zero, between two codes
+    place = -low / torch.where(width > 0, width, 1.0) * last  # position of zero, between two codes
     tried = torch.stack([place.floor(), place.ceil()])
     below = torch.where(tried > 0, -low / tried.clamp(min=1.0), torch.inf)
     above = torch.where(tried < last, high / (last - tried).clamp(min=1.0), torch.inf)
@@ -131,7 +131,7 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
-    """Return the (C,) root mean squared errors over those of steps between -1 and 1 standard deviations."""
+    """Return the (C,) root mean squared errors over those of uniform steps from -1 to 1 standard deviation."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
     usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
@@ -155,7 +155,7 @@ class RotationQuantizer:
         return (1 << (self.bits - 1)) - 1
 
     def codes(self, quats: Tensor) -> Tensor:
-        """Return (N, 4) int64 of wxyz (N, 4): number of the largest component, codes of the others.
+        """Return (N, 4) int64 codes of wxyz (N, 4): index of the largest component, codes of the others.
 
         Where rounding makes another component as large as the largest, it is reduced, so that codes are stable.
         """
@@ -199,7 +199,7 @@ class RotationQuantizer:
 
     @staticmethod
     def _others(largest: Tensor) -> Tensor:
-        """Return the (N, 3) numbers of the other components, ascending."""
+        """Return the (N, 3) indices of the other components, ascending."""
         first = torch.arange(3, device=largest.device).expand(len(largest), 3)
         return first + (first >= largest[:, None])
 
@@ -241,7 +241,8 @@ LEVELS: dict[int, BitTable] = {
     4: _level_bits(12, 7, 7, 7, 6, 5, 5, 5, 6, 5, others=5),
     5: _level_bits(11, 6, 6, 6, 5, 4, 4, 4, 5, 4, others=4),
 }
-"""From nearly lossless (1) to very small (5). Position, shape and strength have more bits, as images depend on them."""
+"""Bits by level, from nearly lossless (1) to very small (5). Positions, shapes and gains have more, as images depend on
+them."""
 
 DEFAULT_LEVEL = 3
 

@@ -40,7 +40,7 @@ class CorruptSection(Exception):
 
 @dataclass(frozen=True)
 class CompressedSection:
-    """A parameter, or the one text, of a file."""
+    """A section of a file: a parameter, the bit masks, or the text of the configuration."""
 
     name: str
     coding: int  # one of CODINGS
@@ -174,7 +174,7 @@ def _column_mask_numbers(section: CompressedSection) -> list[int]:
 
 
 def _column_counts(section: CompressedSection, count: int, masks: Sequence[np.ndarray]) -> list[int]:
-    """Return how many primitives each column has numbers of."""
+    """Return the number of primitives that each column stores."""
     mask_of = _column_mask_numbers(section)
     if max(mask_of, default=0) > len(masks):
         raise CorruptSection(f"a column refers to mask {max(mask_of)}; expected at most {len(masks)}")
@@ -206,7 +206,7 @@ def _column_records(section: CompressedSection) -> ColumnQuantizer:
 
 def _position_cells(planes: _PlaneReader, count: int, bits: int) -> np.ndarray:
     keys = np.cumsum(planes.codes(count, 3 * bits, (1 << 3 * bits) - 1), dtype=np.int64)
-    if len(keys) and (keys.min() < 0 or keys.max() >= 1 << 3 * bits):  # a step is too small to pass over both
+    if len(keys) and (keys.min() < 0 or keys.max() >= 1 << 3 * bits):  # no step is large enough to skip both ranges
         raise CorruptSection(f"steps along the curve leave its {3 * bits} bits")
     return morton_decode(keys.astype(np.uint64), bits)
 

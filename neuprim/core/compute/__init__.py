@@ -1,1 +1,1 @@
-"""What kernels need of the machine: how they are compiled and kept, and the threads that run them."""
+"""Infrastructure of kernels: compilation, the cache of compiled code, launches, devices and threads."""

@@ -9,13 +9,13 @@ import torch
 from torch import Tensor
 
 CPU, CUDA = "cpu", "cuda"
-DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)  # the devices that models are kept on
+DEVICE_TYPES: tuple[str, ...] = (CPU, CUDA)  # the kinds of device that can hold a model
 
 HOST = torch.device(CPU)
 
 
 def on_numba(*tensors: Tensor) -> bool:
-    """Whether compiled CPU kernels may read these tensors."""
+    """Return whether compiled CPU kernels may read these tensors."""
     return all(tensor.is_cpu for tensor in tensors)
 
 
@@ -25,7 +25,7 @@ def _warp() -> bool:
 
 
 def on_warp(*tensors: Tensor) -> bool:
-    """Whether Warp kernels may read these tensors."""
+    """Return whether Warp kernels may read these tensors."""
     return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
@@ -38,12 +38,12 @@ def cuda_unavailable() -> str | None:
 
 
 def current_device(kind: str) -> torch.device:
-    """The device of this kind that a run uses; of several cards torch's current one."""
+    """Return the device of this kind that a run uses; with several GPUs, torch's current one."""
     return torch.device(kind, torch.cuda.current_device()) if kind == CUDA else torch.device(kind)
 
 
 def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
-    """Return the tensor on ``device``. Copies to a GPU go through pinned memory and do not wait."""
+    """Return the tensor on ``device``. Copies to a GPU are asynchronous, through pinned memory."""
     if tensor.device == device:
         return tensor
     if device.type != CUDA or not tensor.is_cpu:
@@ -52,7 +52,7 @@ def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def to_device_like(tensor: Tensor, like: Tensor) -> Tensor:
-    """Return a few numbers on another tensor's device and of its dtype; differentiable, without waiting for a GPU."""
+    """Return a small tensor with the device and dtype of ``like``; differentiable, asynchronous from the CPU."""
     return tensor.to(like, non_blocking=tensor.is_cpu)
 
 

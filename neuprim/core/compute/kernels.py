@@ -1,10 +1,10 @@
-"""How numba compiles the kernels: flags, and where it keeps the result.
+"""Compile the CPU kernels with numba: compiler flags, and the cache folder of the compiled code.
 
-numba's cache notices edits of a kernel's own file, but not of others whose functions it inlined or whose constants it
-froze; and site-packages may be read-only. So code lives in the user's cache folder, under a hash of every source that
-can end up in it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, where set, wins. Whoever may write into such a folder
-or replace it decides what this user's processes execute: it is used only if this user owns it and nobody else may do
-either; otherwise code is kept in a folder of this process alone.
+numba's cache notices edits of a kernel's own file, but not of other files whose functions it inlined or whose constants
+it froze; and site-packages may be read-only. So compiled code is stored in the user's cache folder, under a hash of
+every source that can end up in it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, if set, replaces that folder. Whoever
+can write into or replace the folder controls what this user's processes execute. So it is used only if this user owns
+it and nobody else can do either; otherwise compiled code goes into a temporary folder of this process.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ from neuprim.version import __version__
 
 
 def _prefer_wide_vectors() -> None:
-    """Ask LLVM for 512-bit vectors, unless NUMBA_CPU_FEATURES is set; before anything is compiled."""
+    """Ask LLVM for 512-bit vectors, unless NUMBA_CPU_FEATURES is set. Call before compiling anything."""
     features = llvm.get_host_cpu_features()
     if features.get("avx512f") and numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]
         numba.config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
 
 
 def _forbid_llvm_interleaving() -> None:
-    """Ask LLVM not to compute several vectors at a time: loops that sum would spill registers."""
+    """Ask LLVM not to interleave several vectors: summation loops would spill registers."""
     llvm.set_option("neuprim", "-force-vector-interleave=1")
 
 
@@ -51,7 +51,7 @@ _prefer_wide_vectors()
 _forbid_llvm_interleaving()
 
 FAST = {"nnan", "nsz", "arcp", "contract", "afn", "reassoc"}
-"""Floating-point freedom of the pixel kernels. NaN checks vanish under it: rows are checked before (``prepare``)."""
+"""LLVM fast-math flags of the pixel kernels. They remove NaN checks, so ``prepare`` checks the rows before."""
 
 
 _ROOT = Path(__file__).parents[2]
@@ -59,7 +59,7 @@ _IMPORT = re.compile(r"^\s*from (neuprim[\w.]*) import (\([^)]*\)|[^\n]*)|^\s*im
 
 
 def kernel_sources(module: Path, package: Path = _ROOT) -> set[Path]:
-    """Files whose text can end up in a module's kernels: its own and all of the package that it imports."""
+    """Return the files whose text can end up in a module's kernels: itself and, recursively, its package imports."""
     found: set[Path] = set()
     todo = [module]
     while todo:
@@ -88,7 +88,7 @@ def _imported_sources(file: Path, package: Path) -> set[Path]:
 
 
 def sources_hash(module: Path, package: Path = _ROOT) -> str:
-    """Twelve hexadecimal digits that change with the version and any of :func:`kernel_sources`."""
+    """Return a hash of the version and all :func:`kernel_sources`: twelve hexadecimal digits."""
     digest = hashlib.sha256(f"{module.name} {__version__}".encode())
     for source in sorted(kernel_sources(module, package)):
         digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
@@ -96,7 +96,7 @@ def sources_hash(module: Path, package: Path = _ROOT) -> str:
 
 
 def cache_directory() -> Path:
-    """Folder of the compiled kernels, which nobody else may write."""
+    """Return the folder of compiled kernels, which no other user can write."""
     own = Path(os.environ.get("NUMBA_CACHE_DIR") or files.cache_directory() / "kernels")
     chosen = code_cache(own)
     if chosen != own.absolute():
@@ -104,12 +104,12 @@ def cache_directory() -> Path:
     return chosen
 
 
-_cache_directory = functools.cache(cache_directory)  # once a process: every kernel asks
+_cache_directory = functools.cache(cache_directory)  # cached: every kernel needs it
 _sources_hash = functools.cache(sources_hash)
 
 
 class KernelLocator(getattr(caching, "UserProvidedCacheLocator", object)):  # type: ignore[misc]
-    """numba's own, but for a folder that does not depend on where the sources are."""
+    """numba's cache locator with a folder name that does not depend on the location of the sources."""
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
@@ -131,17 +131,16 @@ def _jit(**options: Any) -> Callable[[Any], Any]:
 
 
 inline = njit(fastmath=FAST, error_model="numpy", forceinline=True)
-"""Building block of a pixel kernel; ``forceinline`` so that a cold and a cached process compute the same bits."""
+"""Decorator of device functions of pixel kernels; ``forceinline`` gives the same bits with a cold and a warm cache."""
 
 inline_source = njit(fastmath=FAST, error_model="numpy", inline="always")
-"""As if its text stood in the caller: LLVM sees both at once, and computes the bits that it would compute of one
-function."""
+"""Decorator that inlines a function into its caller before LLVM: the bits are those of one single function."""
 
-kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)  # A pixel kernel, called from worker threads
+kernel = _jit(fastmath=FAST, error_model="numpy", nogil=True, cache=True)  # decorator of pixel kernels
 
 
 def compile_dispatch_by_length(*functions: Any) -> Any:
-    """One function of (tuple, *arguments) that calls ``functions[len(tuple)]``, chosen during compilation."""
+    """Return a function of (tuple, *arguments) that calls ``functions[len(tuple)]``, chosen at compile time."""
 
     def choose(key: Any, *arguments: Any) -> Any: ...
 
@@ -154,22 +153,21 @@ def compile_dispatch_by_length(*functions: Any) -> Any:
 
 
 exact_kernel = _jit(error_model="numpy", nogil=True, cache=True)
-"""A kernel in strict IEEE arithmetic: per-primitive preparation, binning, sums whose order matters."""
+"""Decorator of kernels in strict IEEE arithmetic: per-primitive preparation, binning, sums whose order matters."""
 
-strict = njit(error_model="numpy", forceinline=True)  # building block of an :data:`exact_kernel`
+strict = njit(error_model="numpy", forceinline=True)  # for functions that an exact_kernel calls
 
 
 _COMPRESSES = 19 <= binding.llvm_version_info[0] <= 22
-"""Whether LLVM moves the chosen elements of a vector together by one instruction; it is called experimental, and other
-versions are not asked."""
+"""Whether to use LLVM's vector compress intrinsic. It is experimental, so only these versions of LLVM use it."""
 
 _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
 
 def _borrow_kernel_array(context, array):  # type: ignore[no-untyped-def]
-    """The same array without its owner: views of it count no references, which is atomic and slow.
+    """Return a view of an array without its owner: no reference counting, which is atomic and slow.
 
-    Only for arrays that somebody else keeps; a kernel's own are given back by :func:`release_array` after the last use.
+    Something else must keep the array alive. For a kernel's own array, :func:`release_array` after the last use does.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -181,7 +179,7 @@ def _borrow_kernel_array(context, array):  # type: ignore[no-untyped-def]
 
 
 def _borrow_kernel_arrays(context, arrays):  # type: ignore[no-untyped-def]
-    """A NamedTuple of :func:`_borrow_kernel_array` arrays; its other parts stay as they are."""
+    """Apply :func:`_borrow_kernel_array` to each array of a NamedTuple; other fields stay as they are."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         parts = []
@@ -199,13 +197,13 @@ def _borrow_kernel_arrays(context, arrays):  # type: ignore[no-untyped-def]
 
 
 def _llvm_vector_pointer(context, builder, signature, arguments, array, index):  # type: ignore[no-untyped-def]
-    """Where the sixteen floats of an argument begin."""
+    """Return a pointer to the 16-float vector that begins at an index of an array argument."""
     data = make_array(signature.args[array])(context, builder, value=arguments[array]).data
     return builder.bitcast(builder.gep(data, [arguments[index]]), _SIXTEEN.as_pointer())
 
 
 def _llvm_copy16(context, target, at, source, first):  # type: ignore[no-untyped-def]
-    """target[at : at + 16] = source[first : first + 16] of float32 arrays, which LLVM would copy one by one."""
+    """Copy source[first : first + 16] to target[at : at + 16], float32; LLVM alone would copy one by one."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         read, written = (
@@ -218,9 +216,9 @@ def _llvm_copy16(context, target, at, source, first):  # type: ignore[no-untyped
 
 
 def _llvm_compress16(context, array, at, first, flags):  # type: ignore[no-untyped-def]
-    """Move those of array[first : first + 16] whose flag is not 0 to array[at:], zeros behind them; returns how many.
+    """Move the elements of array[first : first + 16] with a flag != 0 to array[at:], then zeros; return their number.
 
-    All sixteen are read before any is written: ``at`` may be at most ``first`` where more is to be read.
+    All sixteen are read before any is written. If later elements are still needed, ``at`` must be <= ``first``.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -250,7 +248,7 @@ def _llvm_compress16(context, array, at, first, flags):  # type: ignore[no-untyp
 
 
 def _release_kernel_array(context, array):  # type: ignore[no-untyped-def]
-    """Does nothing, after the last use of what a kernel's own array lent: numba would free it earlier."""
+    """Do nothing; a call after the last use of a borrowed view keeps numba from freeing the kernel's array earlier."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         return context.get_dummy_value()
@@ -266,7 +264,7 @@ compress16: Any = intrinsic(_llvm_compress16)
 
 
 def code_cache(folder: Path) -> Path:
-    """The folder, made where it is missing, or a private one with a warning if others may write it."""
+    """Return the folder, created if missing; a private temporary one, with a warning, if others can change it."""
     folder = folder.absolute()
     try:
         made = not folder.exists()
@@ -286,7 +284,7 @@ def code_cache(folder: Path) -> Path:
 
 
 def folder_weakness(folder: Path) -> str:
-    """Return who else may change what a folder holds, in words; empty where nobody may, and on Windows."""
+    """Return in words who else can change the contents of a folder; "" if nobody can, and on Windows."""
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()
@@ -300,13 +298,13 @@ def folder_weakness(folder: Path) -> str:
         )
         if shared and (
             place == whole or not there.st_mode & stat.S_ISVTX
-        ):  # others' entries of a sticky folder stay where they are
+        ):  # others cannot replace a sticky folder's entries
             return "others may write it" if place == whole else f"others may write {place}"
     return ""
 
 
 def _is_own_cache_group(number: int, user: int) -> bool:
-    """Whether a group is the user's own, as many systems make one of the same name for each, with nobody else in it."""
+    """Return whether a group is the user's own: the primary one, with the user's name and no other members."""
     import grp
     import pwd
 

@@ -1,6 +1,6 @@
-"""Run a nogil kernel over a range on all cores, and autograd operations without bookkeeping where nothing needs it.
+"""Run nogil kernels over a range in parallel, and autograd operations without overhead where no gradient is needed.
 
-Chunks never share output, so results do not depend on the threads.
+Chunks never share output, so results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _share = 0
 
 
 def cpu_name() -> str:
-    """Return the CPU's name, as the system has it."""
+    """Return the CPU's name as the operating system reports it."""
     try:
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
@@ -37,7 +37,7 @@ def cpu_name() -> str:
 
 
 def machine_cores() -> int:
-    """Cores that the system lets this process have."""
+    """Return the number of cores that the operating system lets this process use."""
     try:
         return len(os.sched_getaffinity(0))
     except AttributeError:  # not on every platform
@@ -45,14 +45,14 @@ def machine_cores() -> int:
 
 
 def core_count() -> int:
-    """Cores this process may use: its share, where it has one."""
+    """Return the number of cores this process may use: its limit by :func:`limit_process_threads`, if any."""
     cores = machine_cores()
     return min(cores, _share) if _share else cores
 
 
 @contextmanager
 def limit_process_threads(threads: int) -> Iterator[None]:
-    """Inside, the whole process has a share of the cores; 0: all. One at a time."""
+    """Limit the whole process to ``threads`` cores inside the block; 0: all. Use one at a time."""
     global _share
     before, _share = _share, threads
     try:
@@ -63,7 +63,7 @@ def limit_process_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Inside, "all cores" means ``threads`` of them, 0 for all, also for code that gets no number of threads."""
+    """Let "all cores" mean ``threads`` (0: all) inside the block, also for code without a ``threads`` argument."""
     token = _limit.set(threads)
     try:
         yield
@@ -72,13 +72,13 @@ def limit_threads(threads: int) -> Iterator[None]:
 
 
 def resolve_threads(threads: int) -> int:
-    """How many :func:`parallel_for` works with, asked for so many."""
+    """Return the number of threads that :func:`parallel_for` uses if asked for ``threads``."""
     return threads or _limit.get() or core_count()
 
 
 def chunk_size(count: int, least: int, threads: int) -> int:
-    """How many of ``count`` items :func:`parallel_for` should take at a time: each call costs as much as a few of them,
-    and threads share the work well with eight chunks each of at least ``least`` items. One thread takes all."""
+    """Return a good chunk size for :func:`parallel_for` over ``count`` items: eight chunks per thread balance the work,
+    at least ``least`` items each amortise the cost of a call. A single thread takes all items in one chunk."""
     threads = resolve_threads(threads)
     return max(count, 1) if threads == 1 else max(least, count // (8 * threads))
 
@@ -93,7 +93,7 @@ def _thread_pool(threads: int) -> ThreadPoolExecutor:
 def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: int, *args: Any) -> list[Any]:
     """Call ``function(start, stop, *args)`` for chunks of ``range(count)``; returns the results in chunk order.
 
-    ``threads`` 0 is all cores, or as many as :func:`limit_threads` says.
+    ``threads`` 0 means all cores, or the number set by :func:`limit_threads`.
     """
     threads = resolve_threads(threads)
     chunks = -(-count // chunk) if count else 0
@@ -114,7 +114,7 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
 
 
 class _ForwardKernelContext:
-    """Takes what a forward pass saves for a backward pass that will not come."""
+    """Stand-in for an autograd context when no backward pass follows: ignores what the forward pass saves."""
 
     def save_for_backward(self, *tensors: Tensor) -> None:
         pass
@@ -124,12 +124,12 @@ class _ForwardKernelContext:
 
 
 def kernel_needs_grad(*arguments: Any) -> bool:
-    """Whether somebody asks for a gradient with respect to one of them."""
+    """Return whether a gradient with respect to one of the arguments is needed."""
     return torch.is_grad_enabled() and any(isinstance(x, Tensor) and x.requires_grad for x in arguments)
 
 
 def apply_kernel_operation(operation: type[torch.autograd.Function], *arguments: Any) -> Any:
-    """``operation.apply(*arguments)``, or its forward pass alone where no gradient is asked for."""
+    """Return ``operation.apply(*arguments)``; run its forward pass alone if no gradient is needed."""
     if kernel_needs_grad(*arguments):
         return operation.apply(*arguments)
     return operation.forward(_ForwardKernelContext(), *arguments)

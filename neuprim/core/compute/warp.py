@@ -1,7 +1,7 @@
-"""Warp as the kernels need it, and the only place that launches one of them.
+"""Configure Warp, and launch its kernels; no other module launches one.
 
-Making arrays of tensors and packing them takes longer than the kernels of a small frame, so a kernel's launch is
-recorded once on each device, and its arguments are written over.
+Converting tensors to Warp arrays and packing them takes longer than the kernels of a small frame. So each kernel's
+launch is recorded once per device, and later launches overwrite its arguments.
 """
 
 from __future__ import annotations
@@ -14,21 +14,21 @@ from collections.abc import Sequence
 from typing import Any
 
 import torch
-import warp as wp  # kernels import it from here, where it is started
+import warp as wp  # kernels import it from here, where it is initialised
 from torch import Tensor
 
 from neuprim.core.compute.kernels import code_cache
 from neuprim.core.io import files
 
-BLOCK = 256  # threads of a block where a kernel asks for nothing else
+BLOCK = 256  # default threads per block
 
 OPTIONS = {"enable_backward": False, "fast_math": False, "max_unroll": 16}
-"""Of every kernel's module: adjoints are written by hand, and divisions and roots are rounded properly."""
+"""Module options of every kernel: no generated adjoints (ours are written by hand); IEEE division and roots."""
 
 FAST = {**OPTIONS, "fast_math": True}
-"""Of the pixel kernels in float32: approximate division, root and exponential, which a card computes to one or two
-units in the last place. Errors on an H100 were the same with and without (``benchmarks/gpu.py --parts parity``), and a
-third of the time of small forms goes. The processor ignores it."""
+"""Module options of the float32 pixel kernels: approximate division, root and exponential, which a GPU computes to one
+or two units in the last place. On an H100, errors were the same with and without (``benchmarks/gpu.py --parts
+parity``), and small forms took a third less time. The CPU ignores it."""
 
 
 # ---- types of kernels' arrays, by what they hold
@@ -57,7 +57,7 @@ _Bare: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))
 
 
 class _KernelArray:
-    """A tensor that a kernel takes as an array of ``dtype``, which may hold the numbers of the last dimension."""
+    """A tensor passed to a kernel as an array of ``dtype``; a vector dtype takes up the last dimension."""
 
     __slots__ = ("dtype", "tensor")
 
@@ -66,7 +66,7 @@ class _KernelArray:
 
 
 def array(tensor: Tensor, dtype: Any) -> Any:
-    """Return a contiguous tensor as an argument of a kernel; ``dtype`` may take the numbers of the last dimension."""
+    """Return a contiguous tensor as a kernel argument; a vector ``dtype`` takes up the last dimension."""
     return _KernelArray(tensor, dtype)
 
 
@@ -76,7 +76,7 @@ def _kernel_dtype_bytes(dtype: Any) -> int:
 
 
 def _fill_descriptor(given: _KernelArray, into: Any) -> None:
-    """Write a tensor's address, shape and strides into a descriptor."""
+    """Write a tensor's address, shape and strides into a Warp array descriptor."""
     tensor, whole = given.tensor, _kernel_dtype_bytes(given.dtype)
     assert tensor.is_contiguous(), "arrays of kernels are contiguous"
     shape, size = tensor.shape, tensor.element_size()
@@ -92,7 +92,7 @@ def _fill_descriptor(given: _KernelArray, into: Any) -> None:
 
 
 def _pack_argument(value: Any) -> Any:
-    """An argument as Warp takes it, of its own memory."""
+    """Return an argument as Warp expects it, in memory of its own."""
     if value is None:
         return _Bare()
     if isinstance(value, _KernelArray):
@@ -103,7 +103,7 @@ def _pack_argument(value: Any) -> Any:
 
 
 class _RecordedLaunch:
-    """A kernel's launch on one device, whose arguments are written over."""
+    """A recorded launch of one kernel on one device; each new launch overwrites its arguments."""
 
     def __init__(self, kernel: Any, dims: tuple[int, ...], inputs: Sequence[Any], device: Any, block: int) -> None:
         packed = [_pack_argument(value) for value in inputs]
@@ -129,11 +129,11 @@ class _RecordedLaunch:
 
 _recorded: dict[tuple[Any, int, int], _RecordedLaunch] = {}
 _streams: dict[tuple[int, int], Any] = {}
-_turn = threading.Lock()  # a recorded launch has one set of arguments
+_turn = threading.Lock()  # one caller at a time: a recorded launch has one set of arguments
 
 
 def _device_stream_of_torch(device: torch.device) -> Any:
-    """The caller's stream."""
+    """Return torch's current CUDA stream on the device as a Warp stream."""
     index = torch.cuda.current_device() if device.index is None else device.index
     key = (index, torch._C._cuda_getCurrentRawStream(index))
     if key not in _streams:
@@ -144,7 +144,7 @@ def _device_stream_of_torch(device: torch.device) -> Any:
 def launch_kernel(
     kernel: Any, dim: int | Sequence[int], inputs: Sequence[Any], device: torch.device, block: int = BLOCK
 ) -> None:
-    """Run a kernel on the caller's stream; nothing where ``dim`` is empty."""
+    """Run a kernel on torch's current stream; do nothing if a ``dim`` is 0."""
     if not wp.config.enable_cpu_blocks:
         raise RuntimeError("Warp runs blocks on the CPU as single threads: wp.config.enable_cpu_blocks was turned off")
     dims = (dim,) if isinstance(dim, int) else tuple(dim)

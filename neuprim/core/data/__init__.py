@@ -1,4 +1,4 @@
-"""What a data set hands to the trainer, and what loaders of posed images share."""
+"""Data sets as the trainer uses them, and the common code of loaders of posed images."""
 
 from neuprim.core.data.dataset import (
     Clip,

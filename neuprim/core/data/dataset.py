@@ -38,7 +38,7 @@ def _composite_pixels(rgb, alpha, out, background):  # type: ignore[no-untyped-d
 
 
 Correction = Literal["pose", "offset", "factor"]
-"""What training learns of an uncertain input: a camera's pose, an offset of a position (scene units), or a factor."""
+"""What training learns for an uncertain input: a camera's pose, an offset of a position (scene units), or a factor."""
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class ViewSubset(ViewSet):
         return self._views.pixels(self._indices[index])
 
     def source(self, index: int) -> tuple[ViewSet, int]:
-        """The set that has the view, and its index there."""
+        """Return the set that has the view, and its index there."""
         return self._views, self._indices[index]
 
 
@@ -320,7 +320,7 @@ class DatasetImages(ABC):
 
 @dataclass(frozen=True)
 class SceneContext:
-    """What a scene's loader gets besides its settings."""
+    """Input of a scene's loader besides its settings."""
 
     seed: int  # seed for generated scenes
     cache_dir: Path  # folder for generated data, by a key of everything they depend on
@@ -336,7 +336,7 @@ def camera_extent(cameras: Sequence[Camera]) -> float:
     return radius if radius > 0 else 1.0
 
 
-_OUTLYING = 100.0  # of the median distance
+_OUTLYING = 100.0  # in median distances
 _OUTLYING_SHARE = 0.05
 
 
@@ -348,7 +348,7 @@ def find_outliers(positions: Tensor) -> Tensor:
 
 
 def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """(3,) float64 point nearest to all optical axes (least squares), pulled weakly to one extent in front."""
+    """Return the (3,) float64 point nearest to all optical axes (least squares), pulled weakly one extent forward."""
     positions, forward = _dataset_optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]
@@ -359,7 +359,7 @@ def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
 
 
 def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
-    """Whether the optical axes determine a point in front of the cameras.
+    """Return whether the optical axes determine a point in front of the cameras.
 
     They pass it closer than half the spread of the centres, and 9 of 10 cameras look towards it. Parallel axes, outward
     rings and tripods do not.
@@ -374,7 +374,7 @@ def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
 
 
 def _dataset_optical_axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
-    """(N, 3) centres and (N, 3) viewing directions, float64, of all cameras but outliers."""
+    """Return (N, 3) centres and (N, 3) viewing directions, float64, of all cameras but outliers."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
     usual = ~find_outliers(positions)
@@ -385,7 +385,7 @@ FAR = 100.0  # camera extents from the origin, beyond which a scene is moved: fl
 
 
 def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
-    """Choose the scene's place in the world of its file.
+    """Choose the transform between a scene and the world of its file: an offset for a scene far from the origin.
 
     If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin,
     rounded to a power of ten between one and ten extents. Other scenes keep their coordinates bit for bit.

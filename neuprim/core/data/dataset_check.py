@@ -1,4 +1,4 @@
-"""Checks that a data set keeps the promises of :class:`~neuprim.core.data.dataset.Dataset`."""
+"""Checks that a data set follows the rules of :class:`~neuprim.core.data.dataset.Dataset`."""
 
 from __future__ import annotations
 

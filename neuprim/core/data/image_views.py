@@ -75,10 +75,10 @@ class FisheyeDistortion(Distortion):
 
 
 def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, Tensor]:
-    """Where the pixels of the undistorted ``camera`` lie in a photograph of the same size.
+    """Return the positions of the undistorted ``camera``'s pixels in a photograph of the same size, and a mask.
 
-    Returned are (H, W, 2) float32 source pixels (x, y), centres at +0.5, and (H, W) bool: inside the photograph and on
-    the part of the lens around the principal point where the map does not fold over.
+    Positions are (H, W, 2) float32 pixels (x, y), centres at +0.5. The mask is (H, W) bool: inside the photograph and
+    on the part of the lens around the principal point where the map does not fold over.
     """
     x = (np.arange(camera.width) + 0.5 - camera.cx) / camera.fx
     y = (np.arange(camera.height) + 0.5 - camera.cy) / camera.fy
@@ -93,7 +93,7 @@ def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, T
 
 
 def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
-    """(H, W) bool: pixels joined to the principal point's by pixels where the map keeps its orientation."""
+    """Return (H, W) bool: pixels connected to the principal point by pixels where the map keeps its orientation."""
     # polynomial lens models turn back beyond some radius and would mirror the middle of the photograph into the corners
     if min(source.shape[:2]) < 2:
         return np.isfinite(source).all(axis=-1)
@@ -105,7 +105,7 @@ def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
 
 
 def resample_image(image: Tensor, source: Tensor) -> Tensor:
-    """(H', W', C) float32 bilinear samples of (H, W, C) at (H', W', 2) source pixels, clamped to the border."""
+    """Return (H', W', C) float32 bilinear samples of (H, W, C) at (H', W', 2) source pixels, clamped to the border."""
     height, width = image.shape[:2]
     grid = source / torch.tensor([width, height]) * 2.0 - 1.0  # -1 and 1 are the outer edges of the outer pixels
     planes = image.float().permute(2, 0, 1)[None]
@@ -161,7 +161,7 @@ def average_pixels(values: Tensor, factor: int) -> Tensor:
 
 
 def reduce_image_mask(mask: Tensor, factor: int) -> Tensor:
-    """(H // factor, W // factor) bool: all pixels of a block count."""
+    """Reduce a mask to (H // factor, W // factor) bool: True where all pixels of a block are."""
     return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
 
 
@@ -195,7 +195,7 @@ def _premultiply_dataset_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-de
 
 @dataclass(frozen=True)
 class _StoredImage:
-    """Final pixels of a view, (H, W, C) uint8, half or float, and which of them count."""
+    """Final pixels of a view, (H, W, C) uint8, half or float, and the mask of those that count."""
 
     data: Tensor
     premultiplied: bool
@@ -210,7 +210,7 @@ class _StoredImage:
 
     @property
     def alpha(self) -> Tensor | None:
-        """(H, W) float32, None without."""
+        """Alpha, (H, W) float32; None for images without."""
         if self.data.shape[-1] == 3:
             return None
         alpha = self.data[..., 3].float()
@@ -219,7 +219,7 @@ class _StoredImage:
         return alpha.contiguous()
 
     def planes(self) -> tuple[Tensor, Tensor | None]:
-        """(H, W, 3) float32, premultiplied, and alpha."""
+        """Return (H, W, 3) float32 premultiplied colours, and alpha."""
         if self._by_kernel:  # in one pass, as every step needs them
             rgb, whole = torch.empty(*self.data.shape[:2], 3), torch.empty(self.data.shape[:2])
             outputs = rgb.reshape(-1, 3).numpy(), whole.reshape(-1).numpy()
@@ -239,8 +239,8 @@ class _StoredImage:
 
 
 class StoredPixels(Pixels):
-    """Pixels of a stored image that become floats when they are first used: of a strided view its own alone, and alpha
-    alone where nobody asks for colours.
+    """Pixels of a stored image, converted to floats on first use: of a strided view only its own pixels, and only alpha
+    if nothing reads the colours.
 
     Args:
         image: the image, or None with the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
@@ -285,7 +285,7 @@ class ImageViews(ViewSet):
     ) -> None:
         self._frames = list(frames)
         self._to_linear = to_linear
-        self.scale = 1.0  # of linear colours
+        self.scale = 1.0  # factor of linear colours
         self._factor = downsample
         self._cameras = [_reduced_image_camera(f, downsample) for f in self._frames]
         self._cache_bytes = cache_bytes

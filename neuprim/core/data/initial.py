@@ -1,4 +1,4 @@
-"""Starting points: given points, the visual hull of alpha masks, a box before the cameras, and surroundings."""
+"""Starting points: given points, the visual hull of alpha masks, a box in front of the cameras, and surroundings."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ __all__ = ["initial_points"]
 _FPS_WORK = 5e8  # distances that exact farthest-point sampling may evaluate (1.5 s); above, a grid thins the points
 _COLOR_VIEWS = 100
 _CHUNK = 20_000
-_ROUNDS = 8  # times that a box is filled, for points that cameras see
+_ROUNDS = 8  # times that points are drawn in the box, until enough of them are seen by cameras
 
 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
@@ -50,7 +50,7 @@ def check_point_count(count: int) -> None:
 
 
 def views_have_alpha(views: ViewSet) -> bool:
-    """Whether one of the first eight views is transparent somewhere."""
+    """Return whether one of the first eight views is transparent somewhere."""
     alphas = (views.pixels(i).alpha for i in range(min(len(views), 8)))
     return any(alpha is not None and bool((alpha < 0.5).any()) for alpha in alphas)
 
@@ -139,7 +139,7 @@ def _thin_points_by_grid(points: Tensor, count: int, generator: torch.Generator)
 
 
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
-    """(N, C) per-channel median of the pixels that the points (N, 3) project to, straight colour.
+    """Return (N, C) per-channel medians of the pixels that the points (N, 3) project to, not premultiplied.
 
     A view counts where the point falls on a valid pixel with alpha above ``matter``. Points without views get
     the median of the others, or mid-grey.
@@ -170,10 +170,10 @@ def _sample_starting_point_colors(views: ViewSet, index: int, means: Tensor, mat
 
 
 _VIEWS = 100
-_CELLS = (12, 17, 24, 34, 48, 68, 96, 136, 192)  # pixels looked at along an image's longer side, grid after grid
+_CELLS = (12, 17, 24, 34, 48, 68, 96, 136, 192)  # pixels tested along an image's longer side, one grid after the other
 _NEAREST = 8
-# Quantile of the depths of the nearest points. A wall's pixels beside an object lie beside points of both; a guess too
-# far is hidden or moves forward as it learns, one too near stands in front of other cameras.
+# Quantile of the depths of the nearest points. Next to an object's edge, a wall's pixels are near points of both. A
+# point that is too far is hidden or moves forward in training; one that is too near hides the scene from other cameras.
 _FAR_SIDE = 0.75
 _SHELL = 0.1  # share of the points that surround everything
 
@@ -215,7 +215,7 @@ def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: 
 def _find_starting_pixels(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Positions and colours of pixels ``cell`` apart without a known point that near, in image and space."""
+    """Return positions and colours of pixels ``cell`` apart that have no known point that near, in image and space."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
     spots = _starting_pixel_grid(camera.width, camera.height, cell)
@@ -241,20 +241,20 @@ def _find_starting_pixels(
 
 
 def _starting_pixel_grid(width: int, height: int, cell: float) -> NDArray[np.float64]:
-    """(N, 2) pixel positions (x, y), about ``cell`` apart."""
+    """Return (N, 2) pixel positions (x, y), about ``cell`` apart."""
     across, down = max(round(width / cell), 1), max(round(height / cell), 1)
     x, y = (np.arange(across) + 0.5) * width / across, (np.arange(down) + 0.5) * height / down
     return np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
 
 
 def _surrounding_shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """At most ``count`` points on a sphere around cameras and points, where some view looks."""
+    """Return at most ``count`` points on a sphere around cameras and points, where some view looks."""
     cameras = [views.view(i).camera for i in range(len(views))]
     center = dataset_focus_point(cameras)
     eyes = torch.stack([c.position.double() for c in cameras]) - center
     reach = torch.quantile((given.double() - center).norm(dim=-1)[:1_000_000], 0.99)
     radius = 2.0 * torch.maximum(reach, eyes.norm(dim=-1).max())
-    many = 16 * count  # of which those that are seen are thinned
+    many = 16 * count  # candidates; those that cameras see are thinned
     k = torch.arange(many, dtype=torch.float64)
     z = 1.0 - 2.0 * (k + 0.5) / many
     turn = k * (math.pi * (3.0 - math.sqrt(5.0)))

@@ -23,10 +23,10 @@ _COLOURS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_
 _SCALES = ("scale_0", "scale_1", "scale_2")
 _ROTATION = ("rot_0", "rot_1", "rot_2", "rot_3")
 
-_LARGEST_LOG = 50.0  # logarithms of sizes beyond this are no sizes; those below its negative are none at all
+_LARGEST_LOG = 50.0  # largest valid logarithm of a size; below its negative, a size counts as missing
 _FLATNESS = 0.1  # thickness of a Gaussian without a size along an axis, over its smallest size
-_FARTHEST = 1e4  # distance from the median point, over the median of these, beyond which a point does not belong there
-_COARSE = 1e-3  # of the size of the cloud: what coordinates may be rounded to without a warning
+_FARTHEST = 1e4  # distance from the median point, over the median of these distances, beyond which a point is dropped
+_COARSE = 1e-3  # coarsest rounding of coordinates without a warning, over the size of the cloud
 
 
 def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
@@ -95,12 +95,12 @@ def _compressed_start_points_error(path: Path, what: str) -> DataError:
 
 
 def _starting_point_columns(found: PlyVertices, names: tuple[str, ...]) -> np.ndarray | None:
-    """(N, len(names)) float64; None if one is missing."""
+    """Return the properties ``names`` as (N, len(names)) float64; None if one is missing."""
     return found.columns(names) if set(names) <= set(found.names) else None
 
 
 def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | None:
-    """(N, 3) logarithms of sizes, -inf along the missing axis of discs; None without usable sizes."""
+    """Return (N, 3) logarithms of sizes, -inf along the missing axis of discs; None without usable sizes."""
     there = [name for name in _SCALES if name in found.names]
     if not there:
         return None
@@ -116,7 +116,7 @@ def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | No
 
 
 def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
-    """(N, 3) as the file has them, 0..1 unless it holds more light than that."""
+    """Return (N, 3) colours in the file's own colour space, 0..1, or above for brighter light."""
     dc = _starting_point_columns(found, ("f_dc_0", "f_dc_1", "f_dc_2"))
     if dc is not None:
         return dc * C0 + 0.5

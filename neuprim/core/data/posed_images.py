@@ -27,7 +27,7 @@ __all__ = ["FolderSettings", "SceneDetails", "assemble_dataset", "find_data_fold
 __all__ += ["split_every_nth", "unique_view_names"]
 
 EveryNth = Annotated[int, Range(at_least=2)]  # every n-th image is held out
-HoldOut = Annotated[int, Range(at_least=2, also=(0,))]  # the same, or 0 where a split of its own is there to test on
+HoldOut = Annotated[int, Range(at_least=2, also=(0,))]  # the same, or 0 to use the data set's own test split
 SplitName = Annotated[str, nonempty_text("the name in transforms_NAME.json")]
 
 
@@ -65,7 +65,7 @@ _T = TypeVar("_T")
 
 
 class BadImageViews:
-    """Collects damaged views, which are left out with a warning each; if ``strict``, the first is raised."""
+    """Collection of damaged views, which are left out with a warning each; if ``strict``, the first is raised."""
 
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
@@ -80,7 +80,7 @@ class BadImageViews:
             return None
 
     def add(self, name: str, error: DataError) -> None:
-        """Note a bad view; raise if ``strict``."""
+        """Record a bad view; raise its error if ``strict``."""
         if self._strict:
             raise error
         self._faults.append(f"{error}; view {name} is left out (scene.strict=true refuses it)")
@@ -128,7 +128,7 @@ def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path
 
 
 def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
-    """The only file whose path differs from ``path`` in upper and lower case alone."""
+    """Return the only file whose path differs from ``path`` in upper and lower case alone, or None."""
     if not path.is_relative_to(folder):
         return None
     for part in path.relative_to(folder).parts:
@@ -140,7 +140,7 @@ def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
 
 
 def exif_hint(info: ImageInfo) -> str:
-    """End of a message about an image size: EXIF asks to turn the image. Empty if it does not."""
+    """Return the end of a message about an image size if EXIF asks to rotate the image by 90 degrees, else ""."""
     if info.orientation < 5:
         return ""
     return (
@@ -183,7 +183,7 @@ def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFra
 
 @dataclass(frozen=True)
 class SceneDetails:
-    """What a format knows about a scene besides its images."""
+    """Properties of a scene that a format provides besides its images."""
 
     up: Tensor | None = None  # (3,) upward direction; None for the mean of the cameras' own
     points: PointCloud | None = None  # starting points of the format, float64 in the coordinates of the file
@@ -281,7 +281,7 @@ def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
 def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
-    """Decode all images of a split and leave out the damaged ones; ``empty`` ones may show nothing."""
+    """Decode all images of a split and leave out the damaged ones; ``empty`` allows images that show nothing."""
     bad = BadImageViews(f"{where} ({split})", strict)
     faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
     for index, error in faults.items():
@@ -297,7 +297,7 @@ def image_frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[st
 
 
 def _describe_dataset_downsampling(frames: Sequence[ImageFrame], reduced: Camera, factor: int) -> str:
-    """E.g. "200x200 from 800x800 by area", "1/4 by area" where sizes differ, "" for none."""
+    """Describe the reduction: "200x200 from 800x800 by area", "1/4 by area" if sizes differ, "" for none."""
     if factor == 1:
         return ""
     sizes = {(f.info.width, f.info.height) for f in frames}
@@ -308,7 +308,7 @@ def _describe_dataset_downsampling(frames: Sequence[ImageFrame], reduced: Camera
 
 
 def _mean_dataset_up(cameras: Sequence[Camera]) -> Tensor:
-    """(3,) mean of the cameras' upward directions; +z where they cancel."""
+    """Return the (3,) mean of the cameras' upward directions; +z if they cancel."""
     up = -torch.stack([c.viewmat[1, :3] for c in cameras]).mean(0)
     if up.norm() < 1e-3:
         up = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64)

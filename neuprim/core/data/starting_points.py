@@ -1,4 +1,4 @@
-"""Starting points inferred from images: the visual hull of alpha masks, and points along rays without one."""
+"""Starting points inferred from images: on the visual hull of alpha masks, or along rays without a hull."""
 
 from __future__ import annotations
 
@@ -50,8 +50,9 @@ def hull_surface(
 ) -> tuple[Tensor, float]:
     """Return centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
 
-    ``resolution`` is in voxels along the hull's longest side. At least the share ``seen_views`` of the views looks at a
-    voxel, and at most ``wrong_views`` show no ``matter`` (alpha) there. Raises EmptyHull if no voxel is left.
+    ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull if at least the share
+    ``seen_views`` of the views contains it, and at most the share ``wrong_views`` shows no ``matter`` (alpha) there.
+    Raises EmptyHull if no voxel is left.
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
@@ -62,14 +63,14 @@ def hull_surface(
         _VoxelGrid(center - half, 2.0 * half / _COARSE, everything), silhouettes, 0.87, seen_views, wrong_views
     )
     grid = _carve_voxels(_refine_voxels(grid, _COARSE), silhouettes, 0.87, seen_views, wrong_views)
-    # wider than 0.25 and the hull swells, narrower and it tears
+    # a larger reach than 0.25 makes the hull too large, a smaller one makes holes
     grid = _carve_voxels(_refine_voxels(grid, resolution), silhouettes, 0.25, seen_views, wrong_views)
     core = -F.max_pool3d(-F.pad(grid.full[None].float(), (1,) * 6), 3, stride=1)[0] > 0.5
     return grid.centers((grid.full & ~core).nonzero()).float(), grid.voxel
 
 
 def _read_silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
-    """Masks of evenly chosen views, ordered so that neighbours look from different sides."""
+    """Return the masks of evenly spaced views, ordered so that consecutive views look from different sides."""
     chosen = sorted(evenly_spaced(len(views), _VIEWS), key=lambda i: i * 0.6180339887 % 1.0)
     found = []
     for index in chosen:
@@ -130,11 +131,11 @@ def _carve_voxels(
 def _carve_hull_points(
     points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
 ) -> Any:
-    """(M,) bool of the points that ``needed`` views look at and at most ``allowed`` of those rule out.
+    """Return (M,) bool of the points that at least ``needed`` views contain and at most ``allowed`` of those rule out.
 
-    ``points`` (M, 3), ``poses`` (V, 3, 4) world to camera, ``lenses`` (V, 6) fx fy cx cy width height, all float64. A
-    view's summed-area table (height+1, width+1) begins in ``tables`` at its of the (V,) ``offsets``. ``reach`` is half
-    the side of the cube around a point whose projection is searched for matter.
+    ``points`` (M, 3), ``poses`` (V, 3, 4) world to camera, ``lenses`` (V, 6) fx fy cx cy width height, all float64. The
+    summed-area table (height+1, width+1) of view j begins at ``tables[offsets[j]]``. ``reach`` is half the side of the
+    cube around a point whose projection is searched for matter.
     """
     keep = np.zeros(len(points), dtype=np.bool_)
     for i in range(len(points)):
@@ -165,21 +166,21 @@ def _carve_hull_points(
 
 
 GIVE_POINTS = "pass points with model.init.points=FILE.ply, or with ply_file_path in transforms.json"
-"""What to do where no starting point can be inferred."""
+"""Advice in messages if no starting point can be inferred."""
 
-_PROBES = 2000  # pixels whose depth is looked for
-_OTHERS = 32  # views that they are compared with
+_PROBES = 2000  # pixels whose depth is searched
+_OTHERS = 32  # views with which they are compared
 _STEPS = 2.0 ** torch.arange(-2.0, 8.5, 0.5, dtype=torch.float64)  # depths that are tried, in camera extents
 _INFINITY = 1e6  # in camera extents
-_SEEN = 0.1  # share of these pixels that must be seen at a depth, for it to be judged
+_SEEN = 0.1  # a depth counts only if other views show more than this share of the pixels at that depth
 _SAME = 1.02  # up to this ratio of differences, infinity agrees with the images as well as the best depth does
-_TRIED = 8  # depths of a ray, of which the one counts at which other views agree best
+_TRIED = 8  # depths tried per ray; the one at which other views agree best is used
 _PRIOR = 0.5  # weight of how well a depth fits all rays, relative to how well it fits one: some views agree by chance
 _ROUNDS = 8
 
 
 def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
-    """(N,) int64: how many of at most 100 views contain the points (N, 3)."""
+    """Return (N,) int64: how many of at most 100 views contain each of the points (N, 3)."""
     return torch.stack([views.view(i).camera.sees(means) for i in evenly_spaced(len(views), _VIEWS)]).sum(0)
 
 
@@ -219,14 +220,14 @@ def ray_starting_points(
 
 
 def evenly_spaced(count: int, most: int) -> list[int]:
-    """At most ``most`` evenly spaced indices below ``count``."""
+    """Return at most ``most`` evenly spaced indices below ``count``."""
     return sorted({round(i * (count - 1) / max(min(count, most) - 1, 1)) for i in range(min(count, most))})
 
 
 def _draw_starting_pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Random pixels that show matter: eyes and rays with camera z = 1 (N, 3) float64, colours (N, C), views (N,)."""
+    """Draw pixels that show matter: eyes and rays with camera z = 1, (N, 3) float64, colours (N, C), views (N,)."""
     drawn = torch.randint(len(views), (count,), generator=generator)
     spots = torch.rand((count, 2), generator=generator).double()
     found = []
@@ -248,7 +249,7 @@ def _draw_starting_pixels(
 
 
 def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
-    """Depths that fit, the mean colour difference at each, and how many cameras must see a point."""
+    """Return depths that fit, the mean colour difference at each, and how many cameras must see a point."""
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
     unit = camera_extent(cameras)
@@ -272,7 +273,7 @@ def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: fl
 
 
 def _starting_color_difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
-    """(N,) median colour difference to other views at the points; NaN where no view shows them."""
+    """Return the (N,) median colour difference to other views at the points; NaN where no view shows them."""
     found = []
     for index in evenly_spaced(len(views), _OTHERS):
         camera, pixels = views.view(index).camera, views.pixels(index)

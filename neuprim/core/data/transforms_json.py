@@ -51,10 +51,10 @@ def _image_frame_viewmat(record: JsonReader) -> Tensor:
 
 @dataclass(frozen=True)
 class TransformsLayout:
-    """What differs between formats."""
+    """Options of the reader in which formats differ."""
 
     keys: tuple[str, ...] = ()  # further keys that the loader reads
-    name: Callable[[JsonReader], str] = _image_frame_path  # path of a frame's image, as the file has it
+    name: Callable[[JsonReader], str] = _image_frame_path  # path of a frame's image, as the file states it
     image: Callable[[Path, JsonReader], Path | None] = lambda folder, frame: find_image(
         folder, _image_frame_path(frame)
     )
@@ -91,9 +91,9 @@ def read_image_frames(
     frames: list[ImageFrame] = []
     bad = BadImageViews(document.where, settings.strict)
     for (record, file), mask, name in zip(present, masks, names, strict=True):
-        fisheye = has_fisheye_lens(record, document)  # first, as other keys mean nothing to a lens that is not known
+        fisheye = has_fisheye_lens(record, document)  # first, as the other keys have no meaning for an unknown lens
         if not _is_image_pose_damaged(record):
-            layout.viewmat(record)  # a field that is missing or of another kind is no damage, and refused
+            layout.viewmat(record)  # raises for a missing field or one of another kind, which is not damage
         info = bad.read(name, image_info, file)
         viewmat = None if info is None else bad.read(name, _read_image_pose, record, layout)
         if info is None or viewmat is None:
@@ -121,13 +121,13 @@ def _read_image_pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
 
 
 def _is_image_pose_damaged(record: JsonReader) -> bool:
-    """Whether a pose has numbers that are not finite, or only zeros."""
+    """Return whether a pose has numbers that are not finite, or only zeros."""
     poses = [_image_pose_numbers(record.values.get(key)) for key in _POSES]
     return any(not all(map(math.isfinite, numbers)) for numbers in poses) or bool(poses[0] and not any(poses[0]))
 
 
 def _image_pose_numbers(value: object) -> list[float]:
-    """All numbers in nested lists."""
+    """Return all numbers in nested lists."""
     if isinstance(value, list):
         return [n for item in value for n in _image_pose_numbers(item)]
     if isinstance(value, int) and not isinstance(value, bool):
@@ -138,7 +138,7 @@ def _image_pose_numbers(value: object) -> list[float]:
 def _find_frame_masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
-    """The mask of every frame: what ``mask_path`` of frame or file names, else what lies beside the images."""
+    """Return the mask of every frame, or None: from ``mask_path`` of frame or file, else from next to the images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return find_masks(folder, [file for _, file in present])
     masks, lost = [], []
@@ -154,7 +154,7 @@ def _find_frame_masks(
 
 
 def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
-    """The lens; None where all of its coefficients are zero."""
+    """Return the lens; None for one that is not a fisheye and has only zero coefficients."""
     lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
     if fisheye:
@@ -165,7 +165,7 @@ def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) ->
 def read_image_splits(
     folder: Path, train: str, test: str, hold_out: int, read: Callable[[str], list[ImageFrame]]
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
-    """Read (training, test) frames of ``transforms_SPLIT.json``; ``hold_out`` tests every so many views."""
+    """Read (training, test) frames of ``transforms_SPLIT.json``; ``hold_out=n`` makes every n-th view a test view."""
     frames = read(train)
     if hold_out:
         if len(frames) < 2:

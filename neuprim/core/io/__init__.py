@@ -1,1 +1,1 @@
-"""Files: images, films, PLY, OpenVDB, and writing them so that nothing is half there."""
+"""Files: images, films, PLY, OpenVDB and JSON, and atomic writes."""

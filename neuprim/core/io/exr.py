@@ -25,9 +25,9 @@ __all__ = ["ExrChannel", "exr_channels", "read_exr", "write_exr", "write_exr_lay
 MAX_PIXELS = 64 * 2**20
 """Most pixels of an image (8192 x 8192). Larger ones are refused before pixel memory is allocated."""
 
-_MAX_VALUES = 16 * MAX_PIXELS  # of all channels of a file, as all are decoded together
+_MAX_VALUES = 16 * MAX_PIXELS  # most values of all channels of a file, which are decoded together
 _MAX_HALF = 65504.0
-_MAX_NAME_BYTES = 31  # that every reader of OpenEXR takes
+_MAX_NAME_BYTES = 31  # longest channel name that every reader of OpenEXR accepts
 _MAGIC = b"\x76\x2f\x31\x01"
 
 
@@ -50,12 +50,12 @@ def refuse_image_file_beyond_memory(path: Path) -> Iterator[None]:
 
 
 def default_exr_channel_names(count: int) -> tuple[str, ...]:
-    """R, G, B for three channels, Y for one, else c0, c1, ..."""
+    """Return the names R, G, B for three channels, Y for one, else c0, c1, ..."""
     return {1: ("Y",), 3: ("R", "G", "B")}.get(count, tuple(f"c{i}" for i in range(count)))
 
 
 def exr_channel_name_error(names: Sequence[Any]) -> str | None:
-    """``"PROBLEM; expected ..."`` for the first name that OpenEXR cannot hold or that is ambiguous, else None."""
+    """Return ``"PROBLEM; expected ..."`` for the first name that OpenEXR cannot hold or is ambiguous, else None."""
     used: set[str] = set()
     for i, name in enumerate(names):
         if not isinstance(name, str):
@@ -72,7 +72,7 @@ def exr_channel_name_error(names: Sequence[Any]) -> str | None:
 
 
 def is_exr(path: Path, required: bool = False) -> bool:
-    """Whether a file starts as OpenEXR; raises DataError if it cannot be read or, with ``required``, does not."""
+    """Return whether a file starts as OpenEXR; raises DataError if unreadable or, with ``required``, if not."""
     try:
         with open(path, "rb") as file:
             head = file.read(8)
@@ -94,7 +94,7 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
-    """From the header: names of the wanted channels, or of the only R, G, B(, A); width; height; or DataError."""
+    """Return channel names (``wanted``, or the only R, G, B(, A)), width and height from the header, or DataError."""
     channels, width, height = _read_exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
@@ -111,7 +111,7 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
 
 
 def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
-    """Channels by name, width and height."""
+    """Return channels by name, width and height; raises DataError."""
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             parts = len(file.parts)

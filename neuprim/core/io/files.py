@@ -1,4 +1,4 @@
-"""Write files so that they are complete or absent, and the folder for caches."""
+"""Write files and folders atomically, complete or not at all; find the folder for caches."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def checked_atomic_path(path: Path) -> Iterator[Path]:
-    """:func:`atomic_path` in an existing folder; errors of the disk become DataError."""
+    """Return a context as :func:`atomic_path`, in a folder that must exist; turns errors of the disk into DataError."""
     if not path.parent.is_dir():
         raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
     try:
@@ -153,7 +153,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _is_file_writer_running(number: str | None) -> bool:
-    """Whether another process of this machine has that number."""
+    """Return whether another process of this machine has this process ID."""
     # Containers reuse numbers. A file with this process's own number is old: the lock's holder has not written yet.
     if number is None or int(number) == os.getpid():
         return False
@@ -183,7 +183,7 @@ def publish_folder(final: Path, write: Callable[[Path], None], complete: Callabl
 
 
 def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """:func:`publish_folder` in a parent folder that must exist already."""
+    """Publish a folder as :func:`publish_folder`, but always call ``write``; the parent folder must exist."""
     draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
     try:
         draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users
@@ -211,14 +211,14 @@ def refuse_existing(final: Path, overwrite: bool) -> None:
 
 
 class StagedOutput:
-    """A place to write what becomes ``final`` once :meth:`publish` moves it; write to ``out``."""
+    """A temporary place for an output: write to ``out``, then :meth:`publish` moves it to ``final``."""
 
     def __init__(self, folder: Path, final: Path, overwrite: bool) -> None:
         self._folder, self._final, self._overwrite = folder, final, overwrite
         self.out = folder / (final.name if final.name not in ("", "..") else "out")
 
     def final_path(self, path: Path) -> Path | None:
-        """Where a staged file ends up; None for a file that was written elsewhere."""
+        """Return the final path of a staged file; None for a file outside the staging folder."""
         try:
             parts = path.resolve().relative_to(self._folder.resolve()).parts
         except ValueError:
@@ -228,7 +228,7 @@ class StagedOutput:
         return self._final.joinpath(*parts[1:]) if parts[0] == self.out.name else self._final.parent.joinpath(*parts)
 
     def final_text(self, text: str) -> str:
-        """A text with staged paths replaced by final ones."""
+        """Replace the staged paths in a text by final ones."""
         return text.replace(str(self.out), str(self._final)).replace(str(self._folder), str(self._final.parent))
 
     def publish(self) -> None:

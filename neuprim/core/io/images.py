@@ -108,7 +108,7 @@ def _check_image_size(path: Path, width: int, height: int, size: tuple[int, int]
 
 @contextmanager
 def _open_image(path: Path) -> Iterator[Image.Image]:
-    """The opened image, not decoded yet; refuses other formats and sizes beyond MAX_PIXELS."""
+    """Open an image without decoding it; refuse other formats and sizes beyond MAX_PIXELS."""
     try:
         image = Image.open(path, formats=("PNG", "JPEG", "WEBP"))
     except FileNotFoundError:
@@ -132,14 +132,14 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def _png_depth_and_kind(path: Path) -> tuple[int, int]:
-    """(bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB silently as 8-bit."""
+    """Return (bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB silently as 8-bit."""
     with open(path, "rb") as file:
         head = file.read(26)
     return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
 
 
 def _lossless_mode(path: Path, image: Image.Image) -> str:
-    """RGB or RGBA, whichever holds the image without loss; raises DataError where neither does, and for animations."""
+    """Return "RGB" or "RGBA", whichever holds the image without loss; raise DataError if neither, or an animation."""
     depth, kind = _png_depth_and_kind(path)
     if depth == 16 or image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         what = {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
@@ -148,14 +148,14 @@ def _lossless_mode(path: Path, image: Image.Image) -> str:
         raise DataError(f"{path}: image is {what}; expected 8-bit RGB or RGBA")
     if image.mode != "P" and "transparency" in image.info:
         raise DataError(f"{path}: image is {image.mode} with a transparent colour key (tRNS); expected RGB or RGBA")
-    # Cameras keep previews in the further pictures of a JPEG, which Pillow calls MPO.
+    # Cameras store previews as further pictures of a JPEG, which Pillow calls MPO.
     if getattr(image, "n_frames", 1) > 1 and image.format != "MPO":
         raise DataError(f"{path}: image is an animation; expected one picture")
     return "RGBA" if image.mode in ("LA", "PA", "RGBA") or "transparency" in image.info else "RGB"
 
 
 def _exif_orientation(image: Image.Image) -> int:
-    """EXIF's orientation; 1 if there is none that is readable."""
+    """Return the EXIF orientation, 1 to 8; 1 if it is missing or unreadable."""
     if "exif" not in image.info:  # getexif would decode a PNG to look for a chunk behind the pixels
         return 1
     try:
@@ -177,7 +177,7 @@ def _decode_image(path: Path, image: Image.Image, mode: str) -> np.ndarray:
 
 
 def to_uint8(image: Tensor) -> Tensor:
-    """Display-referred values 0..1 of any shape as uint8, rounded and clamped; raises DataError for NaN."""
+    """Convert display-referred values 0..1 of any shape to uint8, clamped and rounded; raises DataError for NaN."""
     if image.dtype == torch.uint8:
         return image
     if torch.isnan(image).any():

@@ -29,7 +29,7 @@ _MISSING = object()
 
 
 def _describe_json(value: Any) -> str:
-    """A short description of a JSON value for messages."""
+    """Describe a JSON value briefly, for messages."""
     if isinstance(value, list):
         return f"a list of {len(value)}"
     if isinstance(value, dict):
@@ -39,7 +39,7 @@ def _describe_json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class JsonReader:
-    """One JSON object and where it is."""
+    """Reader of the fields of one JSON object."""
 
     values: dict[str, Any]
     where: str  # prefix of messages, e.g. "/data/transforms.json: frames[3]"
@@ -62,11 +62,11 @@ class JsonReader:
         return cls(value, str(path))
 
     def has(self, key: str) -> bool:
-        """Whether the field is there and not null."""
+        """Return whether the field is there and not null."""
         return self.values.get(key) is not None
 
     def fail(self, key: str, expected: str) -> DataError:
-        """The error for a field that is missing or wrong."""
+        """Return the error for a field that is missing or wrong."""
         value = self.values.get(key, _MISSING)
         actual = "is missing" if value is _MISSING else f"is {_describe_json(value)}"
         return DataError(f"{self.where}: {key} {actual}; expected {expected}")
@@ -74,39 +74,39 @@ class JsonReader:
     def number(
         self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf
     ) -> float:
-        """A finite number strictly between ``low`` and ``high``."""
+        """Return a finite number strictly between ``low`` and ``high``, or raise DataError, as all readers here do."""
         value = finite_json_number(self.values.get(key))
         if value is None or not low < value < high:
             raise self.fail(key, expected)
         return value
 
     def number_or(self, key: str, default: float, expected: str = "a finite number", low: float = -math.inf) -> float:
-        """As :meth:`number`, or ``default`` if the field is absent or null."""
+        """Return a number as :meth:`number`, or ``default`` if the field is absent or null."""
         return self.number(key, expected, low) if self.has(key) else default
 
     def count(self, key: str) -> int:
-        """A positive whole number; exporters also write 800.0."""
+        """Return a positive whole number; exporters also write 800.0."""
         value = self.number(key, "a positive whole number", 0.0)
         if value != int(value):
             raise self.fail(key, "a positive whole number")
         return int(value)
 
     def text(self, key: str) -> str:
-        """A text that is not empty."""
+        """Return a text that is not empty."""
         value = self.values.get(key)
         if not isinstance(value, str) or not value or "\0" in value:
             raise self.fail(key, "a non-empty text")
         return value
 
     def texts(self, key: str) -> list[str]:
-        """A list of texts that are not empty."""
+        """Return a list of texts that are not empty."""
         value = self.values.get(key)
         if not isinstance(value, list) or not all(isinstance(v, str) and v and "\0" not in v for v in value):
             raise self.fail(key, "a list of texts")
         return value
 
     def array(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
-        """(n,) or (rows, columns) float64 from nested lists of exactly that shape, all finite numbers."""
+        """Return (n,) or (rows, columns) float64 from nested lists of exactly that shape, all finite numbers."""
 
         def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
             if not shape:
@@ -121,7 +121,7 @@ class JsonReader:
         return torch.tensor(read(self.values.get(key), shape, ""), dtype=torch.float64)
 
     def matrix(self, key: str) -> Tensor:
-        """(4, 4) float64 from 3 or 4 rows of 4 finite numbers; a fourth row must be 0 0 0 1."""
+        """Return (4, 4) float64 from 3 or 4 rows of 4 finite numbers; a fourth row must be 0 0 0 1."""
         rows = self.values.get(key)
         expected = "4 rows of 4 numbers"
         if not isinstance(rows, list) or len(rows) not in (3, 4):
@@ -133,7 +133,7 @@ class JsonReader:
         return torch.cat([matrix[:3], last])
 
     def objects(self, key: str) -> Iterator[JsonReader]:
-        """Readers of the objects in a list that is not empty."""
+        """Yield readers of the objects in a list that is not empty."""
         value = self.values.get(key)
         if not isinstance(value, list) or not value:
             raise self.fail(key, "a non-empty list of objects")
@@ -143,11 +143,11 @@ class JsonReader:
             yield JsonReader(item, f"{self.where}: {key}[{i}]")
 
 
-_MAX_DIGITS = 20  # of a whole number of 64 bits
+_MAX_DIGITS = 20  # digits of a whole number of 64 bits
 
 
 def finite_json_number(value: object) -> float | None:
-    """A number of a file as a float; None for text, true, a list, NaN, 1e400 and the like."""
+    """Return a number from a file as a float; None for text, true, a list, NaN, 1e400 and the like."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:

@@ -38,7 +38,7 @@ class PlyVertices:
         return self.rows.dtype.names or ()
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """(N, len(names)) float64."""
+        """Return the properties ``names`` as (N, len(names)) float64."""
         if not names:
             return np.zeros((len(self.rows), 0))
         return np.stack([self.rows[name].astype(np.float64) for name in names], -1)
@@ -108,7 +108,7 @@ def read_ply_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[st
 
 
 def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader], tuple[str, ...]]:
-    """Byte order ("" for ASCII), elements, comments."""
+    """Return byte order ("" for ASCII), elements and comments."""
     order: str | None = None
     elements: list[_ElementHeader] = []
     comments: list[str] = []
@@ -209,7 +209,7 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
 
 
 def _first_ply_list_lengths(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
-    """Lengths of the first row's lists, 1 for scalars; None if they are implausible."""
+    """Return the lengths of the first row's lists, 1 for scalars; None if they are implausible."""
     sizes = []
     for _, kind, length in fields:
         size = 1

@@ -69,7 +69,7 @@ class Store:
 
     @classmethod
     def local(cls, path: Path) -> Store:
-        """The store in a folder of a file system, of this machine or shared."""
+        """Return the store in a folder of a local or shared file system."""
         return cls(str(path), path)
 
     @property
@@ -77,7 +77,7 @@ class Store:
         return self._system is None
 
     def at(self, *names: str) -> Store:
-        """The store in a subfolder."""
+        """Return the store in a subfolder."""
         path, below = self.path.joinpath(*names), "/".join(names)
         if self.is_local:
             return Store.local(path)
@@ -92,7 +92,7 @@ class Store:
                 self._system.makedirs(self._root, exist_ok=True)
 
     def complete_folders(self, last: str) -> set[str]:
-        """Names of the folders that have the file ``last``."""
+        """Return the names of the folders that have the file ``last``."""
         if not self.is_local:
             with self._client_errors("read"):
                 self._system.invalidate_cache()
@@ -105,7 +105,7 @@ class Store:
         return {e.name for e in entries if e.name[:1] != "." and os.path.isfile(os.path.join(e.path, last))}
 
     def has_file(self, name: str) -> bool:
-        """Whether a file exists, by its name with folders, ``"frame_00001/points.npz"``."""
+        """Return whether a file exists, by its name with folders, ``"frame_00001/points.npz"``."""
         if self.is_local:
             return (self.path / name).is_file()
         with self._client_errors("read"):
@@ -177,14 +177,14 @@ class Store:
             self._wait(notify)
 
     def _is_gone(self) -> bool:
-        """Whether the folder does not exist or does not answer. A lost mount leaves an empty folder, so ask inside."""
+        """Return whether the folder is missing or does not answer. A lost mount leaves an empty folder: ask inside."""
         try:
             return not self.path.is_dir()
         except OSError:
             return True
 
     def _may_be_transient(self, error: Exception) -> bool:
-        """Whether the folder may have been gone for a moment: one of its files was not found."""
+        """Return whether the folder may have been gone for a moment: one of its files was not found."""
         cause = error if isinstance(error, OSError) else error.__cause__
         number = cause.errno if isinstance(cause, OSError) else None
         return number in (None, *_DISAPPEARED) and str(self.path) in str(error)

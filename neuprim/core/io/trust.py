@@ -1,6 +1,6 @@
-"""The user's word that a run of somebody else may be used as one of their own: ``--trust``, or an environment variable.
+"""The user's consent to use a run of somebody else like one of their own: ``--trust``, or an environment variable.
 
-What it is asked for: :mod:`neuprim.config.stored_run`.
+:mod:`neuprim.config.stored_run` says what needs it.
 """
 
 from __future__ import annotations
@@ -10,17 +10,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 FLAG = "--trust"
-ENVIRONMENT = "NEUPRIM_TRUST"  # says the flag for every command; processes that a command starts inherit it
+ENVIRONMENT = "NEUPRIM_TRUST"  # gives the flag to every command; processes that a command starts inherit it
 
 
 def trusted() -> bool:
-    """Whether the user said so."""
+    """Return whether the user trusts runs of others."""
     return os.environ.get(ENVIRONMENT, "") not in ("", "0")
 
 
 @contextmanager
 def trusting(said: bool) -> Iterator[None]:
-    """Inside, runs are trusted if the user ``said`` so now, or in the environment."""
+    """Trust runs inside the block if ``said``, the user's flag, is set, or if the environment variable is."""
     before = os.environ.get(ENVIRONMENT)
     if said:
         os.environ[ENVIRONMENT] = "1"

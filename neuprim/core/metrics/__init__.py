@@ -1,4 +1,4 @@
-"""Measures of images against their truth."""
+"""Metrics of images against ground truth."""
 
 from neuprim.core.metrics.image import (
     comparable_images,

@@ -1,4 +1,4 @@
-"""Image quality of one rendered view against its truth: PSNR and SSIM.
+"""Image quality of one rendered view against its ground truth: PSNR and SSIM.
 
 Float images (H, W, C) are compared as they are: nothing is clipped, quantised or converted. Sums are in float64. JSON
 has no infinity: files hold ``{"psnr": null, "psnr_infinite": true}`` (:func:`metric_to_json`).
@@ -28,7 +28,7 @@ def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """As :func:`comparable_images`; both float32 stay so."""
+    """Return both images as :func:`comparable_images`, but two float32 images stay float32."""
     images = {"rendered": rendered, "truth": truth}
     for name, image in images.items():
         if not image.is_floating_point():

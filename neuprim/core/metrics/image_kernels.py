@@ -61,7 +61,7 @@ def _sum_ssim_of_moments(s, count, c1, c2):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_ssim_of_rows(start, stop, x, y, height, channels, c1, c2):  # type: ignore[no-untyped-def]
-    """The sum of SSIM over window rows start:stop; x, y: flat (height x width x channels)."""
+    """Return the sum of SSIM over window rows start:stop; x, y: flat (height x width x channels)."""
     pitch = x.shape[0] // height
     reach = (SSIM_WINDOW - 1) * channels
     windows = pitch - reach
@@ -78,7 +78,7 @@ def _sum_ssim_of_rows(start, stop, x, y, height, channels, c1, c2):  # type: ign
 
 
 def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
-    """Mean of SSIM over channels and over the positions where an 11 x 11 window lies inside the images.
+    """Return the mean SSIM over channels and over the positions where an 11 x 11 window lies inside the images.
 
     With window means E: SSIM = (2 E[x]E[y] + c1) (2 cov + c2) / ((E[x]^2 + E[y]^2 + c1) (var x + var y + c2)), where
     c1 = (0.01 peak)^2, c2 = (0.03 peak)^2.
@@ -96,7 +96,7 @@ def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
 
 @exact_kernel
 def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignore[no-untyped-def]
-    """Over pixels start:stop, of those that are counted; all where ``counted`` is empty."""
+    """Return the sum of squared differences over the counted pixels in start:stop; an empty ``counted`` means all."""
     total = 0.0
     for pixel in range(start, stop):
         if counted.size == 0 or counted[pixel]:
@@ -107,7 +107,7 @@ def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignor
 
 
 def sum_squared_errors(first: Tensor, second: Tensor, mask: Tensor | None) -> float:
-    """Sum of the squared differences of (H, W, C) images, float32 or float64, where an (H, W) bool mask is True."""
+    """Sum the squared differences of (H, W, C) images, float32 or float64, where an (H, W) bool mask is True."""
     channels, count = first.shape[-1], first.shape[0] * first.shape[1]
     counted = np.empty(0, np.bool_) if mask is None else _flat_values(mask)
     images = _flat_values(first), _flat_values(second)

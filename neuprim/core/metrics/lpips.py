@@ -1,4 +1,4 @@
-"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), by weights of the user's own.
+"""LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), with the user's own weights.
 
 Weights are state dictionaries that LPIPS and torchvision publish, as torch or safetensors files: a whole
 ``lpips.LPIPS(net="vgg")``, or linear layers and convolutions side by side in a folder. Shapes tell AlexNet from VGG16.
@@ -25,7 +25,7 @@ __all__ = ["Lpips", "flip", "flip_available"]
 
 
 class _Layer(NamedTuple):
-    """A convolution with its rectifier."""
+    """A convolution followed by a ReLU."""
 
     number: int  # index in torchvision's features
     inputs: int
@@ -33,8 +33,8 @@ class _Layer(NamedTuple):
     side: int
     stride: int
     padding: int
-    pool: int  # side of the maximum, in steps of 2, that is taken before it; 0 for none
-    tap: bool  # whether the distance looks at what comes out
+    pool: int  # side of the max pooling before it, stride 2; 0 for none
+    tap: bool  # whether the distance compares its output
 
 
 def _vgg16() -> tuple[_Layer, ...]:
@@ -43,7 +43,7 @@ def _vgg16() -> tuple[_Layer, ...]:
         for i in range(count):
             layers.append(_Layer(index, inputs, outputs, 3, 1, 1, 2 if block and i == 0 else 0, i == count - 1))
             index, inputs = index + 2, outputs
-        index += 1  # the maximum
+        index += 1  # the max pooling
     return tuple(layers)
 
 
@@ -97,7 +97,7 @@ class Lpips:
         return self._distance(*self._images(rendered, truth))
 
     def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:
-        """Both as (1, 3, H, W) float32 of 0..1."""
+        """Return both images as (1, 3, H, W) float32, clamped to 0..1."""
         images = [image.clamp(0.0, 1.0).permute(2, 0, 1)[None].float() for image in comparable_images(rendered, truth)]
         if images[0].shape[1] != 3 or min(images[0].shape[2:]) < self.least:
             raise DataError(
@@ -111,7 +111,7 @@ class Lpips:
             return sum(float(((a - b).square() * w[None, :, None, None]).sum(1).double().mean()) for a, b, w in pairs)
 
     def _features(self, image: Tensor) -> Iterable[Tensor]:
-        """What comes out of every tap, each pixel's channels divided by their length."""
+        """Yield the output of every compared layer, each pixel's channels normalised to length 1."""
         x = (image - torch.tensor(_SHIFT)[None, :, None, None]) / torch.tensor(_SCALE)[None, :, None, None]
         for layer, weight, bias in zip(_NETWORKS[self.network], self.weights, self.biases, strict=True):
             if layer.pool:

@@ -1,7 +1,7 @@
-"""Checks of what fields hand to the renderer: one line names field, tensor, found and expected.
+"""Checks of the tensors that fields return: errors name field, tensor, found and expected in one line.
 
-Compiled kernels index without looking, and torch would broadcast what does not fit. Tensors are float32 or float64, in
-any mix, dense and all on one device; strides do not matter.
+Compiled kernels do not check bounds, and torch would broadcast wrong shapes. Tensors are float32 or float64, in any
+mix, dense and all on one device; strides do not matter.
 """
 
 from __future__ import annotations
@@ -40,23 +40,23 @@ def _is_dense_primitive_tensor(value: Any) -> bool:
 
 
 def _describe_model_tensor(value: Any) -> str:
-    """What a value is, for messages."""
+    """Describe a value for messages: its type, or dtype, layout, shape and device."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}"
     layout = "" if value.layout is torch.strided else f" {value.layout}"
     return f"{value.dtype}{layout} {tuple(value.shape)} on {value.device}"
 
 
-# ---------------------------------------------------------------- entrances
+# ---------------------------------------------------------------- labels and checks
 
 
 def model_field_label(kind: str, field: str | None) -> str:
-    """``"density field Waves"``, or ``"density"`` where no field is known."""
+    """Return ``"density field Waves"``, or ``"density"`` if the field is unknown."""
     return kind if field is None else f"{kind} field {field}"
 
 
 def model_method_label(field: Field, name: str) -> str:
-    """``"density field Waves: on_split"``: a method as its author writes it."""
+    """Return ``"density field Waves: on_split"``, the name of a field's method for messages."""
     return (
         f"{model_field_label('density' if isinstance(field, DensityField) else 'colour', type(field).__name__)}: {name}"
     )
@@ -79,7 +79,7 @@ def check_lowered_density(density: Any, sizes: Sizes, field: str | None) -> None
 
 
 def check_lowered_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
-    """The same of a lowered colour."""
+    """Raise :class:`FormError` unless a lowered colour fits, as :func:`check_lowered_density`."""
     _check_lowered_form(model_field_label("colour", field), colour, _COLOURS, sizes)
 
 
@@ -130,7 +130,7 @@ def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: 
 
 
 def check_primitive_field_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
-    """Return what a field's own code returned if it is a dense tensor of real numbers of this shape."""
+    """Return the result of a field's own code; raise FormError unless it is a dense real tensor of this shape."""
     if not _is_dense_primitive_tensor(value) or not value.is_floating_point():
         kinds = " or ".join(device.DEVICE_TYPES)
         raise FormError(
@@ -143,7 +143,7 @@ def check_primitive_field_result(value: Any, shape: tuple[int, ...], who: str) -
 
 
 def check_primitive_shading(found: Any, count: int, who: str) -> Shading:
-    """Return what ``shade`` returned if it fits ``count`` primitives; None is no shading."""
+    """Return the result of ``shade``, None as no shading; raise FormError unless it fits ``count`` primitives."""
     if found is None:
         return Shading()
     if not isinstance(found, Shading):
@@ -164,7 +164,7 @@ def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, wh
 
 
 def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
-    """Return a field's own parameters from one of its methods: names, shapes and dtypes of ``like``."""
+    """Return the tensors that a field's method returned; raise FormError unless they fit those of ``like``."""
     if not isinstance(found, Mapping):
         raise FormError(f"{who} returned type {type(found).__name__}; expected a dict of tensors by name")
     if set(found) != set(like):
@@ -194,7 +194,7 @@ def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFi
 
 
 def check_primitive_colours_finite(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
-    """Raise NonFiniteError for colours, which the per-primitive kernels do not read; waits for a GPU.
+    """Raise NonFiniteError for non-finite colours, which per-primitive kernels do not read; synchronises with a GPU.
 
     ``named``: all tensors of the frame; the first of them that is not finite is the cause.
     """

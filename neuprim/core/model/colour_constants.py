@@ -28,8 +28,8 @@ C3 = (
 MOST_LOBES = 8
 
 LOG_LIMIT = 20.0
-"""Logarithms of sharpness count as no further from 0 than this, and get no gradient beyond."""
+"""Logarithms of sharpness are clamped to plus or minus this value, and get no gradient beyond."""
 
 SHORTEST = 1e-24
-"""Vectors that are not longer have no direction: the unit vector is zero and passes no gradient. The limit keeps
+"""Vectors of at most this length have no direction: the unit vector is zero and passes no gradient. The limit keeps
 gradients of float32 numbers finite."""

@@ -1,4 +1,4 @@
-"""Compiled CPU kernels of colours that depend on the direction of view, forward and backward, float64 inside:
+"""Compiled CPU kernels of view-dependent colours, forward and backward, float64 inside:
 harmonics (:mod:`neuprim.core.model.sh`) and lobes (:mod:`neuprim.core.model.lobes`)."""
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.compute.threads import apply_kernel_operation, parallel_for
 from neuprim.core.model.colour_constants import C0, C1, C2, C3, LOG_LIMIT, SHORTEST
 
-_CHUNK = 8192  # primitives per unit of work: a quarter of a millisecond, beside what waking a thread takes
+_CHUNK = 8192  # primitives per unit of work: a quarter of a millisecond, long compared with waking a thread
 
 
 @strict
 def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
-    """Bands 1..degree of sh.basis at a unit direction, into Y[0:15]."""
+    """Write bands 1..degree of :func:`~neuprim.core.model.sh.sh_basis` at a unit direction into Y[0:15]."""
     Y[0], Y[1], Y[2] = -C1 * y, C1 * z, -C1 * x
     if degree >= 2:
         xx, yy, zz = x * x, y * y, z * z
@@ -41,7 +41,7 @@ def _basis(x, y, z, degree, Y):  # type: ignore[no-untyped-def]
 
 @strict
 def _basis_gradient(x, y, z, degree, g, out):  # type: ignore[no-untyped-def]
-    """out = sum_k g[k] dY_k/d(x, y, z), the basis taken as polynomials of a free direction."""
+    """Write sum_k g[k] dY_k/d(x, y, z) into ``out``, with the basis as polynomials of a direction of any length."""
     gx, gy, gz = -C1 * g[2], -C1 * g[0], C1 * g[1]
     if degree >= 2:
         a, b, c, d, e = C2[0] * g[3], C2[1] * g[4], C2[2] * g[5], C2[3] * g[6], C2[4] * g[7]
@@ -149,7 +149,7 @@ class _HarmonicColors(torch.autograd.Function):
 
 
 def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """:func:`~neuprim.core.model.sh.sh_colors` of float32 CPU tensors, degree 1..3; differentiable."""
+    """Compute :func:`~neuprim.core.model.sh.sh_colors` for float32 CPU tensors, degree 1..3; differentiable."""
     result: Tensor = apply_kernel_operation(_HarmonicColors, means, dc, rest, origin, degree)
     return result
 
@@ -159,7 +159,7 @@ def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tenso
 
 @strict
 def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
-    """A unit vector and the reciprocal of its length before; zeros where it has no direction."""
+    """Return the normalised vector and 1/length; zeros for a vector too short to have a direction."""
     length = np.sqrt(x * x + y * y + z * z)
     over = 1.0 / length if length > SHORTEST else 0.0
     return x * over, y * over, z * over, over
@@ -167,7 +167,7 @@ def _unit_or_zero(x, y, z):  # type: ignore[no-untyped-def]
 
 @strict
 def lobe_weight(nearness, log_sharpness):  # type: ignore[no-untyped-def]
-    """Weight, nearness as clamped at 0, and sharpness. Comparisons are such that NaN stays NaN."""
+    """Return a lobe's weight, ``nearness`` clamped to at most 0, and the sharpness; NaN stays NaN."""
     if log_sharpness > LOG_LIMIT:
         log_sharpness = LOG_LIMIT
     if log_sharpness < -LOG_LIMIT:
@@ -255,6 +255,6 @@ class _LobeColors(torch.autograd.Function):
 def fused_lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """:func:`~neuprim.core.model.lobes.lobe_colors` of float32 CPU tensors, at least one lobe; differentiable."""
+    """Compute :func:`~neuprim.core.model.lobes.lobe_colors` for float32 CPU tensors with lobes; differentiable."""
     result: Tensor = apply_kernel_operation(_LobeColors, means, dc, amplitude, axis, log_sharpness, origin)
     return result

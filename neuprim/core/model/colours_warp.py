@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colours of harmonics and lobes on a GPU, a thread a primitive, float64 inside: the twin of ``model.colours_cpu``."""
+"""GPU kernels of harmonics and lobes, one thread per primitive, float64 inside; on the CPU ``model.colours_cpu``."""
 
 import functools
 from typing import Any
@@ -24,7 +24,7 @@ def _harmonic_functions(degree: int) -> tuple[Any, Any]:
 
     @wp.func
     def basis(v: wp.vec3d):
-        """Bands 1 to ``degree`` at a unit direction."""
+        """Return bands 1 to ``degree`` of the harmonics at a unit direction."""
         x, y, z = v[0], v[1], v[2]
         Y = _vec15()
         Y[0] = -_C1 * y
@@ -49,7 +49,7 @@ def _harmonic_functions(degree: int) -> tuple[Any, Any]:
 
     @wp.func
     def gradient(v: wp.vec3d, g: _vec15):
-        """sum_k g_k dY_k/d(x, y, z), the basis taken as polynomials of a free direction."""
+        """Return sum_k g_k dY_k/d(x, y, z), with the basis as polynomials of a direction of any length."""
         x, y, z = v[0], v[1], v[2]
         out = wp.vec3d(-_C1 * g[2], -_C1 * g[0], _C1 * g[1])
         if wp.static(degree >= 2):
@@ -162,7 +162,7 @@ class _HarmonicColors(torch.autograd.Function):
 
 
 def fused_harmonic_colors(means: Tensor, dc: Tensor, rest: Tensor, origin: Tensor, degree: int) -> Tensor:
-    """:func:`~neuprim.core.model.sh.sh_colors` of float32 GPU tensors, degree 1..3; differentiable."""
+    """Compute :func:`~neuprim.core.model.sh.sh_colors` for float32 GPU tensors, degree 1..3; differentiable."""
     result: Tensor = _HarmonicColors.apply(means, dc, rest, origin, degree)
     return result
 
@@ -175,7 +175,7 @@ _LIMIT, _SHORTEST = wp.constant(d(LOG_LIMIT)), wp.constant(d(SHORTEST))
 
 @wp.func
 def _one_over(v: wp.vec3d):
-    """The reciprocal of a length; zero where there is no direction."""
+    """Return the reciprocal of a vector's length; zero for vectors too short to have a direction."""
     length = wp.length(v)
     if length > _SHORTEST:
         return d(1.0) / length
@@ -302,6 +302,6 @@ class _LobeColors(torch.autograd.Function):
 def fused_lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """:func:`~neuprim.core.model.lobes.lobe_colors` of float32 GPU tensors, at least one lobe; differentiable."""
+    """Compute :func:`~neuprim.core.model.lobes.lobe_colors` for float32 GPU tensors with lobes; differentiable."""
     result: Tensor = _LobeColors.apply(means, dc, amplitude, axis, log_sharpness, origin)
     return result

@@ -9,7 +9,7 @@ p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaus
 **Canonical form.** A sum stays the same when (v_k, b_k) changes sign, when rate b_k gains a whole turn, and when it
 gains half a turn and w_k changes sign. So every w_k can be positive and every b_k between 0 and half a turn.
 
-**Pruning.** The neurons whose part of the density varies most stay; the others leave their mean behind. Over an
+**Pruning** keeps the neurons whose part of the density varies most and adds the mean of the others to b2. Over an
 ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
 
     mean of cos(phi + r.y) = cos(phi) b(|r|),   b(r) = 3 (sin r - r cos r)/r^3,   phi = omega0 b1,
@@ -46,11 +46,11 @@ so far apart, and products with the other weights stay far from the ends of floa
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
-"""What ``model.density`` may say for it, in every task (:func:`neuprim.core.validation.validate_choices`)."""
+"""Its settings under ``model.density``, in every task, for :func:`neuprim.core.validation.validate_choices`."""
 
 
 DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "model.density.edge": EDGES}
-"""What of it trades quality for speed or size, in every task (:attr:`neuprim.core.task.TaskSpec.tunable_settings`)."""
+"""Its settings that trade quality for speed or size, for :attr:`neuprim.core.task.TaskSpec.tunable_settings`."""
 
 
 class CosineDensity(DensityField):
@@ -159,7 +159,7 @@ def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple
 
 
 _FAINT, _SOLID = 0.02, 0.98
-"""Starting points that say how opaque they are start within these: beyond, little light or little gradient passes."""
+"""Range to which the opacities of starting points are clamped: beyond, little light or little gradient passes."""
 
 
 def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> Tensor:
@@ -188,7 +188,7 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
 
 
 def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
-    """(rows,) float64 factor c on a child's (w2, b2), see :func:`split_cosine`."""
+    """Return the (rows,) float64 factors c on the children's (w2, b2), see :func:`split_cosine`."""
     r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
     if edge == 0:
         return r
@@ -220,16 +220,17 @@ def split_cosine(
 
 
 _LOGITS = torch.linspace(-6, 6, 25, dtype=torch.float64)
-"""Of the opacities that are tabulated; beyond, the nearest counts."""
-_NODES, _FAR = 160, 5.0  # rings of the footprint, and where it ends: standard deviations
-_WIDTHS = (1.45, 4.0)  # where c is looked for
+"""Logits of the tabulated opacities; opacities beyond take the nearest entry."""
+_NODES, _FAR = 160, 5.0  # number of rings of the footprint, and its radius in standard deviations
+_WIDTHS = (1.45, 4.0)  # search interval of c
 _GOLDEN = (5**0.5 - 1) / 2
 
 
 def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[Tensor, Tensor]:
-    """(N,) c and (N,) tau, float64, of primitives for Gaussians of opacity ``alphas`` (N,), 0..1.
+    """Return (N,) supports c and (N,) central optical depths tau of primitives that replace Gaussians; float64.
 
-    ``volume``: the Gaussians are densities in space, whose optical depth, not alpha, is a bell on the screen.
+    c is in standard deviations; ``alphas`` are the (N,) opacities of the Gaussians, 0..1. ``volume``: the Gaussians
+    are densities in space, so that their optical depth, not their alpha, is a Gaussian on the screen.
     """
     table = _gaussian_support_table(edge, volume)
     alphas = alphas.double().clamp(1e-9, 1 - 1e-9)
@@ -242,14 +243,14 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
 @lru_cache
 def _gaussian_support_table(edge: int, volume: bool) -> Tensor:
-    """(O, 2) c and log(tau / -log(1 - o)) for the tabulated opacities, by a golden section of c."""
+    """Return (O, 2): c and log(tau / -log(1 - o)) for the tabulated opacities o, by a golden-section search of c."""
     r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
     opacity = torch.sigmoid(_LOGITS)[:, None]
     bell = (-r * r / 2).exp()
     target = -torch.expm1(torch.log1p(-opacity) * bell) if volume else opacity * bell
 
     def best(c: Tensor) -> tuple[Tensor, Tensor]:
-        """(O,) what is left of the squares, and log tau, for (O,) c."""
+        """Return (O,) squared errors and log tau for (O,) c; this tau gives both footprints the same integral."""
         shape = (1 - (r / c[:, None]).square()).clamp_min(0) ** (edge + 0.5)
         low, high = torch.full_like(c, -12.0), torch.full_like(c, 6.0)
         for _ in range(40):
@@ -268,7 +269,7 @@ def _gaussian_support_table(edge: int, volume: bool) -> Tensor:
     return torch.stack([c, best(c)[1] - (-torch.log1p(-opacity[:, 0])).log()], 1)
 
 
-_SLACK = 1e-6  # of a turn: phases that rounding left beside an end stay, so that a second pass changes no bit
+_SLACK = 1e-6  # in turns: phases this close to an end by rounding stay, so that a second pass changes no bit
 
 
 def canonicalize_cosines(
@@ -277,7 +278,7 @@ def canonicalize_cosines(
     """Make every weight of the first output at least 0, and every phase between 0 and half a turn, pi/rate.
 
     Args:
-        inputs: names of what cosines multiply with, (N, K) or (N, K, ...).
+        inputs: names of the frequencies, by which cosines multiply their inputs, (N, K) or (N, K, ...).
         phase, weights: names of the b_k, (N, K), and of the w_k, (N, K) or (N, outputs, K).
     """
     turn = 2 * math.pi / rate
@@ -298,7 +299,7 @@ def canonicalize_cosines(
 
 
 def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
-    """Make every b of the products b exp(g) -1, 0 or 1; a g stays where it would be beyond ``limit``."""
+    """Move |b| of the products b exp(g) into g, so that b is -1, 0 or 1; pairs stay if g would exceed ``limit``."""
     b, g = params[strength].detach(), params[log_gain].detach()
     joined = g.double().clamp(-limit, limit) + b.double().abs().log()
     fits = (b != 0) & (joined.abs() <= limit)

@@ -1,15 +1,15 @@
-"""The edge of a support: how a primitive's density, or its life in time, fades to nothing.
+"""The edge of a support: how a primitive's density fades to zero in space, or its extinction in time.
 
-With u the distance from the middle over that to the edge, the weight is (1 - u^2)^p: p = 0 is a hard edge, 1 and 2 soft
-ones. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 - |y|^2)^p is D^p (1 - u^2)^p,
+With u the distance from the middle over that to the edge, the weight is (1 - u^2)^p: p = 0 is a hard edge, 1 and 2 are
+soft. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 - |y|^2)^p is D^p (1 - u^2)^p,
 and
 
     1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
     B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
 
-which are spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. Chords that a plane cuts have any quadratic c0 + c1 u
-+ c2 u^2 for 1 - |y|^2; its p-th power in Legendre polynomials, sum a_n P_n, gives the general case, as 1/2 integral of
-P_n exp(i z u) du = i^n j_n(z).
+which are spherical Bessel functions, B_p = (2p + 1)!! j_p(z)/z^p. On a chord that a plane cuts, 1 - |y|^2 is a general
+quadratic c0 + c1 u + c2 u^2. Its p-th power expands in Legendre polynomials, sum a_n P_n, and each term has a closed
+form: 1/2 integral of P_n exp(i z u) du = i^n j_n(z).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import math
 import torch
 from torch import Tensor
 
-EDGES = (0, 1, 2)  # exponents p that there are
+EDGES = (0, 1, 2)  # supported exponents p
 
 NORMS = (2.0, 4 / 3, 16 / 15)  # N_p: the integral of (1 - u^2)^p over [-1, 1]. numba freezes them into kernels
 
@@ -30,7 +30,7 @@ _SERIES_BELOW, _TERMS = (
 
 
 def edge_weight(square: Tensor, edge: int) -> Tensor:
-    """(1 - u^2)^p from u^2, 0 outside the support; 1 everywhere for p = 0."""
+    """Return (1 - u^2)^p from u^2, 0 outside the support; 1 everywhere for p = 0."""
     if edge == 0:
         return torch.ones_like(square)
     inner = (1 - square).clamp_min(0)
@@ -38,7 +38,7 @@ def edge_weight(square: Tensor, edge: int) -> Tensor:
 
 
 def sinc(z: Tensor) -> Tensor:
-    """sin z / z, differentiable at 0."""
+    """Return sin z / z, differentiable at 0."""
     small = z.abs() < 1e-3
     safe = torch.where(small, torch.ones_like(z), z)
     z2 = z * z
@@ -47,7 +47,7 @@ def sinc(z: Tensor) -> Tensor:
 
 
 def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
-    """j_0(z) to j_last(z), float64, differentiable everywhere; good to 1e-15, absolutely."""
+    """Return j_0(z) to j_last(z), float64, differentiable everywhere; the absolute error is at most 1e-15."""
     small = z.abs() < _SERIES_BELOW
     safe = torch.where(small, torch.full_like(z, _SERIES_BELOW), z)
     j = [safe.sin() / safe]
@@ -68,7 +68,7 @@ def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
 
 
 def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
-    """a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), p = 1 or 2."""
+    """Return the coefficients a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), p = 1 or 2."""
     if edge == 1:
         return [c0 + c2 / 3, c1, 2 * c2 / 3]
     d0, d1, d2, d3, d4 = c0 * c0, 2 * c0 * c1, c1 * c1 + 2 * c0 * c2, 2 * c1 * c2, c2 * c2
@@ -78,9 +78,10 @@ def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]
 def soft_edge_chord_integral(
     quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
 ) -> Tensor:
-    """(M,) 1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)).
+    """Return (M,) means of a cosine density with a soft edge along chords.
 
-    p = 1 or 2; ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
+    1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)), p = 1 or 2;
+    ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
     """
     a = edge_legendre(*quadratic, edge)
     total = offset * a[0]
@@ -95,7 +96,7 @@ def soft_edge_chord_integral(
 
 
 def edge_profile(z: Tensor, order: int) -> Tensor:
-    """B_order(z) = (2 order + 1)!! j_order(z)/z^order, 1 at 0; float64, differentiable."""
+    """Return B_order(z) = (2 order + 1)!! j_order(z)/z^order, 1 at 0; float64, differentiable."""
     if order == 0:
         return sinc(z)
     small = z.abs() < 1e-3

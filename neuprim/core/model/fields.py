@@ -1,7 +1,7 @@
 """Density fields and colour fields: the parameters of primitives, and how they *lower* to a closed form.
 
-Before a frame is drawn, conditions such as time or light are folded into one of a few closed forms
-(:mod:`neuprim.core.model.forms`) that the renderer knows. The renderer never sees a task.
+Before a frame is rendered, fields fold conditions such as time or light into one of a few closed forms
+(:mod:`neuprim.core.model.forms`). The renderer knows these forms, and no task.
 """
 
 from __future__ import annotations
@@ -205,7 +205,8 @@ class DensityField(Field):
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
         """Return size and opacity of new primitives that resemble Gaussians of opacities ``alphas`` (N,).
 
-        (N,) standard deviations from centre to edge, and (N,) opacities through the centre, here of a constant density.
+        (N,) standard deviations from centre to edge, and (N,) opacities through the centre. The default is that of a
+        constant density.
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 

@@ -1,6 +1,6 @@
-"""The closed forms that fields lower to: what a renderer draws, with its task's conditions folded in.
+"""The closed forms that fields lower to: the renderer's input, with the conditions of a frame folded in.
 
-Each knows its tensors' shapes and its mathematics along chords (:class:`PrimitiveChords`); kernels know a few by name.
+Each form checks its tensors and computes its values along chords (:class:`PrimitiveChords`). Kernels implement a few.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Cosine(PrimitiveTensors):
         return super().fault(sizes) or labelled_fault("omega0", field_number_fault(self.omega0))
 
     def __add__(self, other: Cosine) -> Cosine:
-        """f + g, exactly: the neurons of both side by side, with the first omega0 (the second if that is 0).
+        """Return the exact sum, with the neurons of both and the omega0 of the first (of the second if that is 0).
 
         Raises FormError for other primitives, different edges, or more than :data:`MOST_UNITS` neurons together.
         """
@@ -164,7 +164,7 @@ class Constant(PrimitiveTensors):
         return int(self.rgb.shape[1])
 
     def tensors(self) -> dict[str, Tensor]:
-        return {"colors": self.rgb}  # as users know it
+        return {"colors": self.rgb}  # the name that users know
 
     def shaded(self, factors: Tensor | None) -> Constant:
         """Return ``rgb`` times (N,) factors, at least 0, plus ``ambient``; None: factors of 1."""
@@ -277,14 +277,14 @@ class RayNet(PrimitiveTensors):
         return self.primitive_radiance(pairs.prim, pairs.local)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Return the (N, C) float64 colours at the centres of the primitives, which no position changes."""
+        """Return the (N, C) float64 colours at the centres of the primitives; they do not depend on ``position``."""
         middles = torch.zeros_like(geometry.means, dtype=torch.float64)
         return self.primitive_radiance(torch.arange(geometry.count, device=middles.device), middles)
 
 
 LoweredColour = Constant | RayNet | CustomColour
-"""What :meth:`ColourField.lower` returns. ``per_primitive``: whether a primitive's colour at its centre is that of all
-of it, seen from one direction."""
+"""What :meth:`ColourField.lower` returns. ``per_primitive``: whether the colour at a primitive's centre may stand for
+the whole primitive in one view, exactly (:class:`Constant`) or approximately (:class:`RayNet`)."""
 
 Shade = Callable[[Tensor], Tensor]
 """Function of the (M, 3) float64 scene points that pixels show, which returns (M,) factors on their light, without

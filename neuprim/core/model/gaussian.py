@@ -1,4 +1,4 @@
-"""A true Gaussian density: the baseline of every comparison, and a density that no fast kernel knows.
+"""A true Gaussian density: the baseline of comparisons. No fast kernel renders it, only the reference backend.
 
 With y = diag(1/s) R^T (x - mu) the whitened point and c standard deviations at the support's edge |y| = 1,
 
@@ -26,7 +26,7 @@ _SHORT = 0.2
 """Intervals with w (1 + |u|) below this are integrated by their Taylor series: differences of erfc lose a digit per
 decade of w."""
 _TERMS = 8  # of that series; the first one left out is below 1e-17 of the sum
-_START = 0.02, 0.98  # bounds of the opacities that starting points may ask for
+_START = 0.02, 0.98  # range to which the opacities of starting points are clamped
 _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 
 
@@ -75,7 +75,7 @@ class GaussianDensity(DensityField):
 
             I = kappa/m sqrt(2/a)/c exp(-c^2 x.x / 2) B(c sqrt(a/2) u, c sqrt(a/2) (t1 - t0)/2)
 
-        where B(u, w) is :func:`bell_integral`. Nothing here grows with the distance to the camera but o - mu itself.
+        where B(u, w) is :func:`bell_integral`. Only o - mu grows with the distance to the camera.
         """
         c = self.deviations
         whiten = geometry.rotations.double().transpose(1, 2) / geometry.scales.double()[:, :, None]
@@ -128,7 +128,7 @@ class GaussianDensity(DensityField):
 
 
 def bell_integral(u: Tensor, w: Tensor) -> Tensor:
-    """B(u, w) = integral of exp(-z^2) over [u - w, u + w], w >= 0, to a few ulp of itself; float64, differentiable.
+    """Return B(u, w) = integral of exp(-z^2) over [u - w, u + w], w >= 0, to a few ulp; float64, differentiable.
 
     Three exact forms, each where it does not cancel (Abramowitz and Stegun 1964, 7.1 and 22.11): where the interval
     holds 0, sqrt(pi)/2 (erf(w + u) + erf(w - u)); in one tail, sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)); where it is
@@ -143,7 +143,7 @@ def bell_integral(u: Tensor, w: Tensor) -> Tensor:
 
 
 def _gaussian_series(u: Tensor, w: Tensor) -> Tensor:
-    """The Taylor series of :func:`bell_integral`; scaled polynomials P_n = w^n H_n(u)/n! keep every term small."""
+    """Sum the Taylor series of :func:`bell_integral`; scaled polynomials P_n = w^n H_n(u)/n! keep every term small."""
     low, high = torch.ones_like(u), 2 * u * w  # P_0, P_1;  P_(n+1) = 2 (u w P_n - w^2 P_(n-1)) / (n + 1)
     total = low
     for n in range(1, 2 * _TERMS - 1, 2):

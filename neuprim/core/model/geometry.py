@@ -15,7 +15,7 @@ __all__ = ["Geometry"]
 
 
 def quaternion_to_matrix(quats: Tensor) -> Tensor:
-    """Rotation matrices (..., 3, 3) of wxyz quaternions (..., 4), normalised on use; NaN of a zero quaternion."""
+    """Return rotation matrices (..., 3, 3) of wxyz quaternions (..., 4) of any norm; NaN for a zero quaternion."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -103,7 +103,7 @@ class PrimitiveChords:
         origin: (M, 3) or (3,) starts of the rays, scene units.
         near, far, middle: (M,) ends and middles of the chords, as ray distances in m.
         m: (M,) scene units.
-        whitened, pace: (M, 3) middles in whitened space, and what a ray distance of 1 m moves a point there.
+        whitened, pace: (M, 3) middles in whitened space, and their derivative by the ray distance in m.
     """
 
     prim: Tensor
@@ -122,7 +122,7 @@ class PrimitiveChords:
     def of(
         cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor
     ) -> PrimitiveChords:
-        """Chords ``t0`` to ``t1`` (M,) of rays, or parts of them, in scene units."""
+        """Return the chords, or parts of chords, from ray distance ``t0`` to ``t1`` (M,), scene units."""
         m = geometry.length_scale.double()[prim]
         middle = (t0 + t1) / 2
         local = (origin + middle[:, None] * direction - geometry.means.double()[prim]) / m[:, None]
@@ -146,7 +146,7 @@ class PrimitiveChords:
 
     @property
     def support(self) -> tuple[Tensor, Tensor, Tensor]:
-        """(M,) each: c0, c1, c2 of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1]."""
+        """Coefficients c0, c1, c2, (M,) each, of 1 - |y|^2 = c0 + c1 u + c2 u^2 along the chords, u in [-1, 1]."""
         step = self.half[:, None] * self.pace
         return 1 - self.whitened.square().sum(-1), -2 * (self.whitened * step).sum(-1), -step.square().sum(-1)
 

@@ -41,7 +41,7 @@ class LoweredPrimitives:
     geometry: Geometry
     density: LoweredDensity
     colour: LoweredColour
-    rows: Tensor | None = None  # (M,) int64 rows of the model that these are; None for all
+    rows: Tensor | None = None  # (M,) int64 rows of these primitives in the model; None for all
     shade: Shade | None = None  # factor on each pixel, see ColourField.shade
     fields: tuple[str, str] | None = None  # class names of the fields, for messages
 
@@ -77,7 +77,7 @@ class LoweredPrimitives:
                 raise non_finite_primitive_error(tensors, int(bad.nonzero()[0]))
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
-        """Check what :meth:`Primitives.lower` has not checked; raises FormError."""
+        """Check shade, background, viewmat and devices, which :meth:`Primitives.lower` does not; raises FormError."""
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
@@ -106,7 +106,7 @@ class LoweredPrimitives:
 
     @property
     def movable(self) -> bool:
-        """Whether another device can hold it: no, if a field's own code computes density or colour."""
+        """Whether :meth:`to` can move it to another device: no, if custom code computes density or colour."""
         return self.density.movable and self.colour.movable
 
     def to(self, device: torch.device) -> LoweredPrimitives:
@@ -222,7 +222,7 @@ class Primitives:
         return self._of(field, self.params)
 
     def _of(self, field: DensityField | ColourField, params: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Of some rows of all tensors, those that one field owns."""
+        """Return the tensors that one field owns, by name, from ``params`` with the tensors of all."""
         return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(
@@ -241,7 +241,7 @@ class Primitives:
         geometry, (density, sizes) = (
             active.geometry,
             self._lower_density(active),
-        )  # before the colour, which may draw it
+        )  # before the colour, which may render it
         own = self._of(self.colour, active.params)
         colour = self.colour.lower(own, geometry, camera, conditions)
         names = (type(self.density).__name__, type(self.colour).__name__)
@@ -258,24 +258,24 @@ class Primitives:
         return active.geometry, self._lower_density(active)[0]
 
     def _lower_density(self, active: ActivePrimitives) -> tuple[LoweredDensity, Sizes]:
-        """The density, checked, and the sizes that its tensors share with the geometry."""
+        """Return the density, checked, and the sizes that its tensors share with the geometry."""
         sizes = check_geometry(active.geometry, "geometry")
         try:
             density = self.density.lower(active.own, active.geometry, active.conditions)
-        except FormError as error:  # of a sum of forms, which knows no field
+        except FormError as error:  # from a sum of forms, which does not know the field
             raise FormError(f"{model_method_label(self.density, 'lower')}: {error}") from error
         check_lowered_density(density, sizes, type(self.density).__name__)
         return density, sizes
 
     def component(self, name: str) -> Primitives:
-        """Return a model of the extinction that comes from the source grid ``name``; raises KeyError."""
+        """Return a model with only the extinction from the source grid ``name``; raises KeyError if there is none."""
         own = {key: value.detach() for key, value in self.of(self.density).items()}
         scaled = self.density.scale_density(own, self.density.components(own)[name])
         return Primitives(self.density, self.colour, {**self.params, **scaled})
 
     @torch.no_grad()
     def limit(self, largest: float) -> None:
-        """Scale densities in place, so that no primitive exceeds an extinction, 1/scene unit."""
+        """Scale densities in place, so that no primitive exceeds the extinction ``largest``, 1/scene unit."""
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
         if found is None:
@@ -328,11 +328,11 @@ class Primitives:
                     )
 
 
-KINDS = ("density", "colour")  # first parts of the names
+KINDS = ("density", "colour")  # first parts of the names of reductions
 
 
 def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
-    """List what fields can reduce, as ``density.neurons``."""
+    """List the names of all reductions of two fields, such as ``density.neurons``."""
     return [f"{kind}.{name}" for kind, own in zip(KINDS, (density, colour), strict=True) for name in own.reductions()]
 
 
@@ -365,7 +365,7 @@ def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primiti
 def reduce_fields(
     density: DensityField, colour: ColourField, overrides: Sequence[str]
 ) -> tuple[DensityField, ColourField]:
-    """Reduce fields before there is a model, by the overrides of ``model.reduced``, one after the other."""
+    """Apply the reductions of ``model.reduced``, one after the other, to fields that have no model yet."""
     for word in overrides:
         key, equals, text = word.partition("=")
         kind, dot, name = key.partition(".")

@@ -68,7 +68,7 @@ def primitives_with_unit(unit: PrunableUnit, params: Params) -> Tensor:
 
 
 def _flat_primitive_rows(value: Tensor) -> Tensor:
-    """(N, numbers of a primitive), also for N = 0."""
+    """Reshape to (N, numbers per primitive), also for N = 0."""
     return value.reshape(len(value), math.prod(value.shape[1:]))
 
 

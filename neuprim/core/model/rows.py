@@ -1,6 +1,6 @@
-"""Compiled CPU work per primitive: rows of many tensors, rotations and gains.
+"""Compiled CPU kernels per primitive: gather rows of many tensors, rotations and gains.
 
-Rows ascend, so that a gradient is written in one pass.
+Row numbers ascend, so that a gradient is written in one pass.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel, strict
 from neuprim.core.compute.threads import apply_kernel_operation, kernel_needs_grad, parallel_for
 
-_FEW = 4096  # below, without a gradient, torch is done before a kernel would have begun with the last tensor
+_FEW = 4096  # for fewer rows without a gradient, torch is faster than starting the kernels
 
 
 def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Rows (M,) int64, ascending, of ``tensors`` (N, ...), float32 or float64; differentiable, once. Not checked."""
+    """Gather ascending int64 ``rows`` (M,), unchecked, of float32 or float64 tensors (N, ...); differentiable once."""
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not kernel_needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, apply_kernel_operation(_PrimitiveRows, rows, *tensors.values()), strict=True))
@@ -35,7 +35,7 @@ def _take_primitive_rows_kernel(rows, whole, taken):  # type: ignore[no-untyped-
 
 @exact_kernel
 def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
-    """Writes every row of ``whole``: zeros where there is none of ``taken``."""
+    """Scatter the rows ``taken`` into ``whole``; all other rows become zero."""
     row = 0
     for n in range(rows.shape[0]):
         while row < rows[n]:
@@ -51,7 +51,7 @@ def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-d
 def _each_primitive_table(
     kernel: Callable[..., None], rows: np.ndarray, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    """The kernel on each of ``pairs`` as tables, which are shared out among the threads."""
+    """Run the kernel on each (source, target) pair as 2D tables; threads share the pairs."""
     tables = [tuple(x.reshape(len(x), -1) for x in pair) for pair in pairs if pair[0].size and pair[1].size]
 
     def share(start: int, stop: int) -> None:
@@ -87,14 +87,14 @@ class _PrimitiveRows(torch.autograd.Function):
         ]
         for g, whole in known:
             if not g.numel():
-                whole.zero_()  # nothing lives, or nothing is there
+                whole.zero_()  # no primitive is active, or the tensor is empty
         _each_primitive_table(_put_primitive_rows_kernel, ctx.rows, [(g.numpy(), whole.numpy()) for g, whole in known])
         return (None, *made)
 
 
 @strict
 def ellipsoid_rotation(w, x, y, z):  # type: ignore[no-untyped-def]
-    """Return 1/|q| and the rotation of a float64 quaternion, row by row: float32 squares would scale it."""
+    """Return 1/|q| and the rotation matrix of a float64 quaternion, row by row; float32 squares would scale it."""
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
     return (
@@ -106,7 +106,7 @@ def ellipsoid_rotation(w, x, y, z):  # type: ignore[no-untyped-def]
 
 @strict
 def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
-    """The same into ``out`` (3, 3); returns 1/|q|."""
+    """Write the rotation matrix of a quaternion (4,) into ``out`` (3, 3); return 1/|q|."""
     n, xx, xy, xz, yx, yy, yz, zx, zy, zz = ellipsoid_rotation(
         np.float64(q[0]), np.float64(q[1]), np.float64(q[2]), np.float64(q[3])
     )
@@ -117,7 +117,7 @@ def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
 
 @strict
 def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
-    """dL/dq from dL/dR, row by row, and 1/|q|; the normalisation projects out the radial part."""
+    """Return dL/dq from ``g``, dL/dR row by row, and ``n`` = 1/|q|; normalisation projects out the radial part."""
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = g
     w, x, y, z = w * n, x * n, y * n, z * n
     gw = 2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01))
@@ -130,14 +130,14 @@ def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
 
 @strict
 def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
-    """The same of ``g`` (3, 3) into ``out`` (4,)."""
+    """Write dL/dq into ``out`` (4,) from ``g``, dL/dR (3, 3), and ``n`` = 1/|q|."""
     rows = g[0, 0], g[0, 1], g[0, 2], g[1, 0], g[1, 1], g[1, 2], g[2, 0], g[2, 1], g[2, 2]
     out[0], out[1], out[2], out[3] = quaternion_gradient(q[0], q[1], q[2], q[3], n, rows)
 
 
 @exact_kernel
 def cosine_gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
-    """Gradients of (w2, b2), (N, K) and (N, 1), times ``factor`` (N, 1), and of the factor, ``pulled``."""
+    """Write the gradients of w2 (N, K) and b2 (N, 1), which ``factor`` (N, 1) multiplies, and of it, ``pulled``."""
     for n in range(b2.shape[0]):
         total = np.float64(p_b2[n, 0]) * b2[n, 0]
         g_b2[n, 0] = p_b2[n, 0] * factor[n, 0]
@@ -165,7 +165,7 @@ class _CosineGain(torch.autograd.Function):
 
 
 def fused_cosine_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """(w2, b2), (N, K) and (N, 1), times exp(log_gain), (N, 1), clamped to ``limit``; one dtype."""
+    """Return w2 (N, K) and b2 (N, 1) times exp(log_gain), log_gain (N, 1) clamped to +-``limit``; one dtype."""
     if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain

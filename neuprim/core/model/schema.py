@@ -23,7 +23,7 @@ Params = Mapping[str, Tensor]
 
 @dataclass
 class InitContext:
-    """What the start value of a parameter may depend on.
+    """Input of the functions that draw the start values of parameters.
 
     Attributes:
         means: (N, 3) initial centres, scene units.

@@ -47,7 +47,7 @@ def sh_basis(directions: Tensor, degree: int) -> Tensor:
 
 
 def lowest_band_colors(dc: Tensor) -> Tensor:
-    """(N, C) max(0, C0 dc + 1/2): colours without their dependence on direction."""
+    """Return the (N, C) colours max(0, C0 dc + 1/2), without their dependence on direction."""
     return (dc * C0 + 0.5).clamp_min(0.0)
 
 
@@ -100,7 +100,7 @@ def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Ten
 
 
 def truncate_sh_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
-    """Return the tensors without the bands above ``degree`` of ``name``: the closest there is, on average."""
+    """Return the tensors without the bands of ``name`` above ``degree``, the closest approximation on average."""
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : sh_coefficient_count(degree) - 1].contiguous()} if degree else kept
 
@@ -111,7 +111,7 @@ black."""
 
 
 def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, ...]:
-    """Every number by itself of coefficients (N, (degree + 1)^2 - 1, C) in the parameter ``name``, told of by bands."""
+    """Return a unit for each number of the coefficients ``name``, (N, (degree + 1)^2 - 1, C), in groups by band."""
     return tuple(
         PrunableUnit(
             f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}"
@@ -123,5 +123,5 @@ def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[Pru
 
 
 def initial_sh_dc(color: Tensor) -> Tensor:
-    """Return the (N, C) float32 zero-order coefficients of a colour (N, C) that no direction changes."""
+    """Return the (N, C) float32 zero-order coefficients of direction-independent colours (N, C)."""
     return ((color.clamp_min(_DARKEST) - 0.5) / C0).float()

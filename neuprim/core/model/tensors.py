@@ -1,6 +1,6 @@
-"""What a tensor must be for a kernel to read it: shape in letters that tensors share, dtype, layout and device.
+"""Requirements of kernels on tensors: dtype, layout, device, and shapes in which letters are common sizes.
 
-Functions return a fault in words, or None; :mod:`neuprim.core.model.checks` raises them.
+Functions return a fault as text, or None; :mod:`neuprim.core.model.checks` raises errors.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from torch import Tensor
 
 from neuprim.core.compute import device
 
-Shape = tuple[int | str, ...]  # A letter stands for a size that tensors share
+Shape = tuple[int | str, ...]  # a letter stands for a size that tensors share, as in ("N", "K", 3)
 
 Sizes = dict[str, tuple[int, str]]  # letter -> its size and the tensor that has it
 
 MOST_UNITS = 256
-"""Most neurons of a density and units of a colour network: the fast kernels number a primitive's neurons in a byte."""
+"""Largest number of density neurons or colour units: the fast kernels number a primitive's neurons in a byte."""
 
 _ANY = (0, sys.maxsize)
 _RANGES = {"K": (0, MOST_UNITS), "H": (0, MOST_UNITS), "C": (1, sys.maxsize)}
@@ -28,7 +28,7 @@ _DTYPES = (torch.float32, torch.float64)
 
 
 def primitive_tensor_fault(value: Any) -> str | None:
-    """``"dtype torch.int64; expected torch.float32 or torch.float64"`` and the like of what no kernel can read."""
+    """Return why no kernel can read a value, as ``"dtype torch.int64; expected torch.float32 or ..."``, or None."""
     if not isinstance(value, Tensor):
         return f"type {type(value).__name__}; expected a torch tensor"
     if not value.is_cpu and value.device.type not in device.DEVICE_TYPES:
@@ -41,7 +41,7 @@ def primitive_tensor_fault(value: Any) -> str | None:
 
 
 def field_number_fault(value: Any) -> str | None:
-    """The same of what should be a finite number."""
+    """Return why a value is not a finite number, or None."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return f"type {type(value).__name__}; expected a finite number"
     if abs(value) <= sys.float_info.max:
@@ -50,12 +50,12 @@ def field_number_fault(value: Any) -> str | None:
 
 
 def function_fault(value: Any) -> str | None:
-    """The same of what should be a function."""
+    """Return why a value is not a function, or None."""
     return None if callable(value) else f"type {type(value).__name__}; expected a function"
 
 
 def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
-    """The first of (name, tensor, shapes that it may have) that does not fit; ``sizes`` gets what the others add."""
+    """Return the fault of the first (name, tensor, allowed shapes) that does not fit, or None; extends ``sizes``."""
     for name, value, shapes in tensors:
         fault = primitive_tensor_fault(value)
         if fault is None:
@@ -70,7 +70,7 @@ def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]
 
 
 def labelled_fault(name: str, fault: str | None) -> str | None:
-    """``"NAME has FAULT"``."""
+    """Return ``"NAME has FAULT"``, or None without a fault."""
     return None if fault is None else f"{name} has {fault}"
 
 
@@ -97,7 +97,7 @@ def _fits_primitive_shape(found: torch.Size, shape: Shape, name: str, sizes: Siz
 
 
 def _expected_primitive_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
-    """In numbers where all are known, else in letters with what is known of them."""
+    """Format shapes as numbers if all sizes are known, else as letters with the known sizes and the limits."""
     letters = list(dict.fromkeys(d for d in shapes[0] if isinstance(d, str)))
     known, free = [x for x in letters if x in sizes], [x for x in letters if x not in sizes]
     if not free:
@@ -116,32 +116,31 @@ def _expected_primitive_shapes(shapes: tuple[Shape, ...], sizes: Sizes) -> str:
 
 
 Shapes = Mapping[str, tuple[Shape, ...]]
-"""Name of a tensor -> the shapes it may have, in letters that the tensors of a frame share."""
+"""Name of a tensor -> allowed shapes; a letter is the same size in all tensors of a frame."""
 
 
 class PrimitiveTensors:
-    """A bundle of tensors with a row per primitive, which knows what shapes they must have."""
+    """A group of tensors with one row per primitive and their allowed shapes."""
 
     shapes: ClassVar[Shapes] = {}
 
     def tensors(self) -> dict[str, Tensor]:
-        """Its tensors by the names that messages give them, each with a row per primitive."""
+        """Return the tensors by their names in messages, each with one row per primitive."""
         return {name: getattr(self, name) for name in self.shapes}
 
     @property
     def movable(self) -> bool:
-        """Whether it is made of tensors; a model's own code stays on the device that its tensors are on."""
+        """Whether :meth:`to` can move it: yes if it holds tensors; custom code stays on the device of its tensors."""
         return bool(self.shapes)
 
     def to(self, device: torch.device) -> Self:
-        """The same with its tensors on another device; differentiable."""
+        """Return a copy with its tensors on another device; differentiable."""
         return replace(self, **{name: getattr(self, name).to(device) for name in self.shapes})  # type: ignore[type-var]
 
     def fault(self, sizes: Sizes) -> str | None:
-        """The first part that does not fit, or None: ``"w2 has shape (5,); expected (100, 3), as means has N=100
-        ..."``.
+        """Return the first fault, ``"w2 has shape (5,); expected (100, 3), as means has N=100 ..."``, or None.
 
-        ``sizes``: those known so far; gets the ones that this form adds.
+        ``sizes``: sizes known so far; this adds those of its own tensors.
         """
         return primitive_tensors_fault(
             [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes

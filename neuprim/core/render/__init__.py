@@ -71,7 +71,7 @@ def render(
         ConfigError: no backend has this name.
     """
     settings = settings or RenderSettings(near="auto")
-    # fields are lowered by as many threads as pixels
+    # lowering uses as many threads as the pixels
     with limit_threads(settings.threads) if settings.threads else nullcontext():
         lowered = model.lower(camera, conditions or {}, settings)
         lowered.check_frame(camera.viewmat, background)
@@ -131,7 +131,7 @@ def probe_backend(name: str) -> str | None:
     except Exception as error:  # a broken installation may fail in any way; the reason is what the user wants to read
         return f"{type(error).__name__}: {error}"
     aside = (camera.cx - 8.5) / camera.fx  # the pixel's centre is half a pixel from the sphere's, on both axes
-    missed = 3.0 * math.sin(math.atan(math.hypot(aside, aside)))  # how far from the centre its ray passes
+    missed = 3.0 * math.sin(math.atan(math.hypot(aside, aside)))  # distance of its ray from the sphere's centre
     expected = 1.0 - math.exp(-2.0 * math.sqrt(1.0 - missed**2))  # density 1 along the chord of a unit sphere
     return None if abs(middle - expected) < _PROBE_ERROR else f"drew {middle:.6f} where {expected:.6f} was expected"
 

@@ -1,4 +1,4 @@
-"""The table of renderer backends, which names where each one's ``render`` is without importing it."""
+"""The table of renderer backends; a backend's module is imported only when it is used."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render.output import Draw
 from neuprim.core.settings import RenderSettings
 
-AUTO = "auto"  # takes the first backend of the table that can draw the frame
-REFERENCE = "reference"  # draws every form, in float64; the others are compared with it
+AUTO = "auto"  # selects the first backend of the table that can draw the frame
+REFERENCE = "reference"  # draws every form, in float64; the others are tested against it
 
-_FEW = 64  # primitives that stand for a model, as only its forms count
+_FEW = 64  # primitives that suffice to test a backend with a model: only the forms matter
 
 
 def _no_backend_fault(*_: Any) -> None:
@@ -48,12 +48,12 @@ class Backend:
     with "cannot draw"; None if it can."""
     device_name: Callable[[], str] = _cpu_backend_name  # name of its device, for reports
     missing: Callable[[], str | None] = _no_backend_fault
-    """Returns what this machine lacks, such as a package; None for nothing. Fast."""
+    """Returns what this machine lacks, such as a package; None if nothing. Must be fast."""
     checks: bool = False  # whether it checks that numbers are finite
     differentiates_intrinsics: bool = False  # whether focal lengths and principal points get gradients
-    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device whose tensors it renders, its own first
+    devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it renders on, its main one first
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_backend_fault
-    """Loads and returns a function that renders all slabs in one frame; None without."""
+    """Loads and returns a function that renders all slabs in one frame; None if it has none."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
         """Return the kind of device, "cpu" or "cuda", on which it renders with these settings."""
@@ -64,14 +64,14 @@ class Backend:
         return self.device_name() if self.drawing_device(settings) == self.devices[0] else _cpu_backend_name()
 
     def unavailable(self, device: str | None = None) -> str | None:
-        """Return why this machine cannot run it on a kind of device (None: its own); None if it can."""
+        """Return why this machine cannot run it on a kind of device (None: its main one); None if it can."""
         device = device or self.devices[0]
         return (hardware.cuda_unavailable() if device == hardware.CUDA else None) or self.missing()
 
     def cannot_draw(
         self, lowered: LoweredPrimitives, camera: AnyCamera | None, device: str | None = None
     ) -> str | None:
-        """Return why it cannot render this on a kind of device, as the rest of a sentence; None if it can."""
+        """Return why it cannot draw this on a kind of device (None: its main one), as a predicate; None if it can."""
         device = device or self.devices[0]
         if device not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {device}"
@@ -85,7 +85,7 @@ class Backend:
 
 
 def unsupported_by_kernels(lowered: LoweredPrimitives, camera: AnyCamera | None) -> str | None:
-    """Return what kernels that are compiled ahead of a model cannot draw; None if they can."""
+    """Return which form or camera the cpu and cuda kernels cannot draw; None if they can draw this."""
     if not (isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)):
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
         return f"{forms}; it knows Cosine, and Constant or RayNet"
@@ -162,7 +162,7 @@ def find_backend(name: str) -> Backend:
 def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tuple[Backend, ...]:
     """Return the backends that may draw tensors on a ``kind`` of device under these settings.
 
-    Tensors on the CPU go to a GPU only where the settings say so.
+    Tensors on the CPU move to a GPU only if the settings request it.
     """
     if settings.backend != AUTO:
         return (find_backend(settings.backend),)
@@ -174,7 +174,7 @@ def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tu
 
 
 def gpu_backends_unavailable() -> str | None:
-    """Return why nothing is drawn on a GPU here; None if something is."""
+    """Return why no backend can draw on a GPU here; None if one can."""
     reason = hardware.cuda_unavailable()
     rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CUDA]
     if reason is None and not rows:
@@ -183,7 +183,7 @@ def gpu_backends_unavailable() -> str | None:
 
 
 def check_backend_device(settings: RenderSettings) -> None:
-    """Raise :class:`ConfigError` for a device that the named backend does not draw on."""
+    """Raise :class:`ConfigError` if the named backend does not draw on the device of the settings."""
     if AUTO in (settings.backend, settings.device):
         return
     backend = find_backend(settings.backend)
@@ -195,7 +195,7 @@ def check_backend_device(settings: RenderSettings) -> None:
 
 
 def check_render_backend(settings: RenderSettings) -> None:
-    """Raise :class:`BackendUnavailable` for a GPU that is not there."""
+    """Raise :class:`BackendUnavailable` if the settings require a GPU backend that cannot run here."""
     if settings.device == hardware.CUDA:
         reason = gpu_backends_unavailable() if settings.backend == AUTO else hardware.cuda_unavailable()
         if reason is not None:
@@ -211,7 +211,7 @@ def check_render_backend(settings: RenderSettings) -> None:
 
 
 def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
-    """Return the settings for drawing a finished run, perhaps on a machine without the run's GPU."""
+    """Return settings to draw a finished run here: without a GPU, device "cuda" of backend "auto" becomes "auto"."""
     gone = settings.device == hardware.CUDA and gpu_backends_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 
@@ -219,11 +219,11 @@ def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
 def best_render_backend_device(
     model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions
 ) -> torch.device:
-    """Return the device where a run keeps its tensors to draw frames like this one."""
+    """Return the device on which a run should store its tensors to draw frames like this one."""
     check_render_backend(settings)
     if settings.device != AUTO:
         return hardware.current_device(settings.device)
-    if settings.backend != AUTO:  # a first frame without a GPU says why it is not drawn
+    if settings.backend != AUTO:
         on_gpu = find_backend(settings.backend).devices[0] == hardware.CUDA and hardware.cuda_unavailable() is None
         return hardware.current_device(hardware.CUDA if on_gpu else hardware.CPU)
     if gpu_backends_unavailable() is None:

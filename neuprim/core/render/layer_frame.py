@@ -1,4 +1,4 @@
-"""Layers that ``neuprim render --format exr`` can write, and the frame that they are drawn from.
+"""Layers that ``neuprim render --format exr`` can write, and the frame from which they are computed.
 
 Every task has those of :data:`COMMON`; :attr:`neuprim.core.task.TaskSpec.layers` adds others.
 """
@@ -21,14 +21,14 @@ from neuprim.core.render.output import unproject_rendered_depth
 
 __all__ = ["LayerFrame", "LayerSpec"]
 
-_CLEAR = 2e-4  # a transmittance above has no clamped primitive: one, at alpha_max = 0.9999, would halve it
+_CLEAR = 2e-4  # above this transmittance no primitive is clamped: alpha_max = 0.9999 alone gives half of it
 _WEAKEN = 1 / 8
-_ROUNDS = 14  # at most: densities of 4e12 along a ray, and float32 knows hardly more
+_ROUNDS = 14  # at most: thins by 8^14 = 4e12; float32 hardly needs more
 
 
 @dataclass(frozen=True)
 class LayerFrame:
-    """A model in one view, as layers need it: its image and integrals along rays, without gradients."""
+    """The input of a layer: a model in one view, with its image and integrals along rays, without gradients."""
 
     model: Primitives
     camera: Camera
@@ -38,7 +38,7 @@ class LayerFrame:
 
     @cached_property
     def lowered(self) -> LoweredPrimitives:
-        """Closed forms of the frame."""
+        """The closed forms of the frame's primitives."""
         with torch.no_grad():
             return self.model.lower(self.camera, self.conditions, self.settings)
 
@@ -83,7 +83,7 @@ class LayerFrame:
         return torch.where(self.drawn.alpha > 0, factor, 0.0)
 
     def composite(self, colour: LoweredColour) -> Tensor:
-        """Return the (H, W, C') image over black with other colours of :attr:`lowered`: the sum of alpha_i T_i c_i."""
+        """Return the (H, W, C') image over black, sum of alpha_i T_i c_i, with ``colour`` instead of the model's."""
         return self._render(replace(self.lowered, colour=colour, shade=None), self.settings).rgb
 
     def integral(self, weights: Tensor | None = None) -> Tensor:
@@ -110,7 +110,7 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """-log of the transmittance, in thinner and thinner media for the pixels that are opaque."""
+        """Return -log of the transmittance; opaque pixels are measured again in thinner and thinner media."""
         T = transmittance(1.0)
         found, opaque, factor = _depth_of_transmittance(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
@@ -122,7 +122,7 @@ class LayerFrame:
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
-        """(H, W) of the frame with densities times ``weights``, by a white background behind black primitives."""
+        """Return the (H, W) transmittance with densities times ``weights``: black primitives before white."""
         lowered, means = self.lowered, self.lowered.geometry.means
         black = Constant(torch.zeros(len(means), 1, device=means.device))
         thin = replace(lowered, density=lowered.density.scaled(weights), colour=black, shade=None)
@@ -135,7 +135,7 @@ class LayerFrame:
 
 
 def _depth_of_transmittance(transmittance: Tensor) -> Tensor:
-    """Optical depth, float64; of what float32 calls 0, that of its smallest number."""
+    """Return the float64 optical depth -log T; T below the smallest normal number of its dtype counts as that."""
     return -transmittance.clamp_min(torch.finfo(transmittance.dtype).tiny).double().log()
 
 
@@ -162,12 +162,12 @@ class LayerSpec:
 
     @property
     def light(self) -> bool:
-        """Whether the values are light."""
+        """Whether the layer's values are light, not data such as depth."""
         return not self.channels
 
 
 LIGHTS = "lights"
-"""Stands for one layer per light, ``light_000`` and so on, if several are on."""
+"""The name for all layers of single lights, ``light_000`` and so on, if several are on."""
 
 COMMON: tuple[LayerSpec, ...] = (
     LayerSpec("beauty", "the image, linear light, premultiplied by alpha", lambda frame: frame.drawn.rgb),
@@ -190,7 +190,7 @@ COMMON: tuple[LayerSpec, ...] = (
 
 
 def select_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> tuple[LayerSpec, ...]:
-    """Select the layers that ``--layers`` names, in the order of the list of all; without it, all layers.
+    """Return the layers that ``--layers`` names, in the order of the full list; without names, all layers.
 
     Args:
         text: names separated by commas, or None.

@@ -1,8 +1,8 @@
-"""Columns of the arrays that both kernel stacks share, and the bounds of their per-primitive stage.
+"""Columns of the arrays that the CPU and CUDA kernels share, and the bounds of their per-primitive stage.
 
 A pixel kernel reads one float32 row per primitive and writes one gradient row per (tile, primitive) pair. Constant
 offsets into flat arrays let LLVM vectorise. The CUDA kernels have float4 rows (:mod:`neuprim.core.render.cuda.layout`),
-but float64 rows and gradient rows with these columns. Float32 bounds were found with benchmarks/numerics.py.
+but float64 rows and gradient rows with these columns. benchmarks/numerics.py gave the float32 bounds.
 """
 
 from __future__ import annotations
@@ -48,29 +48,29 @@ PIXELS = TILE * TILE
 VISIBLE, CULLED, NON_FINITE = 0, 1, 2
 FLOAT32_MAX = 3.0e38
 
-# ---- A primitive is drawn in float64 where one of these is exceeded.
-FLOAT64_RADII = 8.0  # terms of a point on the ray this many radii of the thinnest axis long: they cancel
-FLOAT64_ANCHOR = 1.25  # the same of the centre seen from an anchor at the camera: most cameras outside, but near
-FLOAT64_TURNS = 4.0  # of a neuron, or a unit of a colour network, over half a chord
-FLOAT64_PIXELS = 16384.0  # from the corner of the image to the anchor
-FLOAT64_RATIO = 256.0  # of the axes; for the gradients
-FLOAT64_RATIO_NEAR = 16.0  # of the axes of a primitive anchored at the camera, which its chords pass closely
-CUT = 1e-3  # of the reach: float32 may find a chord cut that float64 does not
+# ---- A primitive is drawn in float64 if it exceeds one of these bounds.
+FLOAT64_RADII = 8.0  # cancelling terms of a point on the ray, in radii of the thinnest axis
+FLOAT64_ANCHOR = 1.25  # |XA| if anchored at the camera: most cameras outside the primitive, but near
+FLOAT64_TURNS = 4.0  # turns of a neuron, or of a unit of a colour network, over half a chord
+FLOAT64_PIXELS = 16384.0  # pixels from the corner of the image to the anchor
+FLOAT64_RATIO = 256.0  # longest to thinnest axis; the gradients need it
+FLOAT64_RATIO_NEAR = 16.0  # the same if anchored at the camera, which the chords pass closely
+CUT = 1e-3  # margin at the near plane, share of the reach: float32 may cut a chord that float64 does not
 
-ANCHOR_RADII = 1.5  # a centre this many radii in front of the camera is its own anchor, even where the near plane cuts
+ANCHOR_RADII = 1.5  # a centre more than this far ahead of the camera is its own anchor, even if the near plane cuts
 
 # ---- The visible extent of an ellipsoid. Rays close to the rim cross too little of it to reach alpha_min.
 # A chord whose point nearest to the centre has |y|^2 = 1 - D crosses (1 - |y|^2)^p with an integral of N_p D^p times
 # half its length, which is at most s D^(1/2), with s the longest half chord of the view's rays. No cosine exceeds its
 # amplitude, so an optical depth is at most F N_p s D^(p + 1/2), F = b2 + sum |w2|. Rays below the depth of alpha_min
-# count as empty in every backend; they pass outside the same ellipsoid, smaller by r = (1 - D)^(1/2). The image and
+# count as empty in every backend; they miss the ellipsoid scaled by r = (1 - D)^(1/2). The image and
 # every gradient stay the same but for rounding.
-VISIBLE_SHARE = 0.99  # of the depth of alpha_min that a chord must be able to reach, which leaves room for float32
-MIN_RIM = 0.01  # a smaller D is not worth a smaller silhouette, and float32 knows such D least
+VISIBLE_SHARE = 0.99  # share of alpha_min's optical depth that a chord must be able to reach; margin for float32
+MIN_RIM = 0.01  # smaller D do not shrink the silhouette: little to gain, and float32 is least accurate there
 RIM_POWERS = (2.0, 2 / 3, 2 / 5)  # 1/(p + 1/2)
 MIN_RIM_SHARES = tuple(MIN_RIM ** (p + 0.5) for p in EDGES)  # share of the largest depth below which D < MIN_RIM
 
 
 def min_visible_depth(alpha_min: float) -> float:
-    """Return the optical depth that a chord must reach to be drawn: that of ``alpha_min``, but for rounding."""
+    """Return the optical depth that a chord must reach to be drawn: that of ``alpha_min``, less a rounding margin."""
     return -float(np.log1p(-alpha_min)) * VISIBLE_SHARE

@@ -1,4 +1,4 @@
-"""Light at primitives: its direction, its strength, and how much of it arrives through the others."""
+"""Light at primitives: its direction, its strength, and its visibility through the other primitives."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from neuprim.core.render.layer_frame import LayerFrame, LayerSpec
 from neuprim.core.settings import RenderSettings
 
 VISIBILITY = ("none", "primitive", "pixel")
-"""Where the light's depth images are read: nowhere, at centres of primitives, or at the point that a pixel shows."""
+"""Where the light's visibility is computed: nowhere, at the primitives' centres, or at the mean depth of each pixel."""
 
 # ---------------------------------------------------------------- directions
 
@@ -32,7 +32,7 @@ _MIN_LIGHT_DISTANCE = 1e-4  # in units of a primitive's size; a nearer light doe
 
 
 def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
-    """(..., 3) unit vectors; those shorter than 1e-6 of ``size`` (..., 1) are scaled by 1e6/size."""
+    """Return (..., 3) unit vectors; those shorter than 1e-6 ``size`` (..., 1) are scaled by 1e6/size."""
     scaled = vector / vector.detach().abs().amax(-1, keepdim=True).clamp_min(_MIN_LENGTH * size)
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
@@ -43,8 +43,8 @@ def check_typical_light(typical: float) -> None:
 
 
 def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
-    """(N, C) intensity of the light over ``typical``, with ``falloff`` divided by the squared distance to the
-    centres."""
+    """Return the (N, C) light intensity divided by ``typical``, and with ``falloff`` by the squared distance to the
+    primitives' centres."""
     means = geometry.means
     strength = device.to_device_like(conditions["light_intensity"], means) / typical
     if not falloff:
@@ -55,24 +55,24 @@ def light_factor(geometry: Geometry, conditions: Conditions, typical: float, fal
 
 # ---------------------------------------------------------------- visibility
 
-SIZE = 192  # pixels of the depth images, square
-LAYERS = 4  # of equal depth; more of them separate depths better and take longer
-VOLUME_SIZE, VOLUME_LAYERS = 64, 16  # of smoke, which is smooth and shadows itself in every depth
+SIZE = 192  # pixels per side of the square depth images
+LAYERS = 4  # slabs of equal depth; more of them separate depths better and take longer
+VOLUME_SIZE, VOLUME_LAYERS = 64, 16  # for smoke, which is smooth and shadows itself at every depth
 
 FADE, EXTENTS, PIXEL_FADE = 1 / 50, 1.5, 1 / 10
-"""How far behind a depth image light fades: at a primitive over FADE scene diameters, as the light sees the scene, and
-EXTENTS times its own extent towards the light; at a pixel over PIXEL_FADE diameters. Surfaces made of ellipsoids are
-bumpy: where light fades faster, the bumps shadow each other, and where it fades slower, shadows come off their casters.
+"""The distance behind a depth image over which light fades. At a primitive: FADE scene diameters, as the light sees
+the scene, plus EXTENTS times its own extent towards the light. At a pixel: PIXEL_FADE diameters. Surfaces made of
+ellipsoids are bumpy: if light fades faster, the bumps shadow each other; if slower, shadows detach from their casters.
 A point on a depth image itself keeps all of its light."""
 
-_FAR = 1e3  # scene radii; from there all rays are parallel, and a float32 depth image keeps no digits
+_FAR = 1e3  # scene radii; beyond, all rays are parallel, and float32 depths lose all digits
 _CHUNK = 1024  # points per unit of work
 
 
 def shade_by_light(
     where: str, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading | None:
-    """The visibility of the frame's light ``where`` it is asked for, one of :data:`VISIBILITY`."""
+    """Return the visibility of the frame's light, ``where`` one of :data:`VISIBILITY`; None for "none"."""
     if where == "none":
         return None
     light = conditions["light"]
@@ -85,24 +85,24 @@ def shade_by_light(
 def shade_volume_by_light(
     geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading:
-    """The visibility of the frame's light from the centres of primitives that overlap, as those of smoke do: each slab
-    takes away its light evenly over its own depth."""
+    """Return the visibility of the frame's light at the centres of primitives that overlap, as in smoke: each slab
+    absorbs its share evenly over its own depth."""
     visible = light_visibility(geometry, density, conditions["light"], settings, VOLUME_SIZE, VOLUME_LAYERS)
     return Shading(primitives=visible(geometry.means, 1 / VOLUME_LAYERS, before=0.5))
 
 
 @torch.no_grad()
 def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
-    """(N,) how long each ellipsoid is in the direction from its centre to ``point`` (3,): between the two planes across
-    it that touch the ellipsoid, in scene units."""
+    """Return (N,) extents of the ellipsoids in the direction from their centre to ``point`` (3,): the distance between
+    the two tangent planes perpendicular to it, in scene units."""
     towards = device.to_device_like(point, geometry.means) - geometry.means
     units = normalize_direction(towards, geometry.length_scale[:, None])
     return 2 * ((geometry.rotations * units[:, :, None]).sum(1) * geometry.scales).norm(dim=-1)
 
 
 class Visibility(Protocol):
-    """Scene points (M, 3) -> (M,) float32 visibility 0..1. Light fades over ``fade`` scene diameters and (M,) ``more``
-    scene units; the share ``before`` of that lies in front of a depth image, the rest behind it."""
+    """Function of scene points (M, 3) that returns (M,) float32 visibility, 0 to 1. Light fades over ``fade`` scene
+    diameters plus (M,) ``more`` scene units; the share ``before`` of that is before a depth image, the rest behind."""
 
     def __call__(self, points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor: ...
 
@@ -115,21 +115,21 @@ def light_visibility(
     size: int = SIZE,
     layers: int = LAYERS,
 ) -> Visibility:
-    """The visibility of a point light (3,), by layered shadow maps.
+    """Return the visibility function of a point light (3,), by layered shadow maps.
 
     The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity
     A_k and mean depth d_k. The light's transmittance at a point x of depth z is
 
         V(x) = prod_k (1 - A_k s((z - d_k)/fade)),      s a smooth step from 0 at 0 to 1 at 1,
 
-    exactly 1 where nothing lies in front, and 1 - A behind something of opacity A. One slab, a common shadow map, would
-    know one mean depth per pixel: half way between a translucent thing and the floor below it. Depths are read as
-    inverse depth, weighted by opacity, bilinearly: that is exact on planes, so that a lit floor does not shadow itself
-    at grazing light. V carries no gradient.
+    exactly 1 where nothing lies in front, and 1 - A behind an object of opacity A. A single slab, an ordinary shadow
+    map, has one mean depth per pixel: half way between a translucent object and the floor below it. Inverse depths,
+    weighted by opacity, are interpolated bilinearly. This is exact on planes, so that a lit floor does not shadow
+    itself at grazing light. V carries no gradient.
 
-    The light's camera looks at the middle of all centres and sees all of them; a light among them looks the way most of
-    them lie, and points behind it count as lit. ``settings`` are the frame's own: its backend and threads draw the
-    depth images too.
+    The light's camera looks at the middle of all centres and sees all of them. A light among them looks towards that
+    middle, too, and points behind it count as lit. ``settings`` are the frame's own: its backend and threads also draw
+    the depth images.
     """
     if not geometry.count:
         return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
@@ -138,7 +138,7 @@ def light_visibility(
         light = light.detach().double()
         middle = (means.amin(0) + means.amax(0)) / 2
         far, largest = (means - middle).norm(dim=-1).max(), geometry.scales.detach().max()
-        *place, far_away, margin = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one wait for a GPU
+        *place, far_away, margin = torch.cat([middle, far[None], largest.double()[None]]).tolist()  # one GPU sync
         center, light = torch.tensor(place, dtype=torch.float64), light.cpu()
         radius = far_away + margin
         distance = float((light - center).norm())
@@ -187,7 +187,7 @@ def sample_visibility(
     fades: Tensor,
     before: float = 0.0,
 ) -> Tensor:
-    """(M,) float32 visibility of ``points`` (M, 3) float64 in torch code, for a GPU: the twin of the kernel below."""
+    """Return (M,) float32 visibility of ``points`` (M, 3) float64, in torch for GPUs; the same as the kernel below."""
     nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
     images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
     x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
@@ -204,7 +204,7 @@ def sample_visibility(
 
 @exact_kernel
 def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, nearest, fades, before, found):  # type: ignore[no-untyped-def]
-    """Visibility of the points start:stop, as :func:`sample_visibility`, into ``found``."""
+    """Write the visibility of points start:stop into ``found``, as :func:`sample_visibility` computes it."""
     size = alphas.shape[1]
     for p in range(start, stop):
         x = view[0, 0] * points[p, 0] + view[0, 1] * points[p, 1] + view[0, 2] * points[p, 2] + view[0, 3]
@@ -241,12 +241,12 @@ def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, n
 
 
 def unshadowed_layer(frame: LayerFrame) -> Tensor | None:
-    """(H, W, C) the frame without shadows; None for colours without shadows."""
+    """Return the (H, W, C) frame without shadows; None if the colours have no shadows."""
     return None if frame.shading is None else frame.unshaded
 
 
 def visibility_layer(frame: LayerFrame) -> Tensor | None:
-    """(H, W) mean visibility of the light; None for colours without shadows."""
+    """Return the (H, W) mean visibility of the light; None if the colours have no shadows."""
     return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # rounding may exceed 1
 
 

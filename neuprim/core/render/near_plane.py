@@ -13,17 +13,17 @@ from neuprim.core.cameras import Camera
 from neuprim.core.cameras.pinhole import AnyCamera
 from neuprim.core.settings import RenderSettings
 
-_MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # of which depths are measured
-_SHARE, _CLEARANCE = 1.0 / 400.0, 0.1  # the near plane as a part of the typical and of the nearest depth
+_MAX_CAMERAS, _MAX_POINTS = 100, 100_000  # at most, to measure depths
+_SHARE, _CLEARANCE = 1.0 / 400.0, 0.1  # upper bounds of the near plane: shares of the typical and of the nearest depth
 _MIN_EXTENT = 0.01
-_LARGEST_PIXEL = 1.0 / 250.0  # of the extent: coarse images allow no larger steps, as primitives are small, too
-_MIN_NEAR = 1e-6  # of the typical depth: a point in a camera's centre does not put the plane there
+_LARGEST_PIXEL = 1.0 / 250.0  # share of the extent: coarse images do not allow larger steps, as primitives stay small
+_MIN_NEAR = 1e-6  # share of the typical depth, in case a point lies at a camera's centre
 
 
 def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
     """Return (nearest, median) depth at which cameras see points (N, 3); ray distance for a ``RayCamera``.
 
-    Where no camera sees a point, the distances of all points count.
+    If no camera sees a point, these are the distances of all points from all cameras.
     """
     means = means.detach().double().cpu()[:: max(len(means) // _MAX_POINTS, 1)]
     cameras = [
@@ -41,7 +41,7 @@ def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tup
 
 
 def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """Return the data set's extent, or the median depth of points (N, 3) where that is 100 times as large."""
+    """Return the data set's extent, or the median depth of points (N, 3) if that is over 100 times as large."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth
 
@@ -49,7 +49,7 @@ def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]
 def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: float) -> float:
     """Return the side of a pixel, in scene units, at the median depth of points (N, 3), at most 1/250 of the extent.
 
-    The median of the cameras' focal lengths counts; cameras without one have pixels of the largest size.
+    Uses the median of the cameras' focal lengths; without any, the result is 1/250 of the extent.
     """
     _, depth = nearest_and_median_depth(means, cameras)
     focal = sorted(camera.fx for camera in cameras if isinstance(camera, Camera))

@@ -26,7 +26,7 @@ class Contributions:
     rows: Tensor | None = None  # (N,) rows of the model, if some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return ``weight`` and ``error_weight`` (count,) of all primitives of the model, 0 for those left out."""
+        """Return ``weight`` and ``error_weight`` (count,) of the model's primitives, 0 for those not in the frame."""
         if self.rows is None:
             return self.weight, self.error_weight
         weight, error_weight = (
@@ -36,7 +36,7 @@ class Contributions:
 
 
 def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributions:
-    """Return the sums over several frames of a model with ``count`` primitives, added in their order."""
+    """Return the sum of the contributions to several frames, in frame order, of a model with ``count`` primitives."""
     weight, error = frames[0].of_all(count)
     for contributions in frames[1:]:
         more = contributions.of_all(count)
@@ -46,11 +46,11 @@ def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributi
 
 @dataclass
 class ContributionRequest:
-    """What a backend's backward pass reads and fills: sums over the rays that it drew."""
+    """A request for contributions: a backend's backward pass reads ``error`` and fills ``result``."""
 
-    error: Tensor  # of each ray, in the shape of the frame as the backend drew it
+    error: Tensor  # error of each ray, in the shape of the frame as the backend drew it
     result: Contributions
-    rays: int = 1  # of a pixel; sums are divided by their number, so that frames of any number compare
+    rays: int = 1  # per pixel; sums are divided by it, so that frames with different numbers are comparable
     sums: tuple[Tensor, Tensor] | None = None
 
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
@@ -63,7 +63,7 @@ class ContributionRequest:
         self.fill(*self.sums)
 
     def fill(self, weight: Tensor, error_weight: Tensor) -> None:
-        """Set the sums (N,) over all rays."""
+        """Set the result from the sums (N,) over all rays."""
         n = self.rays
         weight, error_weight = (sums.to(self.result.weight.device) for sums in (weight, error_weight))
         self.result.weight, self.result.error_weight = (
@@ -119,7 +119,7 @@ class RenderOutput:
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
-    """Return (H, W) sum of w z over sum of w, which is a ray's alpha; 0 where nothing is hit."""
+    """Return the (H, W) mean depth: sum of w z divided by sum of w, which is alpha; 0 where nothing is hit."""
     hit = alpha > 0
     if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):
         return (weighted / alpha).masked_fill_(~hit, 0.0)
@@ -127,29 +127,29 @@ def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
 
 
 Draw = Callable[..., RenderOutput]
-"""A backend's ``render(lowered, camera, background, settings)``; which cameras it takes differs."""
+"""Type of a backend's ``render(lowered, camera, background, settings)``; the supported cameras differ."""
 
 
 def draw_pixel_samples(
     draw: Draw, lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw ``settings.samples`` squared rays per pixel: means of rgb and alpha, and of depth weighted by alpha."""
+    """Draw ``settings.samples`` ** 2 rays per pixel; average rgb and alpha, and depth weighted by alpha."""
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
     alpha = _average_pixel_samples(fine.alpha, n)
     depth = None if fine.depth is None else mean_depth(_average_pixel_samples(fine.depth * fine.alpha, n), alpha)
-    fine.stats.samples = n  # contributions are per pixel; pairs and extra count the work really done
+    fine.stats.samples = n  # contributions are per pixel; pairs and extra count the actual work
     return RenderOutput(_average_pixel_samples(fine.rgb, n), alpha, depth, fine.stats)
 
 
 def _average_pixel_samples(image: Tensor, n: int) -> Tensor:
-    """Means over n x n pixels of (n H, n W) or (n H, n W, C)."""
+    """Return the means over n x n pixels of an (n H, n W) or (n H, n W, C) image."""
     h, w = image.shape[0] // n, image.shape[1] // n
     return image.reshape(h, n, w, n, *image.shape[2:]).mean((1, 3))
 
 
 def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
-    """Return the (H, W, 3) float64 scene points at a depth image (H, W); no gradient."""
+    """Return the (H, W, 3) float64 scene points that a depth image (H, W) shows; no gradient."""
     depth = depth.detach().double()
     view = device.to_device_like(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):

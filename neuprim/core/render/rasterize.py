@@ -1,6 +1,6 @@
-"""Tensors and image of a lowered model, around the :class:`torch.autograd.Function` of a kernel backend.
+"""Render a lowered model with the :class:`torch.autograd.Function` of a kernel backend: inputs, outputs, gradients.
 
-Its ``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``: :data:`PARAMETERS`, then :data:`NET`.
+``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``: those of :data:`PARAMETERS`, then NET.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ NET = ("Wx", "bias", "Wout")
 
 @dataclass(frozen=True)
 class RasterRequest:
-    """One frame to draw: what is not a tensor."""
+    """The inputs of a frame that are not tensors."""
 
     camera: Camera
     turns: float  # omega0 / 2 pi of the density
@@ -47,7 +47,7 @@ class RasterRequest:
 
 
 def rasterizer_tensors(lowered: LoweredPrimitives) -> tuple[Tensor, ...]:
-    """Return the tensors of :data:`PARAMETERS`."""
+    """Return the tensors that :data:`PARAMETERS` names, in its order."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
     return g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1)
@@ -82,13 +82,13 @@ def rasterize(
 
 
 def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Keep dtypes and devices for :func:`rasterizer_input_gradients`; gradients that nobody asks for may be None."""
+    """Save dtypes and devices for :func:`rasterizer_input_gradients`; let ``backward`` get None for unused outputs."""
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
-    ctx.set_materialize_grads(False)  # a depth image without a gradient costs the backward pass nothing
+    ctx.set_materialize_grads(False)  # without a gradient, the depth image adds no cost
 
 
 def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    """Return what ``backward`` returns: a gradient for each input, from that of (R | t), (3, 4), and the others."""
+    """Return the result of ``backward``, a gradient per input, from ``view``, dL/d(R | t) (3, 4), and the others."""
     full = None
     if view is not None:
         full = torch.zeros(4, 4, dtype=torch.float64, device=view.device)

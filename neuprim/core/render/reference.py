@@ -1,5 +1,5 @@
-"""The reference: the method's closed form in plain torch, float64, with autograd; every other backend is tested against
-it."""
+"""The reference backend: the method's closed form in plain torch, float64, with autograd. Every other backend is tested
+against it."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.output import RenderOutput, RenderStats, mean_depth
 from neuprim.core.settings import RenderSettings
 
-_BLOCK = 32  # pixels on a side; bounds memory, changes nothing
+_BLOCK = 32  # pixels per side of a block; limits memory, does not change results
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) whose derivative uses max(D, floor): it grows as D^-1/2 at a silhouette."""
+    """sqrt(D) with the derivative at max(D, floor): the exact one grows as D^-1/2 at a silhouette."""
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:
@@ -37,7 +37,7 @@ class _FlooredSqrt(torch.autograd.Function):
 
 
 class _Contributions(torch.autograd.Function):
-    """Identity on the weights of one block; its backward adds them up per primitive for the population statistics."""
+    """Identity on the weights of one block; its backward sums them per primitive, for the population statistics."""
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, rows: Tensor, pixels: Tensor, stats: RenderStats) -> Tensor:
@@ -120,9 +120,9 @@ def _composite_ray_block(
     settings: RenderSettings,
     stats: RenderStats,
 ) -> Tensor:
-    """(P, channels + 2): premultiplied colour, transmittance and sum of w z of P rays against depth-sorted ``rows``."""
+    """Return (P, channels + 2): premultiplied colour, transmittance, sum of w z of P rays through sorted ``rows``."""
     d, P = rays.directions, len(pixels)
-    with torch.no_grad():  # which (primitive, ray) pairs meet at all
+    with torch.no_grad():  # find the (primitive, ray) pairs that intersect
         v = frame.whiten[rows].detach() @ d.T  # (R, 3, P)
         p = frame.start[rows].detach()[:, :, None]
         a = (v * v).sum(1)
@@ -167,7 +167,7 @@ def _composite_ray_block(
     # Front to back: composite, then stop once T < T_min. Rows are already sorted by depth of the centre.
     dense = torch.zeros(len(rows), P, dtype=torch.float64).index_put((i, j), alpha)
     if settings.sort == "entry":
-        # every ray by the depth of its entries; those that the near plane cuts are equal, and first
+        # sort each ray's chords by entry depth; chords cut by the near plane have equal keys and come first
         with torch.no_grad():
             entry = torch.where(tm - h > t_near, (tm - h) * m * rays.depth[j], torch.zeros_like(h))
             keys = torch.full_like(dense, torch.inf).index_put((i, j), entry)
@@ -204,7 +204,7 @@ class ReferenceRays:
     """Rays from the camera centre, float64."""
 
     directions: Tensor  # (..., 3) unit vectors in camera axes; a zero vector meets nothing
-    near: Tensor  # (...) ray distance before which chords are cut, scene units
+    near: Tensor  # (...) ray distance of the near plane, which cuts chords, scene units
     depth: Tensor  # (...) depth per unit of ray distance
 
 
@@ -216,10 +216,10 @@ class FrameRays(ABC):
 
     @abstractmethod
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:
-        """(N,) whether a ray of the h x w pixels at (y, x) may meet each primitive; never false for one that is met."""
+        """Return (N,) whether a ray of the h x w pixels at (y, x) may hit each primitive; never False for a hit."""
 
     def block(self, y: int, x: int, h: int, w: int) -> tuple[ReferenceRays, Tensor]:
-        """The h*w rays of a block of pixels, flat, and the rows they may meet, front to back."""
+        """Return the h*w rays of a block of pixels, flat, and the primitive rows they may hit, front to back."""
         window, r = (slice(y, y + h), slice(x, x + w)), self.rays
         rays = ReferenceRays(
             r.directions[window].reshape(-1, 3), r.near[window].reshape(-1), r.depth[window].reshape(-1)
@@ -228,7 +228,7 @@ class FrameRays(ABC):
 
 
 def pixel_ray_directions(camera: Camera) -> Tensor:
-    """(H, W, 3) float64 unit ray directions in camera axes; differentiable in intrinsics that are tensors."""
+    """Return (H, W, 3) float64 unit ray directions in camera axes; differentiable in intrinsics that are tensors."""
     x = (torch.arange(camera.width, dtype=torch.float64) + 0.5 - camera.cx) / camera.fx
     y = (torch.arange(camera.height, dtype=torch.float64) + 0.5 - camera.cy) / camera.fy
     gy, gx = torch.meshgrid(y, x, indexing="ij")
@@ -237,7 +237,7 @@ def pixel_ray_directions(camera: Camera) -> Tensor:
 
 
 class _PinholeRays(FrameRays):
-    """Near is a camera-z plane, depth is camera-z, the order is that of the centres' z, the cull exact screen boxes."""
+    """Pinhole rays: near is a camera-z plane, depth is camera-z, order by centre z, culling by exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = pixel_ray_directions(camera)
@@ -252,7 +252,7 @@ class _PinholeRays(FrameRays):
 
 
 class _CentralRays(FrameRays):
-    """Near, depth and the order are distances from the camera; the cull is a cone round each block's rays."""
+    """Rays of a RayCamera: near, depth and order are distances from it; culling by a cone around each block's rays."""
 
     def __init__(self, camera: RayCamera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = camera.directions.double()
@@ -264,7 +264,7 @@ class _CentralRays(FrameRays):
             inside = radius >= distance
             safe = torch.where(inside, torch.ones_like(distance), distance)
             self.toward = center / safe[:, None]
-            # half angle under which the bounding sphere appears; all directions from inside it
+            # half angle of the bounding sphere seen from the camera; pi from inside it
             self.angle = torch.where(inside, torch.full_like(distance, math.pi), (radius / safe).clamp_max(1).asin())
 
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:
@@ -279,17 +279,17 @@ class _CentralRays(FrameRays):
 
 
 def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
-    """The frame's rays; ``center`` (N, 3) are the primitives' centres in camera axes, float64."""
+    """Return the frame's rays; ``center`` (N, 3) are the primitives' centres in camera axes, float64."""
     make = _CentralRays if isinstance(camera, RayCamera) else _PinholeRays
     return make(camera, geometry, center, near)  # type: ignore[arg-type]
 
 
 def screen_boxes(geometry: Geometry, camera: Camera, near: float) -> Tensor:
-    """(N, 4) float64 pixel bounds (x0, y0, x1, y1) of each ellipsoid's projection.
+    """Return the (N, 4) float64 pixel bounds (x0, y0, x1, y1) of each ellipsoid's projection.
 
     In the plane of image axis i and the optical axis, the tangents are x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with
     k = c_i z - S_iz, D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2), S = B diag(s^2) B^T and centre c.
-    An ellipsoid that the near plane cuts has the whole screen, one behind it nothing (x1 < x0).
+    An ellipsoid cut by the near plane gets the whole screen, one behind it an empty box (x1 < x0).
     """
     view = camera.viewmat.detach().double()
     R = view[:3, :3]

@@ -1,4 +1,4 @@
-"""The trainer of one of several ranks.
+"""The trainer of one of several ranks that train a model together.
 
 Every rank draws all random numbers of a step, renders its own views, and gets the gradients of all of them, added in
 the order of the views. From there all ranks compute the same, population and learning rates included. R ranks with V
@@ -27,14 +27,14 @@ from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
 from neuprim.core.train.training_views import hash_training_views
 
 _ALIGNMENT = 16
-"""Numbers; tensors start at multiples of 64 bytes, which vector units read at once."""
+"""Alignment in float32 numbers: tensors start at multiples of 64 bytes, which vector units read at once."""
 
 
 class _RankMessage(NamedTuple):
-    """What a rank tells the others in a step.
+    """Message of a rank to the others in a step.
 
     Attributes:
-        checksum: of the positions before the step, to notice a rank that computes differently.
+        checksum: checksum of the positions before the step, to detect a rank that computes differently.
         elapsed: seconds of training; those of rank 0 count.
         stop: whether this rank was asked to stop.
         present: which parameters have a gradient.
@@ -81,7 +81,7 @@ class DistributedTrainer(Trainer):
         self._agreed = self._agreed_at = self._after = 0.0
 
     def check_same_start(self) -> None:
-        """Refuse ranks that start with other settings, data or numbers.
+        """Check that all ranks start with the same settings, data and parameters.
 
         Raises:
             RankError: names the rank and what differs.
@@ -100,7 +100,7 @@ class DistributedTrainer(Trainer):
         self.group.check_equal(facts, "expected the same overrides, data and output directory on all ranks")
 
     def train_step(self) -> StepReport:
-        """As :meth:`~neuprim.core.train.trainer.Trainer.train_step`.
+        """Take one training step with the other ranks, as :meth:`~neuprim.core.train.trainer.Trainer.train_step`.
 
         Raises:
             RankError: another rank ended, or computes differently. The state is that before the step.
@@ -157,7 +157,7 @@ class DistributedTrainer(Trainer):
         return every, self._sums.finish(self.model.params, present)
 
     def _stop_clock(self, start: float) -> float:
-        """Rank 0's clock as of :meth:`_combine_views`; what the step spends afterwards counts in the next one."""
+        """Return rank 0's clock as of :meth:`_combine_views`; later time of the step counts in the next one."""
         self._after = time.perf_counter() - self._agreed_at
         return self._agreed
 
@@ -167,7 +167,7 @@ def _pad_gradient_exchange(numbers: int) -> int:
 
 
 class GradientSum:
-    """Sum gradients and contributions over the views of all ranks, in the order of the views.
+    """Sum of gradients and contributions over the views of all ranks, in the order of the views.
 
     An all-reduce adds in an order of its own, which changes the bits. Here every rank owns a slice of a flat buffer,
     receives that slice of every view, adds the views one after the other as one process does, and sends the sum to the
@@ -192,7 +192,7 @@ class GradientSum:
         *self._gradients, self._weight, self._error = parts
 
     def fits(self, params: Mapping[str, Tensor]) -> bool:
-        """Whether it was made for parameters of these shapes."""
+        """Return whether it was made for parameters of these shapes."""
         return self.shapes == {name: value.shape for name, value in params.items()}
 
     def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:

@@ -22,7 +22,7 @@ from neuprim.core.train.settings import ModelSettings
 __all__ = ["initial_model_to_train"]
 
 _USUAL_OPACITY = 0.5
-"""Of Gaussians that say how large they are, but not how opaque."""
+"""Opacity of Gaussians from files that have sizes but no opacities."""
 
 
 def initial_model_to_train(
@@ -88,7 +88,7 @@ def initial_model_to_train(
 def _add_initial_surroundings(
     cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator
 ) -> PointCloud:
-    """The points, a share of them (``model.init.surroundings``) replaced by what views show where there are none."""
+    """Replace a share of the points (``model.init.surroundings``) by points on what views show where none are."""
     share = settings.init.get("surroundings", 0.0)
     if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
         raise ConfigError(

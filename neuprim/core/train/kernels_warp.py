@@ -53,7 +53,7 @@ def _step_number(
 def adam_kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def check(grads: _POINTERS, ends: _LONGS, bad: wp.array(dtype=wp.int32)):
-        """A thread a number; ``ends``: of the parameters, one after the other."""
+        """Set ``bad`` if a gradient is not finite; one thread per number. ``ends``: cumulative sizes of parameters."""
         n = wp.int64(wp.tid())
         k = int(0)
         begin = wp.int64(0)
@@ -70,8 +70,11 @@ def adam_kernels() -> tuple[Any, Any]:
         beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64),
         bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
-        the betas; ``age``: steps of each row, this one included."""
+        """Take an Adam step unless ``bad``; one thread per number.
+
+        ``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
+        the betas; ``age``: steps of each row, this one included.
+        """
         n = wp.int64(wp.tid())
         if bad[0] == 0:
             k = int(0)
@@ -96,8 +99,9 @@ def adam_rows(
     rates: Sequence[float],
     age: Tensor, betas: tuple[float, float],
 ) -> bool:  # fmt: skip
-    """Take one step in place; returns whether all gradients were finite, and if not nothing has changed. The host waits
-    for the device once.
+    """Take one Adam step in place and return True, or change nothing and return False if a gradient is not finite.
+
+    The host waits for the device once.
 
     Args:
         values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.
@@ -140,7 +144,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def along_rows(
         a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)
     ):
-        """(x, y, xx, yy, xy) blurred along rows of pixels; (H, W - 10, C)."""
+        """Blur (x, y, xx, yy, xy) along rows of pixels; (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -158,7 +162,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def compare(
         rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)
     ):
-        """SSIM of every window, (H - 10, W - 10, C), and its derivatives by the means of x, of x^2 and of x y."""
+        """Compute SSIM of every window, (H - 10, W - 10, C), and its derivatives by the means of x, x^2 and x y."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -175,7 +179,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def back_along_columns(maps: wp.array3d(dtype=wp.vec3), window: _Window, out: wp.array3d(dtype=wp.vec3)):
-        """The adjoint of blurring along columns; (H, W - 10, C)."""
+        """Apply the adjoint of the blur along columns; (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = wp.vec3()
         for k in range(SSIM_TAPS):
@@ -190,7 +194,10 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
         by_l1: float, by_ssim: float,
         difference: wp.array3d(dtype=float), grad: wp.array3d(dtype=float),
     ):  # fmt: skip
-        """``by_l1``, ``by_ssim``: weights over numbers of pixels and of windows."""
+        """Write |a - b| and the gradient of the loss by ``a``, with the adjoint of the blur along rows.
+
+        ``by_l1``, ``by_ssim``: weights over the numbers of pixels and of windows, times channels.
+        """
         y, x, c = wp.tid()
         total = wp.vec3()
         for k in range(SSIM_TAPS):
@@ -212,8 +219,9 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
 
 
 def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
-    weight (1 - SSIM).
+    """Return mean absolute difference and mean SSIM, (2,) float64, and the (H, W, C) gradient of the loss.
+
+    The loss is (1 - weight) L1 + weight (1 - SSIM).
 
     Args:
         rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels, on one device.

@@ -33,12 +33,12 @@ _MU = 16.0
 _DARK = 0.05
 
 _COMPONENT_WEIGHT = 0.1
-"""Weight of an extinction's components: it teaches the primitives' shares, whose rate does not depend on it, and hardly
-moves primitives."""
+"""Weight of the loss of an extinction's components. It trains the primitives' shares, whose learning speed does not
+depend on it, and hardly moves primitives."""
 
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
-    """The photometric loss by kornia and autograd, on any device and in any dtype; the oracle of the fused versions.
+    """Compute the photometric loss by kornia and autograd, on any device and dtype; reference of the fused versions.
 
     Args:
         rendered: (H, W, C) rendered image, values nominally in 0..1.
@@ -135,10 +135,11 @@ class PointLossResult:
     """One frame's points, evaluated and compared.
 
     Attributes:
-        loss: with gradient. parts: its named parts, for the log.
-        psnr: of the extinction at the points, against the largest true one.
-        name: of the frame.
-        rows, shares: of its active primitives, see :func:`~neuprim.core.volumes.points.volume_values_at`.
+        loss: scalar with gradient.
+        parts: named parts of the loss, for the log.
+        psnr: PSNR of the extinction at the points, relative to the largest true one.
+        name: name of the frame.
+        rows, shares: those of the active primitives, see :func:`~neuprim.core.volumes.points.volume_values_at`.
     """
 
     loss: Tensor
@@ -149,7 +150,7 @@ class PointLossResult:
     shares: PointShares
 
     def contributions(self) -> Contributions:
-        """Contributions of the primitives to the points; call it after the backward pass."""
+        """Return the contributions of the primitives to the points; call it after the backward pass."""
         return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
 
@@ -185,8 +186,8 @@ def point_loss(
 
 
 def scale_anisotropy(log_scales: Tensor) -> Tensor:
-    """Mean over primitives of the standard deviation over axes of s / min s (the authors' regulariser); 0 for
-    spheres."""
+    """Return the mean over primitives of the standard deviation over axes of s / min s (the authors' regulariser); 0
+    for spheres."""
     ratio = (log_scales - log_scales.min(dim=-1, keepdim=True).values).exp()
     return ratio.std(dim=-1).mean()
 

@@ -1,4 +1,4 @@
-"""Adam whose every row has its own step count.
+"""Adam with a step count for each row, that is, for each primitive.
 
 Population control creates primitives in the middle of a run. A fresh row with zero moments but an old step count would
 take a first step 3.2 times its rate (method: "splitting exactly"), so bias correction counts per row.
@@ -29,8 +29,8 @@ _INFINITY = 0x7F800000  # bits of a float32
 def adam_step_reference(
     value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor, beta2: float = 0.999
 ) -> None:
-    """One in-place Adam step (Kingma and Ba 2015) of an (N, ...) tensor; ``age`` (N,) counts each row's steps, this one
-    included."""
+    """Take an Adam step (Kingma and Ba 2015) in place on an (N, ...) tensor; ``age`` (N,) counts each row's steps, this
+    one included."""
     shape = (-1, *[1] * (value.dim() - 1))
     m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
     v.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
@@ -40,9 +40,11 @@ def adam_step_reference(
 
 @exact_kernel
 def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, correction, root):  # type: ignore[no-untyped-def]
-    """The same on flat float32 arrays of ``width`` numbers per row. ``correction`` is 1 / c1 and ``root`` is sqrt(1 /
-    c2) of each age. Neighbouring rows mostly have one age, so they are taken in runs that end at ``breaks``: long
-    loops, which vectorise."""
+    """Take the step of :func:`adam_step_reference` on flat float32 arrays of ``width`` numbers per row.
+
+    ``correction`` is 1 / c1 and ``root`` is sqrt(1 / c2) of each age. Neighbouring rows mostly have one age, so they
+    are taken in runs that end at ``breaks``: long loops, which vectorise.
+    """
     b1, b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(EPS)
     one_b1, one_b2 = np.float32(1 - BETA1), np.float32(1 - beta2)
     i, run = start, np.searchsorted(breaks, start, "right")
@@ -63,7 +65,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 @exact_kernel
 def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
-    """The largest of float32 numbers' bits without their signs: those of infinity or more where one is not finite."""
+    """Return the largest bit pattern of float32 numbers without sign: at least infinity's if one is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
     for k in range(bits.shape[0]):  # a maximum of integers vectorises, a sum of floats does not
@@ -80,8 +82,8 @@ def _all_gradients_finite(gradients: list[Tensor]) -> bool:
 
 @lru_cache(maxsize=4)
 def _bias_corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
-    """1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; powers take longer than all else that a step does per
-    row."""
+    """Return 1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; cached, as powers take longer than the rest of a
+    step per row."""
     age = np.arange(1.0, ages)
     return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
 
@@ -112,7 +114,7 @@ class RowAdam:
         self.age = torch.zeros(params["means"].shape[0], dtype=torch.int64, device=params["means"].device)
 
     def step(self, params: dict[str, Tensor], rates: dict[str, float]) -> None:
-        """Update ``params`` in place from their ``.grad``, and lift them to the least values of their specs.
+        """Update ``params`` in place from their ``.grad``, and clamp them to the lower bounds of their specs.
 
         Raises:
             NonFiniteError: a gradient is NaN or infinite; names parameter and primitive, and changes nothing.
@@ -170,7 +172,7 @@ class RowAdam:
         parallel_for(step_rows, len(work), 1, 0)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
-        """Follow a change of population: keep ``rows`` in their new order, and start anew where ``fresh`` is set."""
+        """Apply a population change: take ``rows`` in their new order, and reset moments and age where ``fresh``."""
         for moments in (self.m, self.v):
             for name in moments:
                 moments[name] = moments[name][rows]
@@ -179,11 +181,11 @@ class RowAdam:
         self.age[fresh] = 0
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors a checkpoint needs."""
+        """Return the tensors that a checkpoint needs."""
         return {**{f"m.{k}": t for k, t in self.m.items()}, **{f"v.{k}": t for k, t in self.v.items()}, "age": self.age}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Take over a state, whose tensors are on the right device."""
+        """Restore a :meth:`state` whose tensors are on the right device."""
         self.m, self.v = ({name: state[f"{moment}.{name}"] for name in self.m} for moment in "mv")
         self.age = state["age"]
 

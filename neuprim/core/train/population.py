@@ -1,4 +1,4 @@
-"""Population control: how primitives are born, moved and removed during a training. All splits are exact."""
+"""Population control: how primitives are added, moved and removed during a training. All splits are exact."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.train.settings import PopulationSettings
 
 SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS = 0.5, 0.6, 0.9
-"""A child's centre and semi-axes over its parent's: shift along the longest axis, that axis, the other two.
+"""A child relative to its parent: shift over the longest semi-axis, factor on that axis, factor on the other two.
 
 Exact children carry their parent's sigma only inside themselves: what they leave uncovered vanishes, and what both
 cover counts twice. These cover 78 % of the parent and overlap in 2 %. Five other shapes trained no better.
 """
 
 SPLIT_GAUSSIAN = 1 / 1.6
-"""All semi-axes of a child over its parent's, in the rule of 3D Gaussian splatting (Kerbl et al. 2023: 0.8 times the
-number of children) that the authors of the method keep; such children cover 45 % of their parent."""
+"""Factor on all semi-axes of a child in the rule of 3D Gaussian splatting (Kerbl et al. 2023: the inverse of 0.8 times
+the number of children), which the authors of the method use; such children cover 45 % of their parent."""
 
 _GROWTH = 0.25
-"""Share of the primitives that is born at once: a split costs quality that training has to win back. It is more where
-the count would otherwise not be reached."""
+"""Share of the primitives that one intervention adds: a split costs quality that training has to recover. It is larger
+if the count would otherwise not be reached."""
 
 _MIN_GROWTHS = 3
-"""Shares of the time between ``start`` and ``stop``: primitives are born at least between these."""
+"""Number of equal parts of the time from ``start`` to ``stop``; primitives are added at least at their boundaries."""
 
 
 def split_population(
@@ -78,34 +78,34 @@ class PopulationChange:
 
 
 class Population(ABC):
-    """Observes every step and now and then proposes a :class:`PopulationChange`."""
+    """Base class of strategies: observes every step, and proposes a :class:`PopulationChange` when :meth:`due`."""
 
     def __init__(self, settings: PopulationSettings) -> None:
         self.settings = settings
 
     def due(self, step: int, progress: float) -> bool:
-        """Whether to intervene after this step."""
+        """Return whether to intervene after this step."""
         s = self.settings
         return s.start <= progress < s.stop and step % s.every == 0
 
     @abstractmethod
     def observe(self, model: Primitives, contributions: Contributions) -> None:
-        """Called after the backward passes of a step, while ``.grad`` is there."""
+        """Collect statistics after the backward passes of a step, while ``.grad`` is set."""
 
     @abstractmethod
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
         """Return the next population, or None to leave it; resets the statistics."""
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors that a checkpoint needs."""
+        """Return the tensors that a checkpoint needs."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027 - a strategy without statistics has none
-        """Counterpart of :meth:`state`."""
+        """Restore a :meth:`state`."""
 
 
 class FixedPopulation(Population):
-    """The primitives of the start are those of the end."""
+    """Strategy that adds, moves and removes no primitive."""
 
     def observe(self, model: Primitives, contributions: Contributions) -> None:
         pass
@@ -115,10 +115,10 @@ class FixedPopulation(Population):
 
 
 class RelocatePopulation(Population):
-    """Move the primitives with the least weight to where weight x error is largest, and add those that are missing.
+    """Strategy that moves primitives of least weight to where weight x error is largest, and adds missing ones.
 
     The primitive with the largest error splits in two, one child in its own row and one in the idle row; ``idle``
-    limits who moves. While there are fewer primitives than ``grow_to``, further ones split without an idle row, a
+    limits which ones move. While there are fewer primitives than ``grow_to``, further ones split without an idle row, a
     quarter of all at a time, or as many as the remaining interventions need. Short budgets intervene sooner.
     """
 
@@ -182,7 +182,7 @@ class RelocatePopulation(Population):
         return _split_population_into_rows(model, parents, torch.cat([idle, new]), births, text)
 
     def _count_births(self, count: int) -> int:
-        """How many primitives to add, by the same factor in each of the remaining interventions."""
+        """Return how many primitives to add, so that each remaining intervention grows by the same factor."""
         missing = max((self.settings.grow_to or 0) - count, 0)
         due = math.ceil(count * ((1 + missing / count) ** (1 / (self._remaining + 1)) - 1) - 1e-9)
         return min(missing, max(int(_GROWTH * count), due, 1))
@@ -220,7 +220,7 @@ class GradientPopulation(Population):
 
     g = mean over views that saw the primitive of |dW1| + |db1| + |dw2| + |db2|, one view per step. g >= grow_threshold:
     clone in place, both copies at half density, if max s <= clone_scale x extent, else split in two (s/1.6).
-    g < prune_threshold although seen, or max s > prune_scale x extent: prune. So is a primitive no view saw.
+    Prune if g < prune_threshold, max s > prune_scale x extent, or no view saw the primitive.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:

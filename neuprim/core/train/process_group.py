@@ -23,12 +23,12 @@ _VARIABLES = (*_NUMBERS, "MASTER_ADDR", "MASTER_PORT")
 
 @dataclass(frozen=True)
 class TorchrunRank:
-    """This process among those of torchrun.
+    """Rank of this process among those that torchrun started.
 
     Attributes:
-        rank, size: its number, and how many there are on all machines.
-        local_rank, local_size: the same among those of this machine.
-        address: host and port where they meet.
+        rank, size: number of this process, and number of processes on all machines.
+        local_rank, local_size: the same on this machine.
+        address: host and port where the processes connect.
     """
 
     rank: int
@@ -39,7 +39,7 @@ class TorchrunRank:
 
 
 def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunRank | None:
-    """Return this process's rank; None for a process that works alone.
+    """Return this process's rank; None for a single process.
 
     Raises:
         ConfigError: the environment has some of torchrun's variables, or values that cannot be.
@@ -84,14 +84,14 @@ _FAILED = "failed"  # key of the store: the first failure of any rank
 
 
 class ProcessGroup:
-    """The ranks of a training that have met.
+    """The connected ranks of a training.
 
     Args:
-        place: which rank this process is.
-        environment: of torchrun.
+        place: rank of this process.
+        environment: environment variables of torchrun.
 
     Raises:
-        ConfigError: the ranks cannot meet.
+        ConfigError: the ranks cannot connect.
     """
 
     def __init__(self, place: TorchrunRank, environment: Mapping[str, str]) -> None:
@@ -129,7 +129,10 @@ class ProcessGroup:
         return values
 
     def share_number(self, name: str, make: Callable[[], int]) -> int:
-        """Return what ``make`` gives on rank 0, which is the only one to call it, as ``name``. Raises RankError."""
+        """Return the result of ``make`` on rank 0, the only rank to call it, shared under the key ``name``.
+
+        Raises RankError.
+        """
         number = make() if self.is_first else None
         with self._errors():
             if number is not None:
@@ -172,12 +175,12 @@ class ProcessGroup:
     # ------------------------------------------------------------ failures
 
     def record_failure(self, line: str) -> bool:
-        """Record in the shared store why this rank ends; returns whether it is the first rank that does, which has to
-        tell the user."""
+        """Record in the shared store why this rank ends; return whether it is the first one, which must report to the
+        user."""
         own = json.dumps([self.rank, line[:4000]])
         try:
             return bool(self.store.compare_set(_FAILED, "", own).decode() == own)
-        except RuntimeError:  # the store went with torchrun or rank 0
+        except RuntimeError:  # the store ended with torchrun or rank 0
             return True
 
     @contextmanager
@@ -188,8 +191,8 @@ class ProcessGroup:
             raise self.explain_broken_connection(error) from error
 
     def explain_broken_connection(self, error: Exception) -> RankError:
-        """The reason for a broken connection: the recorded failure of another rank, or that one ended without a
-        word."""
+        """Return the reason for a broken connection: the recorded failure of another rank, or that one ended without a
+        record."""
         try:
             if self.store.check([_FAILED]):
                 rank, line = json.loads(self.store.get(_FAILED))

@@ -1,4 +1,4 @@
-"""Estimate what images, or points, would lose without a primitive or a unit of it, by one backward pass per view.
+"""Estimate the error in images, or at points, of removing a primitive or a unit of it, by one backward pass per view.
 
 To first order an image changes by J delta when numbers change by delta. For random signs z per pixel and channel, the
 mean of (z . J delta)^2 is the sum of squares |J delta|^2 (Hutchinson 1990), and z . J is what a backward pass gives. A
@@ -28,11 +28,11 @@ class Sensitivity:
     """Mean squared effects over the pixels and channels of some views, or over points.
 
     Attributes:
-        whole: (N,) of each primitive being gone; in views, for a difference of colour of 1 from what is behind it.
-        seen: (N,) in how many of the views, or frames, a primitive was; of those in none nothing is known.
-        pieces: name -> (N,) of each primitive's piece being zero.
-        columns: parameter -> (C,) float64, of each of its numbers when those of all primitives change by independent
-            amounts of variance 1; of "quats" by amounts across a quaternion of unit norm.
+        whole: (N,) effect of removing each primitive; in views, if its colour differs by 1 from what is behind it.
+        seen: (N,) number of views, or frames, that show the primitive; where it is 0, the effects are unknown.
+        pieces: name of a unit -> (N,) effect of setting each primitive's unit to zero.
+        columns: parameter -> (C,) float64 effect of each of its numbers, if those of all primitives change by
+            independent amounts of variance 1; for "quats", by amounts perpendicular to a quaternion of unit norm.
     """
 
     whole: Tensor
@@ -41,7 +41,7 @@ class Sensitivity:
     columns: dict[str, Tensor]
 
     def combine(self, other: Sensitivity, weight: float) -> Sensitivity:
-        """Effects on these views and, ``weight`` times, on what another one looked at."""
+        """Return the sum of these effects and ``weight`` times those of ``other``."""
         pieces = {name: value + weight * other.pieces[name] for name, value in self.pieces.items()}
         columns = {name: value + weight * other.columns[name] for name, value in self.columns.items()}
         return Sensitivity(self.whole + weight * other.whole, self.seen + other.seen, pieces, columns)
@@ -56,7 +56,7 @@ class _SensitivitySums:
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
     def add_pass(self, params: dict[str, Tensor]) -> None:
-        """Add one pass: ``params`` with their gradients."""
+        """Add the gradients of ``params`` from one backward pass."""
         gradients = {
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
@@ -64,7 +64,7 @@ class _SensitivitySums:
             self.pieces[name] += primitive_unit_removal_effect(piece, params, gradients).square().cpu()
         for name, own in self.columns.items():
             slopes = gradients[name].reshape(self._model.count, len(own))
-            if name == "quats":  # a change of a quaternion counts as it turns, whatever its norm
+            if name == "quats":  # a change of a quaternion counts by its rotation, whatever the norm
                 slopes = slopes * params[name].detach().norm(dim=1, keepdim=True)
             own += slopes.double().square().sum(0).cpu()
 
@@ -77,11 +77,11 @@ class _SensitivitySums:
 def sensitivity(
     model: Primitives, dataset: Dataset, views: Sequence[int], settings: RenderSettings, seed: int = 0
 ) -> Sensitivity:
-    """Effects over training views, on the processor.
+    """Return the effects on the images of training views, as CPU tensors.
 
     Args:
         views: indices of training views.
-        seed: of the random signs.
+        seed: seed of the random signs.
     """
     generator = torch.Generator().manual_seed(seed)
     whole, seen, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _SensitivitySums(model)
@@ -103,12 +103,14 @@ def sensitivity(
 
 
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
-    """Effects on the extinction at points, in units of its typical size: what images do not show of a volume that is
-    known inside.
+    """Return the effects on the extinction at points, in units of its typical size, as CPU tensors.
+
+    For volumes whose inside is known; images do not show these effects.
 
     Args:
-        draws: points of some frames.
-        seed, threads: of the random signs; of the backward pass, 0 for all cores.
+        draws: points, each sample of one frame.
+        seed: seed of the random signs.
+        threads: CPU threads; 0 uses all cores.
     """
     generator = torch.Generator().manual_seed(seed)
     whole, seen, sums = torch.zeros(model.count), torch.zeros(model.count, dtype=torch.int64), _SensitivitySums(model)

@@ -1,7 +1,7 @@
-"""Training settings, as they stand in a run's configuration under ``train`` and ``model``, and who reads them.
+"""Settings of a run under ``train`` and ``model``, and the tracking of which plugin reads them.
 
-The settings in :data:`OPTIONAL` are read by a task's ``build`` or by a loss, if at all. Whoever reads one says so in
-``uses``; setting one that nobody reads is refused, and a function gets only those that it declared.
+The settings in :data:`OPTIONAL` are read by a task's ``build`` or by a loss, if at all, and declared there in ``uses``.
+Setting one that nobody reads is an error, and a function gets only those that it declared.
 """
 
 from __future__ import annotations
@@ -228,12 +228,12 @@ OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_we
 
 
 class TrackedMapping(dict[str, Any]):
-    """A group of settings as a plugin's function gets it; a setting that it forgot to declare is an error that says so.
+    """A group of settings for a plugin's function; reading a setting that the plugin did not declare is a ConfigError.
 
     Args:
         owner: e.g. ``"task 'glow'"``.
         group: dotted name of the group, e.g. ``"model"``.
-        member: of the plugin's description, where it declares what it reads.
+        member: name of the member that declares what the plugin reads, "uses" or "options".
     """
 
     def __init__(self, values: Mapping[str, Any], owner: str, group: str, member: str) -> None:
@@ -250,7 +250,7 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
     """Return what a task's ``build`` and ``check`` get: the model settings that it uses, and its options as "options".
 
     Args:
-        options: values by name; what is missing takes its default, others are left out.
+        options: values by name; missing ones take their defaults, unknown ones are left out.
     """
     return _track_used_settings("model", vars(model), task, options, f"task {task.name!r}")
 
@@ -258,7 +258,7 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
 def loss_settings(
     owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """As :func:`build_settings`: return what makes a loss of the task or of the ``train.loss`` that owns it."""
+    """Return what makes the loss of ``owner``, a task or a ``train.loss``: settings and options, as build_settings."""
     who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
     return _track_used_settings("train", vars(train), owner, options, who)
 

@@ -36,7 +36,7 @@ _C1, _C2 = f(0.01**2), f(0.03**2)
 
 @inline
 def _vertical_loss_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
-    """Blurs over 11 rows of flat images from position ``at``: x, y, xx, yy, xy, sums kept in registers."""
+    """Blur x, y, xx, yy and xy over 11 rows of flat images from position ``at``, with sums in registers."""
     for j in range(count):
         s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
         for k in range(SSIM_TAPS):
@@ -71,8 +71,8 @@ def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
-    """In place on blocks E[x], E[y], E[xx], E[yy], E[xy]: derivatives of scale x SSIM for E[x], E[xx], E[xy]; returns
-    the sum of SSIM."""
+    """Replace E[x], E[xx], E[xy] in the blocks E[x], E[y], E[xx], E[yy], E[xy] by the derivatives of scale x SSIM with
+    respect to them; return the sum of SSIM."""
     total = f(0)
     for j in range(n):
         a, b = s[_EX + j], s[_EY + j]
@@ -91,7 +91,7 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
-    """unequal[i] = [first, end) of the numbers of image rows start:stop that differ, or [n, 0)."""
+    """Set unequal[i] to the range [first, end) of numbers that differ in image row i, or [n, 0); rows start:stop."""
     n = x.shape[0] // height
     for i in range(start, stop):
         first, end = 0, n
@@ -104,8 +104,8 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 
 @inline
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
-    """[first, end) of the unequal numbers of image rows start:stop, so many before and after, within [0, most); end is
-    first without any."""
+    """Return the range [first, end) of the unequal numbers of image rows start:stop, extended by ``before`` and
+    ``after`` within [0, most); end is first without any."""
     first, end = most, np.int64(0)
     for i in range(start, stop):
         first, end = min(first, unequal[i, 0] - before), max(end, unequal[i, 1] + after)
@@ -115,7 +115,7 @@ def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[
 
 @kernel
 def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type: ignore[no-untyped-def]
-    """Window rows start:stop: derivative maps of the mean SSIM; returns the sum of SSIM over them.
+    """Write window rows start:stop of the derivative maps of the mean SSIM; return the sum of SSIM over them.
 
     x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
     """
@@ -147,7 +147,7 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
 
 @inline
 def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
-    """gr = L1 and SSIM gradient from the three spread maps; returns the sum of |x - y|."""
+    """Write the gradient of L1 and SSIM into ``gr``, from the three spread maps; return the sum of |x - y|."""
     line = f(0)
     for j in range(n):
         a, b = x[j], y[j]
@@ -160,7 +160,7 @@ def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped
 
 @kernel
 def _spread_loss_gradient(start, stop, x, y, height, channels, unequal, maps, weight, grad):  # type: ignore[no-untyped-def]
-    """Image rows start:stop of d loss / d x, the adjoint of the blur; returns the sum of |x - y|."""
+    """Write image rows start:stop of d loss / d x, by the adjoint of the blur; return the sum of |x - y|."""
     n = x.shape[0] // height
     pitch = maps.shape[2]
     reach = (SSIM_TAPS - 1) * channels
@@ -189,7 +189,7 @@ _buffers = threading.local()
 
 
 def _bordered_loss_maps(rows: int, columns: int) -> Any:
-    """Three maps with a zero border, reused by the next image of the same size in this thread."""
+    """Return three maps with a zero border; the next image of the same size in this thread reuses them."""
     maps = getattr(_buffers, "maps", None)
     if maps is None or maps.shape != (3, rows, columns):
         maps = _buffers.maps = np.zeros((3, rows, columns), np.float32)
@@ -197,8 +197,9 @@ def _bordered_loss_maps(rows: int, columns: int) -> Any:
 
 
 def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """Means of the absolute difference and of SSIM, (2,) float64, and (H, W, C) the gradient of (1 - weight) L1 +
-    weight (1 - SSIM).
+    """Return mean absolute difference and mean SSIM, (2,) float64, and the (H, W, C) gradient of the loss.
+
+    The loss is (1 - weight) L1 + weight (1 - SSIM).
 
     Args:
         rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels and at most 51 channels.

@@ -1,8 +1,9 @@
 """The training loop of every task.
 
-A step draws a view, renders it, compares it with the image, runs the backward pass, updates the parameters and lets the
-population react. ``train.supervision`` adds points of known extinction, or replaces the view by them. All that affects
-the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for bit.
+A step draws a view, renders it, compares it with the image, runs the backward pass, updates the parameters and applies
+population control. ``train.supervision`` adds points of known extinction, or replaces the view by them. All that
+affects the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for
+bit.
 """
 
 from __future__ import annotations
@@ -255,7 +256,7 @@ class Trainer:
                 self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
             self.step += 1
 
-            # Let the population react.
+            # Apply population control.
             change = None
             if self.population.due(self.step, progress):
                 change = self.population.intervene(model, self.extent)
@@ -277,7 +278,7 @@ class Trainer:
                 "lower one of them. The last checkpoint is intact"
             ) from error
 
-    # ------------------------------------------------------------ what several processes do differently
+    # ------------------------------------------------------------ methods that DistributedTrainer overrides
 
     def _draw_views(self) -> list[ViewTask]:
         """Draw the views of a step with their backgrounds; none for ``train.supervision=voxels``."""
@@ -288,14 +289,16 @@ class Trainer:
         return [ViewTask(*view, then) for view, then in zip(drawn, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
-        """Called after the backward pass of each view, whose gradients one process adds to those of earlier views."""
+        """Return ``contributions``; called after each view's backward pass. ``.grad`` already sums over the views."""
         return contributions
 
     def _combine_views(
         self, results: list[ViewResult], each: list[Contributions], start: float
     ) -> tuple[list[ViewResult], Contributions]:
-        """Results of all views of the step, in their order, and the sum of their contributions. The step began at
-        ``start``."""
+        """Return the results of all views of the step, in order, and the sum of their contributions.
+
+        ``start``: time at which the step began.
+        """
         return results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
 
     def _stop_clock(self, start: float) -> float:
@@ -322,8 +325,8 @@ class Trainer:
         return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
     def _draw_points(self) -> PointSamples | None:
-        """Draw the points of a step that uses some. With ``both``, that is the last step before each multiple of
-        ``voxels_every``, which is the one that logs show."""
+        """Draw the points of this step, or return None. With ``both``, steps whose number in logs is a multiple of
+        ``voxels_every`` use points."""
         source = self.settings.supervision
         if source == "images" or (source == "both" and (self.step + 1) % self.settings.voxels_every):
             return None
@@ -331,7 +334,7 @@ class Trainer:
         return self.dataset.points.draw(self.settings.voxels_per_step, self.generator)
 
     def _quantized_model(self) -> Primitives:
-        """The model that images and points are rendered of."""
+        """Return the model to render: its parameters are quantised if :attr:`fake_quantize` is set."""
         if self.fake_quantize is None:
             return self.model
         return Primitives(self.model.density, self.model.colour, self.fake_quantize(self.model.params))
@@ -440,7 +443,7 @@ class Trainer:
 
 
 def _check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
-    """Refuse settings that do not fit the model and the data; returns them with ``train.supervision`` decided."""
+    """Check that settings fit the model and the data; return them with ``train.supervision=auto`` resolved."""
     if len(dataset.train) == 0:
         raise DataError(f"{dataset.name}: the training split is empty")
     names = [spec.name for spec in model.specs]
@@ -463,7 +466,7 @@ def _check_training_settings(settings: TrainSettings, model: Primitives, dataset
 
 
 def _summarize_training_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
-    """Loss, mean parts, mean PSNR and name of a step, from its views in their order."""
+    """Return loss, mean parts, mean PSNR and name of a step, from its views in their order."""
     last, count = views[-1], len(views)
     parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}
     name = last.name if count == 1 else f"{last.name} and {count - 1} more"

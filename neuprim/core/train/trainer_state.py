@@ -12,11 +12,11 @@ from torch import Tensor
 from neuprim.core.errors import CheckpointError
 
 _FIXED = ("params", "adam", "exposure", "correction")
-"""Groups of tensors that are there in every state of the same settings."""
+"""Groups of tensors that every state of the same settings has."""
 
 
 def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Tensors whose names begin with a prefix, without it."""
+    """Return the tensors whose names begin with ``prefix``, by names without it."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 

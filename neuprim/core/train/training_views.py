@@ -1,5 +1,5 @@
-"""Training views: loaded one ahead on a GPU, some of their pixels in a step, with numbers of their own: a photograph's
-gain, and corrections of its camera and conditions."""
+"""Training views: prefetching for a GPU, pixel strides, and numbers learned per view: the gain of a photograph, and
+corrections of its camera and conditions."""
 
 from __future__ import annotations
 
@@ -21,26 +21,29 @@ from neuprim.core.data.dataset_check import check_pixels
 from neuprim.core.data.image_views import StoredPixels
 
 _MIN_SIDE = 11
-"""Pixels along a side that no stride goes below: the window of SSIM."""
+"""Fewest pixels per side that a stride may leave: the size of the SSIM window."""
 
 _PIXELS_PER_PRIMITIVE = 1.5
-"""Covered pixels of a view that take as long in a step on the CPU as one primitive does."""
+"""Number of covered pixels that take as long in a step on the CPU as one primitive."""
 
 _COUNTED_VIEWS = 16
 """Views whose covered pixels are counted, spread over the training set."""
 
 _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
-"""Used fraction of the budget -> divisor of the automatic stride until then; from the last one on views are whole."""
+"""(used fraction of the budget, divisor of the automatic stride until then); after the last one, views are whole."""
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
 _CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [3e-4] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
-"""Of the numbers of each kind, at the start: of a pose in radians and units of length, the view's step of Adam each."""
+"""Initial learning rate of each number by kind, per step that uses the view; poses are in radians and units."""
 
 
 class PixelLoader:
-    """Loads the pixels of training views; for a GPU those of the next view in a thread, which does not change which
-    views are used, and keeps those that fit, as loading a large view again takes longer than a step."""
+    """Loader of the pixels of training views.
+
+    For a GPU, a thread loads the next view in advance, which does not change the order of the views. Views that fit in
+    a quarter of the free memory are cached, as loading a large view again takes longer than a step.
+    """
 
     def __init__(self, dataset: Dataset, where: torch.device) -> None:
         self._dataset, self._device = dataset, where
@@ -51,12 +54,12 @@ class PixelLoader:
 
     def _load(self, index: int) -> Pixels:
         pixels = self._dataset.train.pixels(index)
-        if not isinstance(pixels, StoredPixels):  # they have the size of their view, and no floats yet
+        if not isinstance(pixels, StoredPixels):  # these have the size of their view, and are not floats yet
             check_pixels("train", self._dataset.train.view(index), pixels, self._dataset.channels)
         return pixels if self._device.type == device.CPU else pixels.to(self._device)
 
     def take(self, index: int, upcoming: int | None) -> Pixels:
-        """Return a view's pixels, and start loading those of ``upcoming``, if it is known. Raises what loading did."""
+        """Return a view's pixels and start loading those of ``upcoming``, if known; raises the errors of loading."""
         if self._device.type == device.CPU:
             return self._load(index)
         pending, self._pending = self._pending, None
@@ -81,29 +84,29 @@ class PixelStride(NamedTuple):
     row: int = 0
 
     def take(self, view: View, pixels: Pixels) -> tuple[View, Pixels]:
-        """The view that has these pixels alone: its rays and colours are theirs, nothing is averaged."""
+        """Return the view and the pixels reduced to the selected pixels; rays and colours are exact, not averaged."""
         if self.step == 1:
             return view, pixels
         return replace(view, camera=view.camera.strided(*self)), pixels.strided(*self)
 
 
 def count_covered_pixels(views: ViewSet) -> float:
-    """Mean number of pixels of a training view that show something: with alpha above 0, and not masked."""
+    """Return the mean number of pixels with alpha above 0 that are not masked, over at most 16 of the views."""
     chosen = range(0, len(views), -(-len(views) // _COUNTED_VIEWS))
     total = 0
     for index in chosen:
         camera, pixels = views.view(index).camera, views.pixels(index)
-        alpha = pixels.alpha  # stored images are not converted for colours
+        alpha = pixels.alpha  # does not convert the colours of stored images
         covered = torch.ones(camera.height, camera.width, dtype=torch.bool) if alpha is None else alpha > 0
         total += int((covered if pixels.mask is None else covered & pixels.mask).sum())
     return total / len(chosen)
 
 
 def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int, progress: float) -> int:
-    """The step between pixels at this used fraction of the budget.
+    """Return the stride at ``progress``, the used fraction of the budget.
 
     ``auto`` balances the work per pixel, which falls with the square of the stride, and that per primitive, which does
-    not: on either side of the balance a step costs more than it teaches. It depends on sizes alone.
+    not: away from the balance a step learns less for its time. It depends on sizes alone.
     """
     if stride != "auto":
         return stride
@@ -113,7 +116,7 @@ def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int
 
 
 def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:
-    """Draw the first pixel. A stride that leaves a view fewer than 11 pixels a side is lowered; 1 draws nothing."""
+    """Draw the first pixel of a stride. Strides that leave fewer than 11 pixels a side are lowered; 1 draws nothing."""
     stride = max(min(stride, min(view.camera.width, view.camera.height) // _MIN_SIDE), 1)
     if stride == 1:
         return PixelStride()
@@ -122,13 +125,13 @@ def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStr
 
 
 def hash_training_views(views: ViewSet) -> str:
-    """Hash the names of views: other frames or images of the same number are other data."""
+    """Return a hash of the names of views, by which different data of the same size differ."""
     text = "\n".join(views.view(i).name for i in range(len(views)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class _NumbersOfViews:
-    """Some numbers per training view that a run learns beside the model, by Adam, in the steps that use the view."""
+    """Numbers per training view that Adam learns with the model, in the steps that use the view."""
 
     def __init__(self, views: int, rates: list[float], device: torch.device) -> None:
         self.rates = torch.tensor(rates, device=device)
@@ -138,17 +141,17 @@ class _NumbersOfViews:
         self._rows: dict[int, Tensor] = {}
 
     def row(self, index: int) -> Tensor:
-        """The numbers of view ``index``, for :meth:`gradient` to find what its backward pass leaves there."""
+        """Return a view's numbers as a leaf tensor; :meth:`gradient` reads its gradient after the backward pass."""
         self._rows[index] = row = self.numbers[index].clone().requires_grad_()
         return row
 
     def gradient(self, index: int) -> list[float] | None:
-        """Gradient of a view's numbers, after its backward pass; None without one."""
+        """Return the gradient of a view's numbers, after its backward pass; None without one."""
         grad = self._rows.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
     def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
-        """Move the numbers of a step's views by their gradients, at ``factor`` of the rates."""
+        """Update the numbers of the views of a step by their gradients; ``factor`` multiplies the rates."""
         for index, numbers in gradients.items():
             if numbers is None:
                 continue
@@ -161,7 +164,7 @@ class _NumbersOfViews:
             self.numbers[index] -= self.rates * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
 
     def state(self) -> dict[str, Tensor]:
-        """Tensors from which :meth:`load_state` goes on."""
+        """Return the tensors from which :meth:`load_state` continues."""
         return {"numbers": self.numbers, "m": self.m, "v": self.v, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
@@ -171,7 +174,7 @@ class _NumbersOfViews:
 
 
 class Exposures(_NumbersOfViews):
-    """A factor per training view and channel, by which a rendered image is multiplied before it is compared.
+    """Gains per training view and channel, which multiply a rendered image before it is compared.
 
     Their logarithms are learned. The geometric mean over the views stays 1, so that the model keeps the photographs'
     mean exposure, with which held-out views are rendered.
@@ -181,7 +184,7 @@ class Exposures(_NumbersOfViews):
         super().__init__(views, [rate] * channels, device)
 
     def apply(self, index: int, rgb: Tensor) -> Tensor:
-        """(H, W, C) as the camera of view ``index`` would have exposed it."""
+        """Return the (H, W, C) image with the exposure of view ``index``."""
         return rgb * self.row(index).exp()
 
     def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
@@ -191,12 +194,12 @@ class Exposures(_NumbersOfViews):
 
 
 class ViewCorrections(_NumbersOfViews):
-    """Corrections of what a data set knows of its training views only roughly (``Dataset.refine``).
+    """Learned corrections of cameras and conditions that a data set knows only roughly (``Dataset.refine``).
 
     Args:
         kinds: "camera" or a condition -> "pose", "offset" or "factor". A pose has a rotation vector and a shift on the
             camera's axes, an offset is added to a position, and of a factor the logarithm is learned.
-        unit: of shifts and offsets, in scene units.
+        unit: unit of shifts and offsets, in scene units.
     """
 
     def __init__(self, views: int, kinds: Mapping[str, Correction], unit: float, device: torch.device) -> None:
@@ -205,7 +208,7 @@ class ViewCorrections(_NumbersOfViews):
         self.kinds, self.unit = kinds, unit
 
     def apply(self, index: int, view: View) -> View:
-        """The view as it is taken to be now."""
+        """Return the view with its current corrections."""
         row, conditions, camera = self.row(index).double(), dict(view.conditions), view.camera
         for name, part in zip(self.kinds, row.split(self._sizes()), strict=True):
             if name in conditions:
@@ -220,7 +223,7 @@ class ViewCorrections(_NumbersOfViews):
         return [len(_CORRECTION_RATES[kind]) for kind in self.kinds.values()]
 
     def _motion(self, part: Tensor) -> Tensor:
-        """(4, 4) of a rotation vector and a shift."""
+        """Return the (4, 4) rigid transform of a rotation vector and a shift."""
         (x, y, z), shift = part[:3], self.unit * part[3:]
         zero = torch.zeros_like(x)
         cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
@@ -228,7 +231,7 @@ class ViewCorrections(_NumbersOfViews):
         return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
     def summary(self) -> str:
-        """How far the corrections went: root mean squares over the views."""
+        """Return a line for the log with the root mean square of each correction over the views."""
         found = []
         for name, part in zip(self.kinds, self.numbers.split(self._sizes(), 1), strict=True):
             kind, sizes = self.kinds[name], part.square().unflatten(1, (-1, 3 if part.shape[1] > 1 else 1)).sum(-1)

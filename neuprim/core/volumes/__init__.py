@@ -1,1 +1,1 @@
-"""Densities on voxel grids: the model's own, and the files that it is compared with."""
+"""Extinction of a model on voxel grids and at points, and voxel files to compare it with."""

@@ -24,7 +24,7 @@ from neuprim.core.model.primitives import Primitives
 __all__ = ["box_lattice", "density_at", "density_grid"]
 
 _PLANES_PER_JOB = 8
-_PAIRS = 1 << 17  # of points and primitives that torch code evaluates at once
+_PAIRS = 1 << 17  # pairs (point, primitive) that torch code evaluates at once
 
 POINTS_LIMIT = 2**30
 """Most points of a grid, 4 GiB of float32."""
@@ -44,8 +44,8 @@ def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, t
 
 
 def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
-    """(4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene, or in a box of
-    voxels around it if they are turned."""
+    """Return (4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene, or in a
+    box of voxels around it if the grid is rotated."""
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)
     index = corners @ back[:3, :3].T + back[:3, 3]
@@ -62,7 +62,7 @@ def density_grid(
     """Return (X, Y, Z) float32 extinctions, 1/scene unit, at ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
     A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other
-    density is evaluated in blocks. It takes a few MB besides the grid.
+    density is evaluated in blocks. Needs a few MB in addition to the grid.
 
     Args:
         conditions: conditions of the frame, e.g. ``{"time": tensor(0.5)}``.
@@ -111,7 +111,7 @@ def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Ten
 def _add_to_density_grid(
     model: Primitives, conditions: Conditions, ellipsoids: Any, P: np.ndarray, Q: np.ndarray, grid: np.ndarray
 ) -> None:
-    """Add a density in torch code, primitive by primitive in a fixed order, so that sums are the same every time."""
+    """Add a density to ``grid`` in torch code, primitive by primitive in a fixed order: sums are reproducible."""
     active = model.active(conditions, torch.float64)
     for n, (mean, scale, R) in enumerate(zip(*(x.detach().numpy() for x in ellipsoids), strict=True)):
         center = Q[:3, :3] @ mean + Q[:3, 3]
@@ -137,7 +137,7 @@ def _fill_density_planes(
     omega0: float, edge: int,
     grid: Any,
 ) -> None:  # fmt: skip
-    """Planes start:stop. P (3, 4) maps indices to the scene, Q (3, 4) back."""
+    """Fill planes start:stop of ``grid``. P (3, 4) maps indices to the scene, Q (3, 4) back."""
     K = W1.shape[1]
     longest = max(grid.shape[1], grid.shape[2], stop - start)
     low, high, steps, y = np.empty(3, np.int64), np.empty(3, np.int64), np.empty((3, 3)), np.empty(3)
@@ -193,7 +193,7 @@ def _fill_density_planes(
                 last_k = min(int(np.ceil(min((half + root) / square, 1e9))), length)
                 if first_k >= last_k:
                     continue
-                f = row[: last_k - first_k]  # slices, as the compiler makes vector code of them only
+                f = row[: last_k - first_k]  # slices, as the compiler only vectorises these
                 f[:] = b2[n]
                 for q in range(K):
                     c = cosines[0, q, i] * cosines[1, q, j] - sines[0, q, i] * sines[1, q, j]

@@ -23,11 +23,11 @@ DENSITY_ERRORS = ("correlation", "relative_l2", "psnr_active", "max_error")
 """Names of the numbers of :meth:`DensityComparison.errors`."""
 
 _BLOCK_POINTS = 1 << 22  # 16 MiB of each grid
-_MIN_SQUARED_ERROR = 1e-20  # as a share of the peak's square: 200 dB, as no number may be infinite
+_MIN_SQUARED_ERROR = 1e-20  # share of the squared peak: 200 dB, so that no number is infinite
 
 
 class GridExtent(NamedTuple):
-    """Range and place of the absorbing grid of one frame."""
+    """Largest value and bounding box of the absorbing grid of one frame."""
 
     largest: float  # largest value
     box: np.ndarray | None  # (2, 3) box around the active voxels, world units; None without any
@@ -88,7 +88,7 @@ class DensityGridPlacement:
         """Return the placement that :meth:`to_json` wrote; ``where`` names the file in errors.
 
         Raises:
-            DataError: the record is something else.
+            DataError: the record is invalid.
         """
         try:
             placement = DensityGridPlacement(
@@ -182,7 +182,7 @@ class DensityGridSource(DensityTruth):
 
 
 class DensityComparison:
-    """Sums over the points of a grid, block by block, from which all errors follow; float64."""
+    """Float64 sums over the points of a grid, added block by block, that determine all errors."""
 
     def __init__(self) -> None:
         self.points = self.active = 0
@@ -190,7 +190,7 @@ class DensityComparison:
         self.error = self.error_active = self.peak = self.worst = 0.0
 
     def add_block(self, truth: np.ndarray, values: np.ndarray) -> None:
-        """Add two blocks of one shape."""
+        """Add a block of true values, and the model's values at the same points."""
         a, b = truth.reshape(-1).astype(np.float64), values.reshape(-1).astype(np.float64)
         wrong = b - a
         inside = wrong[a != 0]
@@ -203,11 +203,11 @@ class DensityComparison:
         self.worst = max(self.worst, float(np.abs(wrong).max(initial=0.0)))
 
     def errors(self) -> dict[str, float] | None:
-        """Name -> number of each of :data:`DENSITY_ERRORS`; None where the truth is the same everywhere.
+        """Return name -> number of each of :data:`DENSITY_ERRORS`; None if the truth is the same everywhere.
 
         ``correlation`` is Pearson's, ``relative_l2`` |values - truth| / |truth|, both over all points; ``psnr_active``
-        is over those where the truth is not 0, against its largest value; ``max_error`` is the largest error anywhere,
-        as a share of that value.
+        is over those where the truth is not 0, relative to its largest value; ``max_error`` is the largest error
+        anywhere, as a share of that value.
         """
         n = max(self.points, 1)
         a, b, aa, bb, ab = (float(x) for x in self.sums)
@@ -248,7 +248,7 @@ def measure_density_errors(
 def split_density_grid_planes(
     scene_from_index: Tensor, shape: tuple[int, int, int]
 ) -> list[tuple[Tensor, tuple[int, int, int]]]:
-    """The same points in parts of whole planes."""
+    """Return the grid in parts of whole planes, each a scene_from_index and a shape."""
     planes = max(1, _BLOCK_POINTS // max(1, shape[1] * shape[2]))
     parts = []
     for x in range(0, shape[0], planes):

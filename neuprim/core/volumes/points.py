@@ -23,10 +23,10 @@ from neuprim.core.volumes.points_cpu import NOT_FINITE, CosinePointValues, Point
 
 
 class PointShares:
-    """Each primitive's part in the values and in an error; the backward pass fills it.
+    """Each primitive's contribution to the values and to an error; the backward pass fills it.
 
     Attributes:
-        error: (M,) any measure of what is wrong at each point.
+        error: (M,) any measure of error at each point.
         weight, error_weight: (N,) sums over points of sigma_i, and of sigma_i x error, of the primitives of the frame.
     """
 
@@ -53,7 +53,7 @@ class PointValues(NamedTuple):
     components: dict[str, Tensor]
 
     def request_shares(self, error: Tensor) -> PointShares:
-        """Let the backward pass sum up each primitive's part in an ``error`` (M,), which gets no gradient."""
+        """Return the shares of each primitive in an ``error`` (M,) without gradient; the backward pass fills them."""
         self.shares.error = error.detach()
         return self.shares
 
@@ -61,7 +61,7 @@ class PointValues(NamedTuple):
 def volume_values_at(
     model: Primitives, conditions: Conditions, points: Tensor, colour: bool = True, threads: int = 0
 ) -> PointValues:
-    """The values at (M, 3) ``points``, scene units, in one frame; without gradient for the points.
+    """Return the values at (M, 3) ``points``, scene units, in one frame; no gradient for the points.
 
     Args:
         colour: whether to compute the source.
@@ -102,7 +102,7 @@ def volume_values_at(
 def _torch_density_point_values(
     active: ActivePrimitives, form: LoweredDensity, cells: PointCells, weights: Tensor, shares: PointShares
 ) -> Tensor:
-    """As :class:`CosinePointValues`; sums run in a fixed order."""
+    """Return what :class:`CosinePointValues` returns, for any density; sums run in a fixed order."""
     g = active.geometry
     with torch.no_grad():  # one synchronisation
         inputs = [g.means, g.scales, 1 / g.scales, g.rotations, *form.tensors().values()]
@@ -132,8 +132,8 @@ def _torch_density_point_values(
 
 
 def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Tensor]:
-    """(P,) int64 rows of ``cells.points`` and of primitives that contain them, primitive by primitive, on the device of
-    the geometry; three synchronisations."""
+    """Return (P,) int64 rows of ``cells.points`` and of primitives that contain them, primitive by primitive, on the
+    device of the geometry; synchronises three times."""
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
     starts, low, counts, points = (
         device.copy_to_device(torch.from_numpy(x), means.device)
@@ -159,6 +159,6 @@ def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Ten
 
 
 def _sum_density_point_rows(count: int, rows: Tensor, values: Tensor) -> Tensor:
-    """(count, ...) sums of ``values`` (P, ...) by ``rows`` (P,), in the order of P; differentiable."""
+    """Return (count, ...) sums of ``values`` (P, ...) by ``rows`` (P,), in the order of P; differentiable."""
     zeros = torch.zeros((count, *values.shape[1:]), dtype=values.dtype, device=values.device)
     return zeros.index_put((rows,), values, accumulate=True)

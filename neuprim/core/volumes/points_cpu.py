@@ -13,9 +13,9 @@ from neuprim.core.compute.threads import parallel_for
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.rows import ellipsoid_rotation_backward, fill_ellipsoid_rotation
 
-_PARTIAL_SUMS = 8  # groups of primitives with a sum of their own, so that results do not depend on the thread count
+_PARTIAL_SUMS = 8  # groups of primitives with separate sums, so that results do not depend on the thread count
 _ROWS_PER_JOB, _PREPARED_ROWS_PER_JOB = 64, 1024
-_POINTS_PER_CELL = 0.3  # of a full grid; matter fills a small part of it
+_POINTS_PER_CELL = 0.3  # if points filled the grid; usually they fill a small part of it
 _MAX_CELLS = 64  # along the longest side
 NOT_FINITE = "extinction at points: a product of finite parameters is not finite"
 
@@ -39,7 +39,7 @@ class PointCells(NamedTuple):
 
 
 def sort_points_into_cells(points: np.ndarray) -> PointCells:
-    """A grid over (M, 3) points, fine enough that a cell holds few of them."""
+    """Return a grid over (M, 3) points, fine enough that a cell holds few of them."""
     if len(points) == 0:
         points, low, step, counts = np.zeros((0, 3)), np.zeros(3), 1.0, np.ones(3, np.int64)
     else:
@@ -54,15 +54,15 @@ def sort_points_into_cells(points: np.ndarray) -> PointCells:
 
 
 class CosinePointValues(torch.autograd.Function):
-    """(M, 1 + C) float32 extinction and weighted extinctions, of (means, log_scales, quats, W1, b1, w2, b2, weights),
-    each a row per primitive."""
+    """Autograd function of (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive, that
+    returns (M, 1 + C) float32 extinction and weighted extinctions."""
 
     @staticmethod
     def forward(
         ctx: Any, cells: PointCells, omega0: float, edge: int, shares: Any, threads: int, *tensors: Tensor
     ) -> Tensor:  # type: ignore[override]
         params = [np.ascontiguousarray(x.detach().numpy()) for x in tensors]
-        if len({x.dtype for x in params}) > 1:  # a mix would compile kernels of its own
+        if len({x.dtype for x in params}) > 1:  # a mix would compile more kernels
             params = [x.astype(np.float64, copy=False) for x in params]
         count, K, width = len(params[0]), params[3].shape[1], 1 + params[7].shape[1]
         shapes = ((count, 3), (count, 3, 3), (count,), (count, 3))
@@ -151,7 +151,7 @@ def _prepare_point_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate,
 
 @exact_kernel
 def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
-    """Gradients of (log_scales, quats, W1, b1, w2, b2) from those of ``prims``, (A, rate, phase, amplitude, offset)."""
+    """Fill gradients of (log_scales, quats, W1, b1, w2, b2) from those of A, rate, phase, amplitude and offset."""
     A, rate, phase, amplitude, offset = prims
     p_A, p_rate, p_phase, p_amplitude, p_offset = pulled
     g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = gradients
@@ -184,7 +184,7 @@ def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prim
 
 @exact_kernel
 def _sort_density_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
-    """Counting sort by cell: fill ``starts``, zeros before, ``order`` and the sorted ``placed``."""
+    """Sort points by cell, by counting: fill ``starts`` (pass zeros), ``order`` and the sorted ``placed``."""
     cells = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
         cell = 0
@@ -205,7 +205,7 @@ def _sort_density_points(points, low, step, counts, starts, order, placed):  # t
 
 @exact_kernel
 def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
-    """Sum the ``parts`` (P, M, W) of sorted points in order into ``merged`` (M, W) of the given points."""
+    """Sum the ``parts`` (P, M, W), points sorted, in order; fill ``merged`` (M, W), points in their given order."""
     for p in range(start, stop):
         for q in range(parts.shape[2]):
             total = 0.0
@@ -216,14 +216,14 @@ def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignor
 
 @inline
 def _density_point_cell_span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
-    """First and last cell of an axis that a box meets; beyond the last, or -1, if none."""
+    """Return the first and last cell of an axis that a box meets; if none, first is past the end or last is -1."""
     first = int(np.floor(min(max((center - reach - low) / step, 0.0), float(count))))
     return first, int(np.floor(min(max((center + reach - low) / step, -1.0), float(count - 1))))
 
 
 @inline
 def _point_cells_of_primitive(cells, reach, means, n):  # type: ignore[no-untyped-def]
-    """First and last cell along each axis that the box of primitive n meets."""
+    """Return the first and last cell along each axis that the box of primitive n meets."""
     low, step, counts = cells.low, cells.step, cells.counts
     x0, x1 = _density_point_cell_span(means[n, 0], reach[n, 0], low[0], step, counts[0])
     y0, y1 = _density_point_cell_span(means[n, 1], reach[n, 1], low[1], step, counts[1])
@@ -241,7 +241,7 @@ def _whiten_density_point_offset(A, n, dx, dy, dz):  # type: ignore[no-untyped-d
 
 @inline
 def _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """f/m at an offset from the mean."""
+    """Return f/m at an offset from the mean."""
     f = offset[n]
     for k in range(phase.shape[1]):
         f += amplitude[n, k] * np.cos(phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz)
@@ -253,7 +253,7 @@ def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sum
     """Add sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
 
     Args:
-        reach, prims: of all primitives, as :func:`_prepare_point_axes` and :func:`_prepare_point_neurons` fill them.
+        reach, prims: filled by :func:`_prepare_point_axes` and :func:`_prepare_point_neurons`, for all primitives.
     """
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims
@@ -283,8 +283,8 @@ def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sum
 
 @kernel
 def _density_point_values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
-    """Gradients of ``prims`` from those of the sums, ``pulled`` (M, 1 + C), and the sums of sigma and sigma x error,
-    ``shares`` (N, 2)."""
+    """Fill gradients of ``prims`` from those of the sums, ``pulled`` (M, 1 + C), and ``shares`` (N, 2), the sums of
+    sigma and sigma x error."""
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims
     g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors = gradients

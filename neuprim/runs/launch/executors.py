@@ -1,6 +1,6 @@
-"""Where tasks run: processes of this machine (concurrent.futures), a Ray cluster, or Slurm (submitit).
+"""Executors of tasks: processes of this machine (concurrent.futures), a Ray cluster, or Slurm (submitit).
 
-All machines of a cluster have neuprim and see the output directory under the same path.
+All machines of a cluster need neuprim, and the output directory under the same path.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _SLURM_MINUTES = 24 * 60
 
 
 class WorkerDied(Exception):
-    """The process that had a task is gone; the text says what is known."""
+    """The worker process of a task died; the text says what is known."""
 
 
 def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """(jobs at once, threads of each) on this machine.
+    """Return (parallel jobs, threads per job) on this machine.
 
     Raises:
-        ConfigError: together they would be more than the cores of this machine.
+        ConfigError: together they would need more than the cores of this machine.
     """
     cores, workers, threads = machine_cores(), settings.workers, settings.threads
     if workers is None:
@@ -61,10 +61,10 @@ def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int,
 
 
 def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """(jobs at once, threads of each, 0 for all) that a search may count on; raises as :func:`divide_cores_among_jobs`.
+    """Return (parallel jobs, threads per job, 0 for all) to plan with; raises as :func:`divide_cores_among_jobs`.
 
-    What a cluster has at a given time is unknown: there it is what the user says, else as many as this machine has
-    cores, with one thread.
+    The free resources of a cluster are unknown. There the user's settings count; the default is as many jobs as this
+    machine has cores, with one thread each.
     """
     if settings.name == "inline":
         return 1, settings.threads or 0
@@ -79,20 +79,20 @@ def _one_line(error: BaseException) -> str:
 
 
 def _cannot_begin(error: BaseException) -> JobResult:
-    """The result of a job whose worker lacks a package; errors of the job itself are results already."""
+    """Return the result of a job whose worker lacks a package; errors of the job itself are results already."""
     return JobResult("failed", line=f"the worker cannot do it: {str(error).strip().splitlines()[-1]}", trace=str(error))
 
 
 class ProcessExecutor:
-    """``launcher=processes``: workers that stay alive from one task to the next.
+    """Executor of ``launcher=processes``: worker processes that are reused from one task to the next.
 
     Each is a pool of one process: when the system kills a process, its pool breaks and no other.
 
     Args:
-        folder: for the workers' logs.
+        folder: folder for the workers' logs.
 
     Attributes:
-        workers: how many tasks it has at once. threads: of each.
+        workers: number of parallel tasks. threads: threads per task.
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:
@@ -114,7 +114,7 @@ class ProcessExecutor:
         return future
 
     def result(self, future: Future[JobResult]) -> JobResult:
-        """The result of a future that is done. Raises WorkerDied."""
+        """Return the result of a future that is done. Raises WorkerDied."""
         pool = self._busy.pop(future)
         try:
             result = future.result()
@@ -128,10 +128,10 @@ class ProcessExecutor:
         return result
 
     def cancel(self, future: Future[JobResult]) -> None:
-        """Remove a task from a queue, if it has not begun; here every task has, and stops by itself."""
+        """Remove a task that has not begun from the queue. Here there is no queue: tasks stop by themselves."""
 
     def close(self, now: bool) -> None:
-        """Release everything; ``now`` kills what still works."""
+        """Release all workers; ``now`` kills those that still work."""
         for pool in self._busy.values() if now else ():
             for process in list((pool._processes or {}).values()):
                 process.kill()
@@ -151,10 +151,10 @@ class ProcessExecutor:
 
 
 class RayExecutor:
-    """``launcher=ray``: tasks of Ray, on this machine or on a cluster.
+    """Executor of ``launcher=ray``: tasks of Ray, on this machine or on a cluster.
 
     Raises:
-        BackendUnavailable: nothing answers at the address, or no Ray.
+        BackendUnavailable: no Ray answers at the address.
         ConfigError: options that Ray refuses, or more threads than any of its machines has.
     """
 
@@ -228,7 +228,7 @@ def _check_ray_address(address: str) -> None:
 
 
 def _divide_ray_cluster_among_jobs(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """(jobs at once, threads of each); jobs that the cluster has no cores for wait in Ray's queue."""
+    """Return (parallel jobs, threads per job); jobs that the cluster has no cores for wait in Ray's queue."""
     machines = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if len(machines) == 1 and settings.address is None:
         return divide_cores_among_jobs(settings, jobs)
@@ -245,10 +245,10 @@ def _divide_ray_cluster_among_jobs(ray: Any, settings: LauncherSettings, jobs: i
 
 
 class SlurmExecutor:
-    """``launcher=slurm``: jobs of a Slurm cluster; submitit's local executor uses processes of this machine.
+    """Executor of ``launcher=slurm``: Slurm jobs, or with ``launcher.address=local`` processes of this machine.
 
     Args:
-        folder: where submitit keeps its files, which workers see.
+        folder: folder for submitit's files, which workers can access.
 
     Raises:
         BackendUnavailable: there is no Slurm here.

@@ -1,9 +1,9 @@
-"""Jobs, their results, how far they are, and the process that does one.
+"""Jobs, their status and results, and the worker process that performs a job.
 
-A job names a function and has plain values for it. A worker has its share of the cores; it and its launcher meet in a
-folder that both see, which works between processes, containers and machines alike: the status of a job is a file, and
-so is what stops it. This module imports nothing heavy, so that a worker can set its number of threads before libraries
-read it.
+A job names a function and has plain values as its arguments. A worker has its share of the cores. It communicates with
+its launcher by files in a shared folder: one has the status of a job, another one asks the worker to stop. This works
+between processes, containers and machines alike. This module imports nothing heavy, so that a worker can set its
+number of threads before libraries read it.
 """
 
 from __future__ import annotations
@@ -36,28 +36,28 @@ ENDED = ("done", "failed", "interrupted")
 """States of a job that is over."""
 
 _CACHE_VARIABLES = ("NEUPRIM_CACHE_DIR", "NUMBA_CACHE_DIR")
-"""A cluster may not pass them on."""
+"""Environment variables that the launcher passes to its workers; a cluster may not do that."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
-"""Libraries read them when they are loaded."""
+"""Environment variables with the number of threads; libraries read them when they are loaded."""
 
 _INTERVAL = 0.25
-"""Seconds between two looks at the status and at the file that stops the job."""
+"""Seconds between two checks of the status and of the file that stops the job."""
 
 _GRACE = 60.0
-"""Seconds that a worker has to write its checkpoint when its launcher is gone."""
+"""Seconds that a worker has to write its checkpoint after its launcher died."""
 
 _working = threading.Event()
 
 
 @dataclass(frozen=True)
 class LaunchJob:
-    """One piece of work.
+    """A function call that a worker performs.
 
     Attributes:
         name: unique among those launched together, and valid as a file name.
         call: ``module:function``, which is called with ``data``, the number of times that its worker died before, and a
-            listener of events. From the second time on it should continue where it was left.
+            listener of events. If its worker died before, it should continue where it was left.
         data: numbers, texts, lists, dictionaries and paths. Objects of plugins are named, not sent.
     """
 
@@ -68,15 +68,15 @@ class LaunchJob:
 
 @dataclass(frozen=True)
 class JobResult:
-    """How a job ended.
+    """Result of a job.
 
     Attributes:
         state: done, failed or interrupted.
         value: what its function returned.
         line: why it failed.
-        trace: of a bug; empty where the input is at fault.
+        trace: traceback of a bug; empty if the input is at fault.
         seconds: from its start to its end in the worker.
-        attempts: how often it was started.
+        attempts: number of starts.
     """
 
     state: str
@@ -89,13 +89,13 @@ class JobResult:
 
 @dataclass(frozen=True)
 class JobStatus:
-    """How far a job is.
+    """Status of a job.
 
     Attributes:
         state: waiting, starting, preparing, training, finishing, or one of :data:`ENDED`.
         text: what it does, or why it ended.
-        step, progress: of the training; the used fraction of its budget, 0..1.
-        psnr: held out, the last point of the curve, dB.
+        step, progress: training step, and the used fraction of the training's budget, 0..1.
+        psnr: last point of the held-out curve, dB.
         attempt: how often its worker died before.
     """
 
@@ -107,12 +107,12 @@ class JobStatus:
     attempt: int = 0
 
     def end(self, result: JobResult) -> JobStatus:
-        """The last status of a job with this result."""
+        """Return the last status of a job with this result."""
         return replace(self, state=result.state, text=result.line, attempt=result.attempts - 1)
 
 
 def perform_job(job: LaunchJob, attempt: int, events: Events) -> JobResult:
-    """Do a job in this process. Nothing is raised: errors are in the result."""
+    """Perform a job in this process and return its result, which includes errors and Ctrl-C."""
     start = time.monotonic()
 
     def result(state: str, value: Any = None, line: str = "", trace: str = "") -> JobResult:
@@ -134,7 +134,7 @@ def perform_job(job: LaunchJob, attempt: int, events: Events) -> JobResult:
 
 
 class StatusListener:
-    """Turns the events of a run into its status, and passes that on."""
+    """Event listener that turns the events of a run into its status, and passes it to ``on_status``."""
 
     def __init__(self, attempt: int = 0, on_status: Callable[[JobStatus], None] = lambda status: None) -> None:
         self.status, self._on_status = JobStatus("starting", attempt=attempt), on_status
@@ -158,7 +158,7 @@ class StatusListener:
 
 
 def write_status(file: Path, status: JobStatus) -> None:
-    """Replace the file. Errors are ignored: a full disk must not end a run because of its display."""
+    """Replace a status file. Errors are ignored: a full disk must not end a run because of its display."""
     staged = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         staged.write_text(json.dumps(asdict(status)), encoding="utf-8")
@@ -168,7 +168,7 @@ def write_status(file: Path, status: JobStatus) -> None:
 
 
 def read_status(file: Path) -> JobStatus | None:
-    """Return the status in a file; None where there is none that can be read."""
+    """Return the status in a file; None if the file is missing or cannot be read."""
     try:
         data: Any = load_json(file.read_text(encoding="utf-8"))
         return validate_settings(JobStatus, {f.name: data[f.name] for f in fields(JobStatus)})
@@ -180,24 +180,24 @@ def read_status(file: Path) -> JobStatus | None:
 
 
 def worker_cache_variables() -> dict[str, str]:
-    """Environment variables that a worker gets from its launcher."""
+    """Return the environment variables that a worker gets from its launcher."""
     return {name: os.environ[name] for name in _CACHE_VARIABLES if name in os.environ}
 
 
 def worker_environment(threads: int) -> dict[str, str]:
-    """Environment variables of a worker with so many threads."""
+    """Return the environment variables of a worker with this number of threads."""
     return worker_cache_variables() | dict.fromkeys(_THREAD_VARIABLES, str(threads))
 
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """A job with all that its worker needs; called in the worker.
+    """A job with everything that its worker needs; the worker calls it.
 
     Attributes:
         threads: its share of the cores.
         status: file for its status. stop: file whose presence asks it to stop.
         cwd: folder that relative paths refer to.
-        variables: of the environment, set before anything heavy is imported.
+        variables: environment variables, set before anything heavy is imported.
         attempt: how often its worker died before.
     """
 
@@ -210,7 +210,7 @@ class WorkerTask:
     attempt: int = 0
 
     def checkpoint(self) -> Any:
-        """What submitit queues when Slurm takes the machine away or its time is up: the task, which continues."""
+        """Return the continued task, which submitit queues when Slurm preempts the job or its time is up."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(replace(self, attempt=self.attempt + 1))
@@ -234,7 +234,7 @@ class WorkerTask:
 
 @contextmanager
 def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]:
-    """Have a thread write the task's status, and interrupt the main thread once the task shall stop."""
+    """Run a thread that writes the task's status, and interrupts the main thread when the stop file appears."""
     over, blocked = threading.Event(), _worker_blocks_interrupts()
 
     def watch() -> None:
@@ -294,7 +294,7 @@ def _interrupt_worker_main_thread(blocked: bool = False) -> None:
     """Interrupt the main thread as Ctrl-C does: a run finishes its step and writes a checkpoint.
 
     Args:
-        blocked: whether the main thread blocks that signal, as under Ray; then a wait of it ends first.
+        blocked: whether the main thread blocks that signal, as under Ray; then it first finishes a wait.
     """
     main = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and main is not None and not blocked:
@@ -304,8 +304,8 @@ def _interrupt_worker_main_thread(blocked: bool = False) -> None:
 
 
 def _worker_blocks_interrupts() -> bool:
-    """Whether the main thread, which calls this, blocks Ctrl-C. A process whose parent ignored it, as in the background
-    of a script, listens to it again."""
+    """Return whether the main thread, which calls this, blocks SIGINT. If SIGINT is ignored, as in the background of a
+    script, restore its default handler first."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return hasattr(signal, "pthread_sigmask") and signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -315,8 +315,8 @@ def _worker_blocks_interrupts() -> bool:
 
 
 def start_worker_process(log: Path, variables: Mapping[str, str]) -> None:
-    """Prepare a new process: it ignores the terminal's Ctrl-C, which the launcher passes on, writes its output to a
-    file, and ends when the launcher is gone."""
+    """Prepare a new process: it does not receive the terminal's Ctrl-C, which the launcher passes on, writes its output
+    to a file, and ends when the launcher is gone."""
     os.environ.update(variables)
     if hasattr(os, "setsid"):
         os.setsid()

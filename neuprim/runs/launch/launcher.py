@@ -29,7 +29,7 @@ from neuprim.runs.launch.jobs import (
 )
 
 LAUNCH_FOLDER = "launch"
-"""In a sweep's directory: statuses while it works, and the logs of workers that printed something."""
+"""Folder in a sweep's directory: status files while it works, and the logs of workers that printed something."""
 
 OnStatus = Callable[[int, JobStatus], None]
 """Called with the number of a job and its status, whenever it is new."""
@@ -38,7 +38,7 @@ OnResult = Callable[[int, JobResult], None]
 """Called with the number of a job and its result, before its last status."""
 
 _INTERVAL = 0.1
-"""Seconds between two looks at what is done."""
+"""Seconds between two checks of the running jobs."""
 
 
 def ignore_status(number: int, status: JobStatus) -> None:
@@ -46,7 +46,7 @@ def ignore_status(number: int, status: JobStatus) -> None:
 
 
 def check_launcher(settings: LauncherSettings, jobs: int) -> None:
-    """Refuse what cannot work, before anything is written.
+    """Raise an error if the launcher cannot work here, before anything is written.
 
     Raises:
         BackendUnavailable: the launcher needs a package that is not installed.
@@ -66,7 +66,7 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
 
 
 def use_launcher_threads_for_runs(settings: LauncherSettings) -> AbstractContextManager[None]:
-    """Give this process the threads of ``launcher.threads`` where runs work in it; otherwise it keeps its own."""
+    """Limit this process to ``launcher.threads`` if runs work in it (``launcher=inline``); otherwise do nothing."""
     own = settings.name == "inline" and settings.threads is not None
     return limit_process_threads(settings.threads or 1) if own else nullcontext()
 
@@ -79,13 +79,13 @@ def launch_jobs(
     on_result: OnResult = lambda number, result: None,
     stop_at_failure: bool = False,
 ) -> list[JobResult | None]:
-    """Do all jobs.
+    """Perform all jobs with a launcher.
 
     The first Ctrl-C stops every job as it stops a run, which finishes its step and writes a checkpoint; the second ends
     their processes.
 
     Args:
-        folder: where launcher and workers meet; every worker sees it under this path. It is removed afterwards, unless
+        folder: shared folder of launcher and workers, under the same path for all. It is removed afterwards, unless
             workers printed something.
         stop_at_failure: whether the first job that fails stops the others as Ctrl-C does.
 
@@ -120,7 +120,7 @@ def launch_jobs(
 def _launch_inline(
     jobs: Sequence[LaunchJob], on_status: OnStatus, on_result: OnResult, stop_at_failure: bool
 ) -> list[JobResult | None]:
-    """Do one job after the other in this process, up to the one that Ctrl-C or a failure ends."""
+    """Perform one job after the other in this process, until Ctrl-C or, with ``stop_at_failure``, a failure."""
     results = list[JobResult | None]([None] * len(jobs))
     for number, job in enumerate(jobs):
         listener = StatusListener(on_status=partial(on_status, number))
@@ -135,7 +135,7 @@ def _launch_inline(
 
 @dataclass
 class _JobLoop:
-    """Hand jobs to an executor, follow them, and collect their results."""
+    """Loop that submits jobs to an executor, follows their status, and collects their results."""
 
     executor: LaunchExecutor
     tasks: Sequence[WorkerTask]
@@ -175,7 +175,7 @@ class _JobLoop:
         return self.results
 
     def _step(self) -> None:
-        """Start what there is a worker for, and look at what is at work."""
+        """Submit waiting tasks to free workers, and check the running ones."""
         while self.waiting and len(self.running) < self.executor.workers:
             number, task = self.waiting.popleft()
             task.status.unlink(missing_ok=True)

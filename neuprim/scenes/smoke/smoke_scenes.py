@@ -66,7 +66,7 @@ class TurbulenceNoise:
         return torch.from_numpy(numbers.astype(np.float32))
 
     def field(self, channel: int, axes: Axes, cells: float, tempo: float, time: float) -> Tensor:
-        """(X, Y, Z) values."""
+        """Return (X, Y, Z) noise of one channel at a time in seconds."""
         phase = max(time, 0.0) * tempo
         key = math.floor(phase)
         angle = (phase - key) * math.pi / 2
@@ -76,18 +76,18 @@ class TurbulenceNoise:
         return torch.matmul(x, planes).reshape(len(x), len(y), len(z))
 
     def fractal(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 3) -> Tensor:
-        """Octaves of :meth:`field`, each twice as fine, half as strong and faster by half."""
+        """Sum octaves of :meth:`field`, each twice as fine, half as strong and 1.5 times as fast."""
         fields = (self.field(channel + 101 * k, axes, cells * 2**k, tempo * 1.5**k, time) for k in range(octaves))
         return torch.stack([field * 0.5**k for k, field in enumerate(fields)]).sum(0)
 
     def vector(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 2) -> Tensor:
-        """(3, X, Y, Z): three independent :meth:`fractal` fields."""
+        """Return three independent :meth:`fractal` fields, (3, X, Y, Z)."""
         channels = (channel + 1009 * (k + 1) for k in range(3))
         return torch.stack([self.fractal(c, axes, cells, tempo, time, octaves) for c in channels])
 
 
 def _smoke_lattice_weights(places: Tensor) -> Tensor:
-    """(n, _PERIOD) what each lattice node counts at each place; cubic fade, so that slopes are continuous."""
+    """Return (n, _PERIOD) lattice weights; a cubic fade makes slopes continuous."""
     lower = places.floor()
     part = places - lower
     part = part * part * (3 - 2 * part)
@@ -100,8 +100,10 @@ def _smoke_lattice_weights(places: Tensor) -> Tensor:
 
 
 class SmokeStage:
-    """A box, the coordinates of its cells' centres, the noise, and (X, Y, Z) ``fade`` per second: near the sides and
-    the top gas vanishes, so that nothing is cut off there."""
+    """Simulation box with coordinates of its cells' centres, noise, and (X, Y, Z) ``fade`` per second.
+
+    Near the sides and the top gas vanishes at the rate ``fade``, so that nothing is cut off there.
+    """
 
     def __init__(self, box: SmokeBox, seed: int) -> None:
         self.box, self.noise, self.axes = box, TurbulenceNoise(seed), box.axes()
@@ -113,7 +115,7 @@ class SmokeStage:
     def region(
         self, low: tuple[float, float, float], high: tuple[float, float, float]
     ) -> tuple[tuple[slice, slice, slice], Axes]:
-        """The cells whose centres lie in a box of the world (one at least per axis), and their coordinates."""
+        """Return slices and coordinates of the cells with centres in a world box, at least one per axis."""
         slices, axes = [], []
         for axis, (a, b) in enumerate(zip(low, high, strict=True)):
             line = self.axes[axis].reshape(-1)
@@ -127,8 +129,10 @@ class SmokeStage:
 
 @dataclass(frozen=True)
 class SmokeScene:
-    """A simulation: frames of the whole sequence, seconds between two of them, the grids that are written
-    (see the module), what the gas is like, and sources and forces at a time in seconds."""
+    """A simulated scene: number of frames, seconds per frame, grids to write, and gas.
+
+    The module describes the grids. ``forcing`` returns sources and forces at a time in seconds.
+    """
 
     name: str
     timesteps: int
@@ -144,7 +148,7 @@ class SmokeScene:
 
 
 def _soft_smoke_source_edge(distance: Tensor, width: float) -> Tensor:
-    """1 well inside (negative distance), 0 outside, smooth over ``width``."""
+    """Return a smooth step over ``width``: 1 well inside (negative distance), 0 outside."""
     t = (0.5 - distance / width).clamp(0, 1)
     return t * t * (3 - 2 * t)
 
@@ -261,7 +265,7 @@ def _force_ground_explosion(stage: SmokeStage, time: float) -> GasForcing:
 
 
 def _fade_out(time: float, end: float, length: float) -> float:
-    """1, then down to 0 at ``end`` over ``length`` seconds."""
+    """Return 1, falling linearly to 0 at ``end`` over the last ``length`` seconds."""
     return min(1.0, max(0.0, (end - time) / length))
 
 
@@ -281,7 +285,7 @@ GROUND_EXPLOSION = SmokeScene(
 
 
 def _whirl_axis(height: Tensor, time: float) -> tuple[Tensor, Tensor]:
-    """Where the whirl's axis passes at each height: the ground leads, the top follows later and wanders less."""
+    """Return x and y of the whirl's axis by height; the ground leads, the top follows and wanders less."""
     late = time - 0.55 * height
     reach = 0.13 * torch.exp(-0.35 * height)
     return reach * torch.sin(1.5 * late + 0.4), reach * torch.sin(1.05 * late + 2.0)
@@ -352,8 +356,8 @@ def simulate_smoke(
     Args:
         name: one of :data:`SMOKE_SCENES`.
         frames: number of frames from the start, at most :data:`MAX_TIMESTEPS`; None for all.
-        resolution: cells across the box, which is half as high again as it is wide.
-        seed: of the turbulence; not negative.
+        resolution: cells across the box, which is 1.5 times as high as wide.
+        seed: seed of the turbulence; not negative.
 
     Raises:
         ConfigError: unknown scene.
@@ -382,7 +386,7 @@ def simulate_smoke(
 
 
 def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -> str:
-    """Hash everything that the files depend on."""
+    """Return a hash of everything that the files depend on."""
     settings = {
         "version": SOLVER_VERSION,
         "scene": scene.name,
@@ -398,7 +402,7 @@ def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -
 
 
 def smoke_box(resolution: int) -> SmokeBox:
-    """The box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
+    """Return the box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
     return SmokeBox((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
 
 

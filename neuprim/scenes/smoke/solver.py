@@ -42,7 +42,7 @@ class SmokeBox:
     cell: float
 
     def axes(self) -> tuple[Tensor, Tensor, Tensor]:
-        """World coordinates of the cells' centres, (X, 1, 1), (1, Y, 1) and (1, 1, Z), float32."""
+        """Return float32 world coordinates of cell centres, (X, 1, 1), (1, Y, 1) and (1, 1, Z)."""
         x, y, z = (torch.arange(n, dtype=torch.float32) + 0.5 for n in self.shape)
         x, y = x - self.shape[0] / 2, y - self.shape[1] / 2
         return (x * self.cell).reshape(-1, 1, 1), (y * self.cell).reshape(1, -1, 1), (z * self.cell).reshape(1, 1, -1)
@@ -53,8 +53,10 @@ class SmokeBox:
 
     @cached_property
     def _modes(self) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Eigenvectors (n, n) of each axis' second difference, in columns, and the inverse eigenvalues (X, Y, Z) of the
-        Laplacian."""
+        """Eigenvectors (n, n), in columns, of each axis' second difference; inverse eigenvalues.
+
+        The latter, (X, Y, Z), are those of the Laplacian.
+        """
         vectors, total = [], torch.zeros(self.shape, dtype=torch.float64)
         for axis, (count, (low, high)) in enumerate(zip(self.shape, _ENDS, strict=True)):
             side = torch.ones(count - 1, dtype=torch.float64)
@@ -68,7 +70,7 @@ class SmokeBox:
         return tuple(vectors), 1 / total
 
     def solve_pressure(self, right: Tensor) -> Tensor:
-        """(X, Y, Z) float64: the pressure whose Laplacian is ``right``."""
+        """Return the (X, Y, Z) float64 pressure whose Laplacian is ``right``."""
         (x, y, z), inverse = self._modes
         return _apply_smoke_solver_modes(_apply_smoke_solver_modes(right.double(), x.T, y.T, z.T) * inverse, x, y, z)
 
@@ -79,13 +81,13 @@ def _apply_smoke_solver_modes(field: Tensor, x: Tensor, y: Tensor, z: Tensor) ->
 
 
 def flow_divergence(velocity: Faces, box: SmokeBox) -> Tensor:
-    """(X, Y, Z) float64, in 1/s: what flows out of each cell per volume."""
+    """Return the (X, Y, Z) float64 divergence, 1/s: the net outflow of each cell per volume."""
     u, v, w = (component.double() for component in velocity)
     return ((u[1:] - u[:-1]) + (v[:, 1:] - v[:, :-1]) + (w[:, :, 1:] - w[:, :, :-1])) / box.cell
 
 
 def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
-    """The divergence-free part of a flow: u - grad p with laplace p = div u, and nothing through the ground."""
+    """Return the divergence-free part of a flow, u - grad p with laplace p = div u; closed at the ground."""
     u, v, w = velocity
     w = w.clone()
     w[:, :, 0] = 0
@@ -93,15 +95,15 @@ def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
 
 
 def expansion_flow(source: Tensor, box: SmokeBox) -> Faces:
-    """The irrotational flow with divergence ``source`` (X, Y, Z) in 1/s: how gas that is heated pushes the rest away.
+    """Return the irrotational flow with divergence ``source`` (X, Y, Z), 1/s, as of heated gas.
 
-    Kept apart from the divergence-free flow: added for transport alone, it does not outlast its cause.
+    It is added for transport alone and not to the divergence-free flow, so that it does not outlast its cause.
     """
     return _subtract_gradient(box.air_at_rest(), -box.solve_pressure(source), box)
 
 
 def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Faces:
-    """velocity - grad pressure, in float32; faces of the ground keep their values."""
+    """Return velocity - grad pressure, in float32; faces of the ground keep their values."""
     parts = []
     for axis, (component, (low, high)) in enumerate(zip(velocity, _ENDS, strict=True)):
         first, last = pressure.narrow(axis, 0, 1), pressure.narrow(axis, -1, 1)
@@ -111,13 +113,13 @@ def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Face
 
 
 def _smoke_solver_flow_at_centres(velocity: Faces) -> Tensor:
-    """(3, X, Y, Z) velocity at the cells' centres, the mean of opposite faces."""
+    """Return the (3, X, Y, Z) velocity at the cells' centres, the mean of opposite faces."""
     u, v, w = velocity
     return torch.stack([u[1:] + u[:-1], v[:, 1:] + v[:, :-1], w[:, :, 1:] + w[:, :, :-1]]).mul_(0.5)
 
 
 def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
-    """Faces between two cells get the mean of both, those at the ends the cell's own."""
+    """Interpolate from centres to faces: the mean of both cells; at the ends the cell's own value."""
     parts = []
     for axis, field in enumerate(centred):
         first, last, count = field.narrow(axis, 0, 1), field.narrow(axis, -1, 1), field.shape[axis] - 1
@@ -131,7 +133,7 @@ def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
 
 @dataclass(frozen=True)
 class GasProperties:
-    """What the gas is like.
+    """Properties of the gas and settings of the solver.
 
     Attributes:
         buoyancy: upward acceleration at temperature 1.
@@ -164,7 +166,7 @@ class GasProperties:
 
 @dataclass(frozen=True)
 class GasState:
-    """The gas ``time`` seconds after the start.
+    """State of the gas ``time`` seconds after the start.
 
     Attributes:
         velocity: at the faces, free of divergence.
@@ -182,13 +184,13 @@ class GasState:
 
     @staticmethod
     def clear_air(box: SmokeBox, coloured: bool = False) -> GasState:
-        """Clear, cold air at rest."""
+        """Return clear, cold air at rest."""
         zeros = torch.zeros(box.shape)
         return GasState(box.air_at_rest(), zeros, zeros, zeros, torch.zeros(3, *box.shape) if coloured else None)
 
 
 class GasSource(NamedTuple):
-    """A place where gas takes given values. What is None is left alone.
+    """A region where gas approaches given values. Fields that are None do not change.
 
     Attributes:
         where: slices of the cells that the fields cover.
@@ -208,7 +210,7 @@ class GasSource(NamedTuple):
 
 
 class GasForcing(NamedTuple):
-    """What a scene does to the gas at one time.
+    """Sources and forces that act on the gas at one time.
 
     Attributes:
         sources: applied in order.
@@ -224,7 +226,7 @@ class GasForcing(NamedTuple):
 
 
 def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
-    """As many equal steps over ``time`` seconds as the fastest gas needs."""
+    """Advance the gas by ``time`` seconds in as many equal steps as its speed needs, up to ``most_steps``."""
     fastest = max(float(component.abs().max()) for component in state.velocity)
     count = min(max(math.ceil(fastest * time / box.cell / settings.cfl), 1), settings.most_steps)
     for _ in range(count):
@@ -233,7 +235,7 @@ def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing
 
 
 def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
-    """The gas ``time`` seconds later; its velocity is free of divergence, to rounding."""
+    """Advance the gas by one step of ``time`` seconds; the result is free of divergence, to rounding."""
     before = _smoke_solver_flow_at_centres(state.velocity)
     wind = before
     making = forcing.expansion
@@ -244,7 +246,7 @@ def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: G
         wind = before + _smoke_solver_flow_at_centres(expansion_flow(making, box))
     scalars = torch.stack([state.density, state.temperature, state.fuel])
     fields = [before, scalars] if state.colour is None else [before, scalars, state.colour]
-    # The velocity stays blurred: sharp, it gathers motion of the finest scale, which shows as streaks along the axes.
+    # The velocity is not sharpened: that collects motion of the finest scale, which shows as streaks along the axes.
     moved = advect_field(torch.cat(fields), wind, time, box.cell, blurred=3)
     after = moved[:3]
     density, temperature, fuel = _burn_fuel(moved[3], moved[4], moved[5], settings, time)
@@ -281,7 +283,10 @@ def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: G
 def _burn_fuel(
     density: Tensor, temperature: Tensor, fuel: Tensor, settings: GasProperties, time: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), so flames end sharply; then the gas cools."""
+    """Burn fuel, then cool the gas.
+
+    The rate is constant (Nguyen, Fedkiw and Jensen 2002), so that flames end sharply.
+    """
     burnt = fuel.clamp_max(settings.burn * time)
     density = density + (2 * settings.soot) * burnt * (1 - fuel).clamp_min(0)  # most of it at the flame's end
     temperature = temperature + settings.heat * burnt
@@ -293,8 +298,11 @@ def _burn_fuel(
 def _gas_acceleration(
     velocity: Tensor, density: Tensor, temperature: Tensor, settings: GasProperties, box: SmokeBox
 ) -> Tensor:
-    """(3, X, Y, Z) acceleration: buoyancy, weight, and vorticity confinement e h (N x w) with w = curl u and N =
-    grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001), which gives small eddies back what interpolation takes."""
+    """Return (3, X, Y, Z) acceleration: buoyancy, weight and vorticity confinement e h (N x w).
+
+    w = curl u and N = grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001). Confinement restores the small eddies that
+    interpolation damps.
+    """
     if settings.confinement:
         w = _vorticity(velocity, box.cell)
         size = (w * w).sum(0).sqrt()
@@ -309,7 +317,7 @@ def _gas_acceleration(
 
 
 def _central_difference(field: Tensor, axis: int, cell: float) -> Tensor:
-    """Central difference along one axis, zero in the first and last cell."""
+    """Return the central difference along one axis, zero in the first and last cell."""
     result = torch.zeros_like(field)
     count = field.shape[axis] - 2
     result.narrow(axis, 1, count).copy_((field.narrow(axis, 2, count) - field.narrow(axis, 0, count)) * (0.5 / cell))
@@ -323,7 +331,7 @@ def _vorticity(velocity: Tensor, cell: float) -> Tensor:
 
 
 def _apply_source(state: GasState, velocity: Tensor, source: GasSource, time: float) -> tuple[GasState, Tensor]:
-    """State and velocity at the centres after a source has worked for ``time`` seconds."""
+    """Return state and velocity at the centres after a source has acted for ``time`` seconds."""
     share = 1 - torch.exp(-source.rate * time)
 
     def towards(field: Tensor, value: Tensor | float) -> Tensor:
@@ -346,23 +354,29 @@ def _apply_source(state: GasState, velocity: Tensor, source: GasSource, time: fl
 # ---------------------------------------------------------------- transport
 
 _SLAB = 1 << 15  # cells worked on at once: their stencils stay in a CPU's cache, which is twice as fast
-_INVISIBLE = 1e-4  # most of a box holds no more, and need not be corrected
+_INVISIBLE = 1e-4  # values up to this are not corrected; most of a box holds no more
 
 
 class _SmokeSolverStencil(NamedTuple):
-    """Rows of a table (X * Y * Z, C) around N points. ``embedding_bag`` sums them several times faster than
-    ``grid_sample`` in three dimensions, with the same result for any number of threads."""
+    """Trilinear stencils of N points in a table (X * Y * Z, C).
+
+    ``embedding_bag`` sums them several times faster than ``grid_sample`` in three dimensions, with the same result for
+    any number of threads.
+    """
 
     rows: Tensor  # (N, 8) int32, the cells around each point; the first is the lowest corner
     weights: Tensor  # (N, 8) float32, trilinear
 
     def read(self, table: Tensor) -> Tensor:
-        """(N, C) interpolated values of a contiguous table (X * Y * Z, C)."""
+        """Return (N, C) interpolated values of a contiguous table (X * Y * Z, C)."""
         return embedding_bag(self.rows, table, per_sample_weights=self.weights, mode="sum")
 
 
 def _smoke_solver_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _SmokeSolverStencil:
-    """Of points given as three tensors (N,) in cells, the first centre at 0; clamped to the outermost centres."""
+    """Return the stencils of points, given as three (N,) tensors in cells.
+
+    The first centre is at 0; points are clamped to the outermost centres.
+    """
     lower, parts = [], []
     for along, count in zip(points, shape, strict=True):
         inside = along.clamp(0, count - 1)
@@ -384,16 +398,16 @@ def _smoke_solver_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> 
 
 
 def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
-    """(C, X, Y, Z) fields, carried for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second.
+    """Advect (C, X, Y, Z) fields for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second.
 
     Traces back with the midpoint rule, then corrects the interpolation's blur (MacCormack; Selle, Fedkiw, Kim, Liu and
     Rossignac 2008, "An unconditionally stable MacCormack method"): carry forward, carry back, add half the difference
-    to what it started as,
+    from the original,
 
         q1 = A(q),   q2 = A^-1(q1),   q' = q1 + (q - q2) / 2,
 
     limited to the values of the eight cells that ``q1`` is made of, so that no new extremum can appear. The first
-    ``blurred`` fields are left uncorrected, as are cells with next to nothing in the others.
+    ``blurred`` fields are left uncorrected, as are cells with negligible values in all others.
     """
     shape = (fields.shape[1], fields.shape[2], fields.shape[3])
     table, winds = (x.reshape(len(x), -1).T.contiguous() for x in (fields, velocity))
@@ -416,7 +430,7 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
     blurry = carried[:, blurred:].contiguous()
 
     def correct(at: Tensor) -> None:
-        # The wind half a step ahead is not sampled but extrapolated: as much more than here as the one behind is less.
+        # The wind half a step ahead is not sampled but extrapolated from those here and half a step behind.
         step = scale * (2 * winds.index_select(0, at) - behind.index_select(0, at))
         ahead = [axis.index_select(0, at) + step[:, k] for k, axis in enumerate(cells)]
         gone = sharp.index_select(0, at) - _smoke_solver_stencil(ahead, shape).read(blurry)
@@ -433,19 +447,22 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
 
 
 def _advect_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
-    """Calls that write to different places, in threads of our own: torch's threads wait for each other in a busy loop
-    after every operation, which on a busy machine takes many times longer than the work."""
+    """Run jobs that write to different places in threads of our own.
+
+    Torch's threads wait for each other in a busy loop after every operation, which on a busy machine takes many times
+    longer than the work.
+    """
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         list(pool.map(work, jobs))
 
 
 @lru_cache(maxsize=2)
 def _smoke_solver_cell_indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...]:
-    """Indices along each axis of the cells in a table's rows, three of (X * Y * Z,) float32."""
+    """Return the cell indices of a table's rows along each axis, three of (X * Y * Z,) float32."""
     axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in shape), indexing="ij")
     return tuple(axis.reshape(-1) for axis in axes)
 
 
 def _smoke_solver_stencil_offsets(shape: tuple[int, int, int]) -> list[int]:
-    """How many rows of a table the eight cells of a stencil lie after the first."""
+    """Return the offsets, in rows of a table, of a stencil's eight cells from the first."""
     return [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]

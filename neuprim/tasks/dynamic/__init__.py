@@ -104,7 +104,7 @@ def parse_dynamic_time(text: str) -> list[Tensor]:
 
 
 def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
-    """The volume sequence that the images were rendered from; None if there is none.
+    """Return the volume sequence that the images were rendered from; None if there is none.
 
     Raises:
         DatasetFault: the dataset's ``extra`` is something else.
@@ -117,13 +117,13 @@ def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
 
 
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Pixels that show matter in some frame of the view's camera."""
+    """Return pixels with matter in any frame of the view's camera; None without a volume sequence."""
     recording = vdb_recording_of(dataset)
     return None if recording is None else recording.matter_mask(index)
 
 
 def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
-    """One film of all frames per test camera."""
+    """Return one video clip of all frames per test camera."""
     recording = vdb_recording_of(dataset)
     if recording is None:
         return ()
@@ -149,10 +149,10 @@ def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str,
 
 
 def invisible_fraction_over_time(model: Primitives, times: Sequence[Tensor]) -> float:
-    """Share of primitives whose opacity along each of their axes stays below 1/255 at all of these times.
+    """Return the share of primitives with opacity below 1/255 along all axes, at all ``times``.
 
-    The chord along axis j through the centre has half length s_j, so that I = (N_p s_j/m) (b2 + sum_k w2_k cos(omega0
-    b1_k) B_p(omega0 W1_k . r_j s_j/m)) with r_j the axis' direction (:mod:`neuprim.core.model.edge`).
+    The chord along axis j through the centre has half length s_j, so its optical depth is I = (N_p s_j/m) (b2 + sum_k
+    w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)), r_j the axis' direction (:mod:`neuprim.core.model.edge`).
     """
     most_opaque = torch.zeros(model.count, dtype=torch.float64)
     density, params = model.density, {k: v.detach() for k, v in model.of(model.density).items()}
@@ -198,7 +198,7 @@ _LAYERS = (
 
 
 def _import_dynamic_function(module: str, function: str) -> Callable[..., Any]:
-    """A function of a module of this task; loaders pull in many modules that other commands do not need."""
+    """Return a function that imports its module when called, as loaders need many modules."""
 
     def call(*arguments: Any) -> Any:
         return getattr(import_module(f"{__package__}.{module}"), function)(*arguments)

@@ -23,17 +23,16 @@ FREQUENCIES = {"periods": 2 * math.pi, "printed": 1.0}
 
 _TIME_TENSORS = ("time_poly", "time_cos", "time_sin")
 
-_FITTED_TIMES = 256  # at which fewer terms are fitted to all terms
+_FITTED_TIMES = 256  # sampled times at which fewer terms are fitted to all terms
 _MIN_SINGULAR = 1e-7  # relative singular value of a fit; weaker coefficients would not survive float32
 
 
 class TimeHarmonics(ColourField):
-    """c = max(0, C0 S(xi) + sum of higher bands + 1/2), S(xi) = S0 + sum_i a_i xi^i + sum_i b_i cos(w i xi) + c_i sin(w
-    i xi).
+    """SH colour with a lowest band that changes in time: c = max(0, C0 S(xi) + higher bands + 1/2).
 
-    Per channel 1 + n + 2 l parameters in the zero-order coefficient, i = 1..n and 1..l; the higher bands do not change.
-    With n = l = 4, three channels and degree 3: 84 parameters, 39 at degree 0. ``frequencies`` chooses w, see
-    :data:`FREQUENCIES`.
+    S(xi) = S0 + sum_i a_i xi^i + sum_i (b_i cos(w i xi) + c_i sin(w i xi)), i = 1..n and 1..l. S has 1 + n + 2 l
+    parameters per channel; the higher bands do not change. With n = l = 4, three channels and degree 3: 84 parameters,
+    39 at degree 0. ``frequencies`` chooses w, see :data:`FREQUENCIES`.
     """
 
     def __init__(
@@ -96,7 +95,7 @@ class TimeHarmonics(ColourField):
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
-        """Basis of each tensor at a time, float64."""
+        """Return the float64 basis functions of each tensor at time ``xi``."""
         turn = FREQUENCIES[self.frequencies] * xi
         waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
@@ -106,16 +105,16 @@ class TimeHarmonics(ColourField):
         return self.lowest_band(params, conditions), params.get("sh_rest")
 
     def lowest_band(self, params: Params, conditions: Conditions) -> Tensor:
-        """(N, C) S(xi)."""
+        """Return (N, C) S(xi), the zero-order coefficient at the frame's time."""
         dc, xi = params["sh_dc"], get_frame_time(conditions)
-        terms = self._terms(xi) if self.powers or self.waves else {}  # a frame of still colours computes none
+        terms = self._terms(xi) if self.powers or self.waves else {}  # none if colours do not change in time
         for name, basis in terms.items():
             if name in params:
                 dc = dc + (params[name] * device.to_device_like(basis, dc)[:, None]).sum(1)
         return dc
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Coefficients of the direction, per channel, and single terms in time."""
+        """Return one unit per coefficient of the direction and channel, and one per term in time."""
         terms = ((name, i) for name, count in self._term_counts() for i in range(count))
         units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
         return (*sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest"), *units)

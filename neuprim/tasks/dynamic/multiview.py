@@ -92,7 +92,7 @@ def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) ->
 def _read_timed_frames(
     options: MultiviewSettings, document: JsonReader, records: list[JsonReader], time_range: _TimeRange
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """The frames with their times 0..1, and their records."""
+    """Return the records, and their frames with the condition "time", 0..1."""
     layout = TransformsLayout(
         keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True
     )
@@ -109,7 +109,7 @@ def _read_timed_frames(
 
 
 def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _TimeRange:
-    """The times of these records that become 0 and 1; files of further splits count for "auto" only.
+    """Return the times that become 0 and 1; ``others``, further splits, count for "auto" only.
 
     Raises:
         DataError: a frame without a time, times that are no finite numbers or out of range, "auto" with a single time.
@@ -149,7 +149,7 @@ def _read_time(record: JsonReader) -> float:
 
 
 def _parse_multiview_time_range(value: str) -> _TimeRange:
-    """The two numbers of "LOW:HIGH"; ValueError where it is something else."""
+    """Return the two numbers of "LOW:HIGH"; raises ValueError for other text."""
     low, high = (float(part) for part in value.split(":"))
     if not (math.isfinite(low) and math.isfinite(high) and low < high and math.isfinite(high - low)):
         raise ValueError(value)
@@ -183,7 +183,7 @@ class MultiviewSettings(FolderSettings):
 
 # ---------------------------------------------------------------- starting points
 
-_MIN_SHARED = 2  # cameras per time for a hull of a single time; with fewer, neighbours in time are added
+_MIN_SHARED = 2  # least cameras per time for a hull of a single time; with fewer, neighbours in time are added
 _RUN_LENGTH = 4  # neighbours in time
 _MAX_MOMENTS = 64
 _RESOLUTION = 64
@@ -192,12 +192,12 @@ _MIN_OPACITY = 0.1  # least opacity of matter; the edges of smoke are seldom mor
 
 
 def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """At most ``count`` distinct starting points of a moving scene, in scene units and the images' colour space.
+    """Return at most ``count`` distinct starting points of a moving scene.
 
-    Visual hulls of single moments are united over time; one hull of all masks would carve away whatever moves. If
-    several cameras share each time, a moment is one time. If every image has its own time, as in D-NeRF, a moment is a
-    run of four neighbours in time: a thing that moves by less than its own size meanwhile keeps its middle, and the
-    next, overlapping runs supply the rest.
+    They are in scene units and the images' colour space. Visual hulls of single moments are united over time; one hull
+    of all masks would carve away whatever moves. If several cameras share each time, a moment is one time. If every
+    image has its own time, as in D-NeRF, a moment is a run of four neighbours in time: an object that moves by less
+    than its size during a run keeps its middle, and the next, overlapping runs supply the rest.
 
     Points lie on the surfaces of these hulls, each with the "time" and the colour of one moment. Cameras without a
     common target give points along rays. Without alpha, or if every image has its own time and all hulls are empty,
@@ -222,7 +222,7 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
 
 
 def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
-    """Points on the hulls; None if every image has its own time and all hulls are empty."""
+    """Return points on the hulls; None if every image has its own time and all hulls are empty."""
     moments, shared = _choose_moments(times)
     surfaces, owners, sides = [], [], []
     empty: EmptyHull | None = None
@@ -259,7 +259,7 @@ def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: to
 
 
 def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
-    """(views, time) of at most _MAX_MOMENTS moments in order of time; and whether moments are single times."""
+    """Return at most _MAX_MOMENTS (views, time) in order of time, and whether each is one time."""
     values = times.tolist()
     sharing = Counter(values)
     shared = float(np.median(list(sharing.values()))) >= _MIN_SHARED
@@ -275,7 +275,7 @@ def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]
 
 
 def _draw_moving_point_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
-    """Rows of one random point in every cubic cell with points: things at rest are found in all moments."""
+    """Return one random row per occupied cubic cell, as static surfaces repeat in all moments."""
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()
     _, first = np.unique(cells, axis=0, return_index=True)

@@ -1,4 +1,4 @@
-"""Colour of smoke and fire that scatter a light and know it: :class:`ScatteringHarmonics`."""
+"""Colour of smoke and fire that scatter a light given as a condition: :class:`ScatteringHarmonics`."""
 
 from __future__ import annotations
 
@@ -23,12 +23,17 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 
 SHINES = "shines"
-"""Condition of a frame, 0 or 1, that is one of several which add up: whether it has what shines by itself."""
+"""Condition, 0 or 1: whether a frame includes emission; of several frames to be summed, one does."""
 
 
 def light_smoke_by_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
-    """As :func:`~neuprim.core.light_conditions.lights_from_environment`; smoke shines by itself under the first light
-    alone."""
+    """Return the lights of an environment, with emission under the first light only.
+
+    See :func:`~neuprim.core.light_conditions.lights_from_environment`.
+
+    Raises:
+        DataError: the model was not trained with several lights.
+    """
     if "lights" not in facts:
         raise DataError("--environment: this model has one light baked in; expected one trained with scene.lights=4")
     found = lights_from_environment(environment, count, facts)
@@ -37,12 +42,12 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 
 
 class ScatteringHarmonics(TimeHarmonics):
-    """c = TimeHarmonics(xi, d) + T max(0, a) E/typical: what shines by itself, and single scattering of one light.
+    """Emission plus single scattering of one light, c = TimeHarmonics(xi, d) + T max(0, a) E/typical.
 
     a (C,) per primitive is its albedo, times the share of its extinction that scatters, times the isotropic phase
     function 1/4 pi. T is the transmittance of the model's own extinction from the primitive's centre to the light
     (:func:`~neuprim.core.render.light.shade_volume_by_light`), without gradient; E is the condition
-    ``light_intensity``, the light's irradiance as it arrives, and ``typical`` that of a usual training light.
+    ``light_intensity``, the light's irradiance as it arrives, and ``typical`` that of a typical training light.
     """
 
     def __init__(self, *settings: Any, typical: float = 1.0, **more: Any) -> None:
@@ -60,7 +65,7 @@ class ScatteringHarmonics(TimeHarmonics):
         return [dc, scattered, *others]
 
     def harmonics(self, params: Params, conditions: Conditions) -> None:
-        """None: light is in no harmonics."""
+        """Return None: scattered light cannot be given by harmonics."""
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
         return lowest_band_colors(self.lowest_band(params, conditions))

@@ -1,4 +1,4 @@
-"""Cosine density that changes in time. The density of one frame is a static one. Parts that vary, joined by "+":
+"""Cosine density that changes in time; in one frame it is a static one. Parts that can vary, joined by "+":
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
@@ -44,7 +44,7 @@ from neuprim.core.model.rows import cosine_gain_backward
 from neuprim.core.model.schema import InitContext, ParameterSpec, Params
 
 TIME_PARTS = ("phase", "offset", "window", "motion")
-"""What may vary in time."""
+"""Parts of the density that can vary in time."""
 
 OFFSET_TERMS = 4
 _OFFSETS, _MOTION = ("offset_cos", "offset_sin"), ("velocity", "acceleration")
@@ -55,14 +55,14 @@ ChunkOverlaps = tuple[tuple[float, float], ...]
 
 
 def get_frame_time(conditions: Conditions) -> Tensor:
-    """The frame's time xi, a 0-dim float64 tensor. Raises KeyError if the frame has no condition "time"."""
+    """Return the frame's time xi, 0-dim float64; raises KeyError without a condition "time"."""
     if "time" not in conditions:
         raise KeyError("a dynamic model needs the condition 'time'")
     return conditions["time"].detach().double().reshape(())
 
 
 def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
-    """Overlaps as tuples. Raises ValueError unless they are pairs of ascending times, one after the other."""
+    """Return overlaps as tuples; raises ValueError unless all times ascend."""
     try:
         overlaps = tuple((float(begin), float(end)) for begin, end in seams)
     except (TypeError, ValueError):
@@ -74,10 +74,10 @@ def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverl
 
 
 def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
-    """Weights 0 to 1 at time ``xi`` () of primitives of these chunks, float64 in the shape of ``chunk``.
+    """Return the chunks' weights 0..1 at time ``xi`` (), float64 in the shape of ``chunk``.
 
     Args:
-        chunk: numbers from 0 to len(overlaps), any dtype; rounded, as compressed files may change them slightly.
+        chunk: chunk numbers from 0 to len(overlaps), any dtype; rounded, as compressed files may change them slightly.
     """
     numbers = chunk.detach().double().round()
     weights = torch.ones_like(numbers)
@@ -88,9 +88,9 @@ def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Te
 
 
 class TimeDensity(DensityField):
-    """f(x~, xi) of K cosine neurons whose ``time`` parts vary (see the module); 5K + 1 parameters and the parts'.
+    """Density f(x~, xi) of K cosine neurons with ``time`` parts (see the module); 5K + 1 parameters and the parts'.
 
-    ``init`` of the model settings: as :class:`~neuprim.core.model.cosine.CosineDensity`, and
+    Keys of the setting ``model.init``: those of :class:`~neuprim.core.model.cosine.CosineDensity`, and
 
     * ``window``: half width tau of a new window, in units of the sequence;
     * ``window_frames``: largest tau in frames;
@@ -220,7 +220,7 @@ class TimeDensity(DensityField):
         return self.static.from_gaussians(alphas)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Fewer neurons, and each part of time, which is either there or not."""
+        """Return smaller numbers of neurons, and 0, i.e. removal, for each part of time."""
         return self.static.reductions() | {part: (0,) for part in TIME_PARTS if part in self.parts}
 
     def reduce(
@@ -236,7 +236,7 @@ class TimeDensity(DensityField):
         return field, {key: value for key, value in remaining.items() if key in kept}
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Neurons, and all that changes in time except windows, without which nothing would be left."""
+        """Return units of neurons, offset and motion per axis; zeros would not remove a window."""
         rates = ("W_t",) if "phase" in self.parts else ()
         units = [
             PrunableUnit(unit.name, {**unit.places, **dict.fromkeys(rates, unit.places["b1"])})
@@ -260,7 +260,7 @@ class TimeDensity(DensityField):
 
 
 def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
-    """b1 + xi W_t without whole turns of 2 pi/omega0; float32-exact also for times far outside 0..1."""
+    """Return b1 + xi W_t modulo 2 pi/omega0; float32-exact also for times far outside 0..1."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
@@ -270,14 +270,17 @@ def _zero_time_parameters(width: int) -> Any:
 
 
 def _initial_time_window_center(ctx: InitContext) -> Tensor:
-    """The starting point's time, else a random one, evenly distributed over the sequence."""
+    """Return the starting points' times, else random ones, uniform over the sequence."""
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
     return (ctx.uniform(1) + 1) / 2
 
 
 def _initial_log_time_window(ctx: InitContext) -> Tensor:
-    """Limit new windows to a number of frames: a longer sequence shows more events, not longer ones."""
+    """Return (N, 1) log half widths of new windows.
+
+    They are limited in frames, as longer sequences show more events, not longer ones.
+    """
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
         half = min(half, ctx.number("window_frames", 1.0, 0) * ctx.steps["time"])
@@ -286,16 +289,17 @@ def _initial_log_time_window(ctx: InitContext) -> Tensor:
 
 # ---------------------------------------------------------------- dropping a part of time
 
-_MEAN_TIMES = 128  # of a mean: the middles of as many equal parts of the sequence
+_MEAN_TIMES = 128  # times of a mean: the middles of as many equal parts of the sequence
 _MIDDLE = 0.5  # reference time of motion without a window
 
 
 def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
-    """The tensors of a :class:`TimeDensity` with one part replaced by its mean over the sequence, and "means" if moved.
+    """Return a :class:`TimeDensity`'s tensors with one part replaced by its mean in time.
 
-    Means are over xi in 0..1, weighted by the window if there is one. A phase that advances by a over the sequence,
-    cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of e^(i xi a). A window leaves its mean
-    factor, a motion its mean position. The dropped part's own tensors are still in the result.
+    They include "means" if these move. Averages are over xi in 0..1, weighted by the window if there is one. A phase
+    that advances by a over the sequence, cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of
+    e^(i xi a). A window leaves its mean factor, a motion its mean position. The dropped part's own tensors are still in
+    the result.
     """
     if part == "phase":
         return {**params, **_mean_phase_over_time(params, omega0)}
@@ -309,13 +313,13 @@ def _sequence_mean_times(like: Tensor) -> Tensor:
 
 
 def _time_window_factor(params: Params, xi: Tensor) -> Tensor:
-    """(N, 1) factors of the windows at a time."""
+    """Return the (N, 1) factors of the windows at time ``xi``."""
     u = (xi - params["window_center"].double()) / params["log_window"].double().exp()
     return (1 - u * u).clamp_min(0.0).square()
 
 
 def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
-    """(time, (N, 1) weights), which add up to 1."""
+    """Return pairs (time, (N, 1) weights); the weights of a primitive add up to 1."""
     times = _sequence_mean_times(params["b1"])
     if "window_center" not in params:
         even = torch.full_like(params["b2"].double(), 1.0 / _MEAN_TIMES)
@@ -374,7 +378,7 @@ WINDOW_EDGE = 2  # exponent of the window in time
 
 @exact_kernel
 def _rows_in_time_window_kernel(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
-    """How many there are; ``rows`` begins with them."""
+    """Write the rows whose window contains ``xi`` to the start of ``rows``; return their number."""
     found = 0
     for n in range(center.shape[0]):
         if abs(xi - np.float64(center[n, 0])) < np.exp(np.float64(log_window[n, 0])):
@@ -384,7 +388,10 @@ def _rows_in_time_window_kernel(center, log_window, xi, rows):  # type: ignore[n
 
 
 def rows_in_time_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
-    """Ascending int64 rows of (N, 1) tensors with abs(xi - center) < exp(log_window), in float64; no gradient."""
+    """Return ascending int64 rows with |xi - center| < exp(log_window), computed in float64.
+
+    The tensors are (N, 1); there is no gradient.
+    """
     center, log_window = center.detach(), log_window.detach()
     if not device.on_numba(center, log_window):
         return ((xi - center[:, 0].double()).abs() < log_window[:, 0].double().exp()).nonzero()[:, 0]
@@ -415,7 +422,7 @@ class _TimeWindow(torch.autograd.Function):
 
 
 def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
-    """(w2, b2) (N, K) and (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
+    """Return w2 (N, K) and b2 (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
 
     ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
     """
@@ -454,7 +461,7 @@ class _MoveInTime(torch.autograd.Function):
 
 
 def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
-    """(N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
+    """Return (N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
 
     ``center`` is (N, 1); all are of one dtype. No gradient for the time ``xi`` ().
     """

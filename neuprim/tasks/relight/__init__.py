@@ -1,7 +1,7 @@
-"""The relighting task: images under one point light each in, a model that takes any light out.
+"""The relighting task: fit images under one point light each, render under any light.
 
-Images are linear light over the exposure, in which 1 is as bright as a display shows. Scores clamp them to 0..1 first,
-as one highlight of 20 would dominate an image's error. "linear_clamped" compares these values, "display" their sRGB
+Images are linear light over the exposure; 1 is the brightest value of a display. Scores clamp them to 0..1 first, as
+one highlight of 20 would dominate an image's error. "linear_clamped" compares these values, "display" their sRGB
 values. FLIP is measured where its package is installed (``neuprim[flip]``).
 """
 
@@ -40,7 +40,7 @@ _OF_FORM: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FORMS, _NETWORK),
     "harmonics": {"degree": 5},
 }
-"""Settings of each form of colour, with what they are where model.colour does not say."""
+"""Settings of each form of colour, with their defaults."""
 
 
 def _light_colour_field(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
@@ -90,18 +90,18 @@ def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[D
 
 
 def _load_relight_scene(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Import the loaders when one is used and call it."""
+    """Import the loaders on first use and call one of them."""
     from neuprim.tasks.relight import datasets
 
     loader: Callable[..., Dataset] = getattr(datasets, function)
     return loader(settings, context)
 
 
-_MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
+_MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
 
 
 def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Pixels of a test view that show matter; None for images without alpha."""
+    """Return an (H, W) bool mask of a test view's pixels with matter; None for images without alpha."""
     alpha = dataset.test.pixels(index).alpha
     return None if alpha is None else alpha > _MIN_ALPHA
 
@@ -109,7 +109,7 @@ def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
 def relight_metrics(
     dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True
 ) -> dict[str, float]:
-    """:func:`relight_scores`, with errors per pixel class and the PSNR of its part where the dataset has them."""
+    """Return :func:`relight_scores`, and errors per pixel class and PSNR of the part if there are any."""
     known, result = dataset_lighting(dataset), relight_scores(rendered, truth, structure)
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
@@ -120,7 +120,7 @@ def relight_metrics(
 
 
 def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Exposure, falloff, scores of images without a model, and pixel classes in percent of the pixels with matter."""
+    """Return exposure, falloff, baseline scores, and classes in percent of the pixels with matter."""
     known = dataset_lighting(dataset)
     result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff}
     result["baselines"] = lighting_baseline_scores(dataset)
@@ -133,7 +133,7 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 
 
 def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """Mean scores over the test views of images without a model, by name; without SSIM and FLIP, which are slow."""
+    """Return mean test scores of images without a model, by name; not SSIM and FLIP, which are slow."""
 
     found = {}
     for name, guess in {"black": None, **dataset_lighting(dataset).baselines}.items():
@@ -149,18 +149,18 @@ def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
 
 
 def relight_clips(dataset: Dataset) -> Sequence[Clip]:
-    """The dataset's films."""
+    """Return the dataset's video clips."""
     return dataset_lighting(dataset).clips
 
 
 def light_facts(dataset: Dataset) -> dict[str, Any]:
-    """Summary of the training lights for the model's header."""
+    """Return a summary of the training lights for the model's header."""
     lights = torch.stack([dataset.train.view(i).conditions["light"] for i in range(len(dataset.train))])
     return {"lights": summarize_lights(lights, dataset.center, dataset_lighting(dataset).falloff, dataset.exposure)}
 
 
 def light_orbit(dataset: Dataset, frames: int) -> list[View]:
-    """Views that circle the scene while the light circles it the other way at its mean distance and height."""
+    """Return an orbit of views; the light orbits the other way at its mean distance and height."""
     training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
     up, center = dataset.up.double() / dataset.up.double().norm(), dataset.center.double()
     offsets = torch.stack([c["light"] for c in training]).double() - center
@@ -182,7 +182,7 @@ def light_orbit(dataset: Dataset, frames: int) -> list[View]:
 
 
 def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
-    """PSNR of linear light clamped to 0..1 and of display values, with ``structure`` also SSIM and FLIP."""
+    """Return PSNR of light clamped to 0..1 and of display values; if ``structure``, SSIM and FLIP."""
     first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
     result = {"psnr_linear_clamped": psnr(first, second)}
     first, second = linear_to_srgb(first), linear_to_srgb(second)
@@ -195,7 +195,11 @@ def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> d
 
 
 def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
-    """Errors and pixel counts of every class that the (H, W) map ``classes`` has; raises DataError for others."""
+    """Return MSE and pixel count of each class in the (H, W) map ``classes``.
+
+    Raises:
+        DataError: the map has another size or unknown classes.
+    """
     if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
         raise DataError(
             f"pixel classes: found {tuple(classes.shape)} with values up to {int(classes.max())}; "
@@ -211,7 +215,7 @@ def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor)
 
 
 def relight_pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
-    """Share of each class, in percent of the pixels that are not background."""
+    """Return the share of each class, in percent of the pixels that are not background."""
     counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
     whole = max(float(counts[1:].sum()), 1.0)
     return {name: 100.0 * float(counts[i]) / whole for i, name in enumerate(PIXEL_CLASSES) if i}

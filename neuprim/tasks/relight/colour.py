@@ -168,11 +168,12 @@ class LightNetwork(ColourField):
 def prune_light_network_units(
     params: Params, geometry: Geometry, keep: int, boost: float, multiplicative: bool
 ) -> dict[str, Tensor]:
-    """The tensors of a :class:`LightNetwork` with ``keep`` units per primitive: those that change the colour most.
+    """Prune a :class:`LightNetwork` to the ``keep`` units per primitive that change colour most.
 
-    Removed units leave their mean: of cos(phi + beta (W_x x~ + W_d d + W_l l)) with x~ over the ellipsoid, d and l over
-    all directions, it is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), b the mean over a ball. The
-    variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean becomes part of the albedo.
+    A removed unit is replaced by its mean. With x~ over the ellipsoid, d and l over all directions, the mean of
+    cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), b the
+    mean over a ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean becomes
+    part of the albedo.
     """
     net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
     phase, out = boost * params["net_phase"].double(), params["net_out"].double()
@@ -209,7 +210,7 @@ def prune_light_network_units(
 
 
 class LightHarmonics(ColourField):
-    """c = E max(0, SH(direction mu -> light)): a baseline without view dependence and shadows."""
+    """Baseline colour c = E max(0, SH(direction mu -> light)); no view dependence, no shadows."""
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         check_count(degree, 0, 8, "spherical-harmonics degree")
@@ -251,11 +252,11 @@ class LightHarmonics(ColourField):
 
 
 def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """(N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions, bands in order, m = -l..l.
+    """Return (N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions.
 
-    By recurrence of the associated Legendre functions without the Condon-Shortley phase: P_m^m = (2m - 1)!! sin^m,
-    P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m - (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and
-    sin^m sin(m phi) are polynomials in x, y.
+    Bands are in order, m = -l..l. By recurrence of the associated Legendre functions without the Condon-Shortley phase:
+    P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m -
+    (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are polynomials in x, y.
     """
     x, y, z = directions.unbind(-1)
     cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]

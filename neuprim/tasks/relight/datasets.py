@@ -1,11 +1,11 @@
 """Load relighting data: one light at a time in the layout of GS³ and NRHints, and the generated ``lit_solids``.
 
-Of ``transforms_SPLIT.json`` are read, in a frame or else in the file: the intrinsics of
-:mod:`neuprim.core.cameras.intrinsics`, ``pl_intensity`` (three numbers or one, default 1), and ``camera_near`` and
-``camera_far``, which are only checked. Per frame: ``pl_pos``, the light's position; ``img_path``, of which the longest
-tail that exists counts, as GS³ saves paths of its machine, else ``file_path`` with ``file_ext``; and a pose, where
-[R_opt^T | T_opt], world to camera with OpenCV axes, wins over ``transform_matrix``. PNG and JPEG hold sRGB with
-straight alpha and become linear light; OpenEXR is linear and premultiplied.
+Keys of ``transforms_SPLIT.json``, in a frame or else in the file: the intrinsics of
+:mod:`neuprim.core.cameras.intrinsics` and ``pl_intensity`` (three numbers or one, default 1). In the file:
+``camera_near`` and ``camera_far``, which are only checked. In a frame: ``pl_pos``, the light's position; ``img_path``,
+whose longest existing tail is used, as GS³ saves paths of its machine, else ``file_path`` with ``file_ext``; and a
+pose, where [R_opt^T | T_opt], world to camera with OpenCV axes, wins over ``transform_matrix``. PNG and JPEG hold sRGB
+with straight alpha and become linear light; OpenEXR is linear and premultiplied.
 """
 
 from __future__ import annotations
@@ -102,7 +102,7 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
-    """The frames of one split, with their lights as conditions. Raises DataError: as :func:`load_olat`."""
+    """Read the frames of one split, with lights as conditions; DataError for missing or wrong fields."""
     document = JsonReader.open(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
@@ -127,7 +127,7 @@ def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[Ima
 
 
 def _light_of_camera(camera: Camera, light: Tensor) -> Tensor:
-    """(3,) in world units of a position on the camera's axes: x right, y up, z backward."""
+    """Return the (3,) world position of a point in camera coordinates: x right, y up, z backward."""
     view = camera.viewmat.double()
     return view[:3, :3].T @ (light.double() * light.new_tensor([1, -1, -1]) - view[:3, 3])
 
@@ -137,7 +137,7 @@ def _olat_frame_name(record: JsonReader) -> str:
 
 
 def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
-    """A frame's file, or None."""
+    """Return the image file of a frame; None if it does not exist."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
@@ -163,7 +163,7 @@ def _existing_olat_file(path: Path) -> Path | None:
 
 
 def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
-    """(4, 4) float64 world-to-camera matrix, OpenCV axes."""
+    """Return the (4, 4) float64 world-to-camera matrix of a frame, OpenCV axes."""
     corrected = record.has("R_opt") or record.has("T_opt")
     if not corrected or ignore_corrections:
         if corrected and not record.has("transform_matrix"):
@@ -178,7 +178,7 @@ def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
 
 
 def _light_intensity(source: JsonReader) -> Tensor:
-    """(3,) float32."""
+    """Return ``pl_intensity`` as (3,) float32; 1 if it is missing."""
     expected = "3 numbers of at least 0, or one"
     if not source.has("pl_intensity"):
         return torch.ones(3)
@@ -224,7 +224,7 @@ def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneCo
 
 
 def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
-    """Pixel classes, parts of the test split, two baselines without a model, and a film of the light going round."""
+    """Return pixel classes, test parts, two baselines without a model, and a clip of a circling light."""
     names = {"no_cast_shadows": "unshadowed.exr", f"nearest_light_of_{NEAR_LIGHTS}": "nearest.exr"}
     baselines = {name: partial(_read_lit_companion_image, ending) for name, ending in names.items()}
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))
@@ -234,7 +234,7 @@ def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
 
 
 def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
-    """(H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
+    """Return (H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
     path = _lit_companion_path(views, "classes.png", index)
     try:
         with Image.open(path, formats=("PNG",)) as image:
@@ -244,7 +244,10 @@ def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
 
 
 def _read_lit_companion_image(ending: str, views: ViewSet, index: int) -> Tensor | None:
-    """(H, W, 3) a further image of a view, linear light over the exposure; training views lack the nearest light."""
+    """Read a further (H, W, 3) image of a view, linear light over the exposure; None if there is none.
+
+    Training views lack "nearest".
+    """
     camera, path = views.view(index).camera, _lit_companion_path(views, ending, index)
     return read_image(path, (camera.width, camera.height))[..., :3].float() if path.is_file() else None
 

@@ -1,6 +1,6 @@
-"""What a data set for relighting says of its light.
+"""Facts about the lights of a relighting dataset: falloff, exposure, baselines.
 
-Every view has two conditions: "light" (3,), the position in scene units, and "light_intensity" (3,), radiant.
+Every view has two conditions: "light" (3,), position in scene units, and "light_intensity" (3,), radiant intensity.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 
 Falloff = Literal["none", "inverse_square"]
 
-EXPOSURE_PERCENTILE = 99.5  # an automatic exposure lets this percentile of the training images' values be 1
-FALLOFF_VIEWS = 200  # training views, evenly spread, whose brightness says how light weakens with distance
-FALLOFF_SPREAD = 0.4  # standard error of the exponent beyond which they do not say it
+EXPOSURE_PERCENTILE = 99.5  # an automatic exposure maps this percentile of the training images' values to 1
+FALLOFF_VIEWS = 200  # evenly spaced training views, from whose brightness the falloff is measured
+FALLOFF_SPREAD = 0.4  # largest standard error of a measured falloff exponent
 
 
 @dataclass(frozen=True)
@@ -47,12 +47,12 @@ class Lighting:
 
 
 def dataset_lighting(dataset: Dataset) -> Lighting:
-    """The dataset's facts about its light, or the defaults. Raises DatasetFault: its ``extra`` is something else."""
+    """Return the dataset's lighting facts, or the defaults; DatasetFault if ``extra`` is other data."""
     return get_extra(dataset, Lighting) or Lighting()
 
 
 def olat_percentile_exposure(views: ImageViews, where: str) -> float:
-    """The 99.5th percentile of all premultiplied values, in half precision; raises DataError if it is zero."""
+    """Return the 99.5th percentile of premultiplied values in half precision; DataError if it is 0."""
     # counts per bit pattern, as patterns of non-negative half floats ascend with their values
     counts = torch.zeros(1 << 15, dtype=torch.int64)
     for i in range(len(views)):
@@ -71,11 +71,11 @@ def olat_percentile_exposure(views: ImageViews, where: str) -> float:
 
 
 def measure_falloff(dataset: Dataset) -> Falloff:
-    """Whether training images darken with the square of the light's distance, warning where they do not say it.
+    """Return whether images darken with the squared light distance; warn if they do not show it.
 
-    The logarithm of a view's mean value over its intensity is fitted by a line in the logarithm of the light's
+    A linear fit explains the logarithm of a view's mean value over its intensity by the logarithm of the light's
     distance, harmonics of degree 2 of the directions to light and camera, and the cosine between the two and its
-    square. A slope below -1 is "inverse_square"; so is an unknown one, as that is how point lights are.
+    square. A slope below -1 is "inverse_square"; so is an unknown one, as point lights are.
     """
     center, views = dataset.center.double(), dataset.train
     rows, values = [], []

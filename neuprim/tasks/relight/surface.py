@@ -5,7 +5,7 @@
 n, l and v are unit vectors: the normal, and from the centre to the light and to the camera; h = unit(l + v) is between
 them. s(x) = (x + sqrt(x^2 + 0.01))/2 is a smooth max(0, x), gate(x) = 1/(1 + exp(-20 x)). The lobes are spherical
 Gaussians in the half vector (Wang et al. 2009, All-frequency rendering of dynamic, spatially-varying reflectance). V is
-the visibility of the light, which indirect light does without; E is the light's strength, as for
+the visibility of the light, which does not affect indirect light; E is the light's strength, as for
 :class:`~neuprim.tasks.relight.colour.LightNetwork`. All is constant over a primitive.
 """
 
@@ -35,7 +35,7 @@ from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 INDIRECT = (0, 1, 4)
 """Numbers per channel of the indirect light: none, b_0, or b_0 and B."""
 
-_GLOSS = 20.0  # sharpness of the first highlight at the start; each further one is six times as sharp
+_GLOSS = 20.0  # initial sharpness of the first lobe; each further one is six times as sharp
 _HIGHLIGHT, _INDIRECT = 0.1, 0.02
 _NEIGHBOURS = 12
 
@@ -51,8 +51,9 @@ def surface_colors(
     light: Tensor,
     eye: Tensor,
 ) -> Tensor:
-    """(N, 2, C) colours of the module's equation for E = 1 and V = 1, linear light: what comes from the light directly,
-    and the indirect part. Fused on float32 tensors; differentiable in all but ``sizes``.
+    """Return (N, 2, C) colours of the module's equation for E = V = 1: direct and indirect part.
+
+    They are linear light. Fused on float32 tensors; differentiable in all but ``sizes``.
 
     Args:
         means: (N, 3) scene units. sizes: (N,) of the primitives, scene units.
@@ -114,8 +115,10 @@ def _unit(vector: Tensor, shortest: Tensor | float) -> Tensor:
 
 
 def initial_normals(context: InitContext) -> Tensor:
-    """(N, 3) float32 unit normals: the direction in which the neighbours of a starting point vary least, away from the
-    middle of all points."""
+    """Return (N, 3) float32 unit normals of starting points.
+
+    A normal is the direction in which the point's neighbours vary least; it points away from the middle of all points.
+    """
     points = context.means.double()
     away = points - points.mean(0)
     count = min(_NEIGHBOURS, len(points))
@@ -133,7 +136,7 @@ class SurfaceColour(ColourField):
         lobes: L, 0..8.
         indirect: B, one of :data:`INDIRECT`.
         visibility: "none" or "primitive": where the light's depth images are read.
-        falloff, typical: as of :class:`~neuprim.tasks.relight.colour.LightNetwork`.
+        falloff, typical: as in :class:`~neuprim.tasks.relight.colour.LightNetwork`.
     """
 
     def __init__(
@@ -200,7 +203,10 @@ class SurfaceColour(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[SurfaceColour, dict[str, Tensor]]:
-        """Fewer lobes: those whose integral over the sphere times their colour is largest stay."""
+        """Keep fewer numbers of indirect light, or fewer lobes.
+
+        Lobes with the largest integral over the sphere times colour are kept.
+        """
         field, found = SurfaceColour(**{**self.settings(), name: value}), dict(params)
         if name == "indirect":
             kept = found.pop("indirect")[:, :value].contiguous()
@@ -216,7 +222,7 @@ class SurfaceColour(ColourField):
         return field, found
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Lobes, and indirect light."""
+        """Return one unit per lobe, and one of the direction of indirect light."""
         found = [PrunableUnit(f"lobe {j}", {"highlight": (j,), "log_gloss": (j,)}) for j in range(self.lobes)]
         if self.indirect > 1:
             found.append(PrunableUnit("direction of indirect light", {"indirect": (slice(1, None),)}))

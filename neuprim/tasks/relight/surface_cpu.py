@@ -19,8 +19,10 @@ _CHUNK = 2048  # primitives per unit of work
 
 @strict
 def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
-    """A vector over its length, or over ``shortest`` where it is shorter; the reciprocal of that, and 1 where it is a
-    unit vector, so that its gradient has no part along it. NaN stays NaN."""
+    """Return a vector over max(length, ``shortest``), that divisor's reciprocal, and 1.0 for unit length.
+
+    The last is 0.0 for a shortened vector; the gradient of a unit vector has no part along it. NaN stays NaN.
+    """
     length, whole = np.sqrt(x * x + y * y + z * z), 1.0
     if not length >= shortest:
         length, whole = shortest, 0.0
@@ -30,7 +32,7 @@ def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
 
 @strict
 def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
-    """Turn row i, the gradient of what :func:`_unit` returned, into that of its vector."""
+    """Convert row i of ``g`` from the gradient of the output of :func:`_unit` to that of its input."""
     x, y, z, over, whole = unit
     along = (g[i, 0] * x + g[i, 1] * y + g[i, 2] * z) * whole
     g[i, 0], g[i, 1], g[i, 2] = (g[i, 0] - along * x) * over, (g[i, 1] - along * y) * over, (g[i, 2] - along * z) * over
@@ -38,7 +40,7 @@ def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
 
 @strict
 def _directions(i, means, sizes, normal, light, eye):  # type: ignore[no-untyped-def]
-    """Normal, directions to light and camera, and their half vector, as :func:`_unit` returns them."""
+    """Return normal, directions to light and camera, and half vector, each as :func:`_unit` does."""
     shortest = SHORTEST * np.float64(sizes[i])
     n = _unit(np.float64(normal[i, 0]), np.float64(normal[i, 1]), np.float64(normal[i, 2]), SHORTEST)
     l = _unit(light[0] - means[i, 0], light[1] - means[i, 1], light[2] - means[i, 2], shortest)
@@ -48,7 +50,7 @@ def _directions(i, means, sizes, normal, light, eye):  # type: ignore[no-untyped
 
 @strict
 def _positive(value):  # type: ignore[no-untyped-def]
-    """max(0, value), where NaN stays NaN."""
+    """Return max(0, value); NaN stays NaN."""
     return 0.0 if value < 0.0 else np.float64(value)
 
 
@@ -82,7 +84,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
     start, stop, means, sizes, normal, albedo, highlight, log_gloss, indirect, light, eye, grad,
     g_light, g_eye, g_normal, g_albedo, g_highlight, g_log_gloss, g_indirect,
 ):  # fmt: skip
-    """Into g_light and g_eye (N, 3) the gradients of the vectors to the light and to the camera."""
+    """Write the gradients; g_light, g_eye (N, 3) are those of the vectors to light and camera."""
     lobes, numbers, channels = log_gloss.shape[1], indirect.shape[1], albedo.shape[1]
     g_l = np.empty(3)
     for i in range(start, stop):
@@ -107,7 +109,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
             g_cosine += GATE * gate * (1.0 - gate) * weight * pull
             pull *= gate * weight
             g_log_gloss[i, j] = pull * sharpness * near if abs(log) <= LOG_LIMIT else 0.0
-            if between <= 1.0:  # above by rounding alone: the gradient across the normal is zero there
+            if between <= 1.0:  # above 1 by rounding only: the gradient across the normal is 0
                 g_between += pull * sharpness
         g_l[:] = 0.0
         if numbers:
@@ -156,6 +158,6 @@ class _SurfaceColors(torch.autograd.Function):
 
 
 def fused_surface_colors(*tensors: Tensor) -> Tensor:
-    """:func:`~neuprim.tasks.relight.surface.surface_colors` of float32 CPU tensors; differentiable."""
+    """Compute :func:`~neuprim.tasks.relight.surface.surface_colors` of float32 CPU tensors; differentiable."""
     result: Tensor = apply_kernel_operation(_SurfaceColors, *tensors)
     return result

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colours of surfaces on a GPU, a thread a primitive, float64 inside: the twin of ``tasks.relight.surface_cpu``."""
+"""GPU kernels of surface colours, one thread per primitive, float64 inside; on CPUs ``surface_cpu``."""
 
 from typing import Any
 
@@ -18,7 +18,7 @@ _WRAP, _GATE, _SHORTEST, _LIMIT = (wp.constant(d(x)) for x in (WRAP, GATE, SHORT
 
 @wp.func
 def _over(v: wp.vec3d, shortest: wp.float64):
-    """The reciprocal of a length, or of ``shortest`` where that is more."""
+    """Return 1 / max(length of v, ``shortest``)."""
     length = wp.length(v)
     if not length >= shortest:
         length = shortest
@@ -27,7 +27,7 @@ def _over(v: wp.vec3d, shortest: wp.float64):
 
 @wp.func
 def _pull_back(g: wp.vec3d, v: wp.vec3d, over: wp.float64, shortest: wp.float64):
-    """The gradient of v from that of v ``over`` its length."""
+    """Return the gradient of v, given the gradient g of ``over`` v (see :func:`_over`)."""
     if not wp.length(v) >= shortest:
         return over * g
     unit = over * v
@@ -111,7 +111,7 @@ def _backward(
         g_log_gloss[i, j] = 0.0
         if wp.abs(d(log_gloss[i, j])) <= _LIMIT:
             g_log_gloss[i, j] = f(pull * near)
-        if between <= d(1.0):  # above by rounding alone: the gradient across the normal is zero there
+        if between <= d(1.0):  # above 1 by rounding only: the gradient across the normal is 0
             g_between += pull
     g_l = g_cosine * n
     for c in range(albedo.shape[1]):
@@ -161,7 +161,9 @@ class _SurfaceColors(torch.autograd.Function):
 
 
 def fused_surface_colors(*tensors: Tensor) -> Tensor:
-    """:func:`~neuprim.tasks.relight.surface.surface_colors` of float32 GPU tensors, at least one lobe and one number of
-    indirect light; differentiable."""
+    """Compute :func:`~neuprim.tasks.relight.surface.surface_colors` of float32 GPU tensors; differentiable.
+
+    Needs at least one lobe and one number of indirect light.
+    """
     result: Tensor = _SurfaceColors.apply(*tensors)
     return result

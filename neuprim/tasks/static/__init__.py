@@ -21,7 +21,7 @@ from neuprim.tasks.static.colour import SphericalHarmonics, SphericalLobes
 __all__ = ["TASK", "SphericalHarmonics", "SphericalLobes"]
 
 
-_USUAL_LOBES = 2  # of a primitive, where model.colour.lobes says nothing
+_USUAL_LOBES = 2  # lobes per primitive if model.colour.lobes is not set
 
 
 def _build_static_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
@@ -64,13 +64,13 @@ def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, .
 
 
 def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Import a loader when it is used, as each pulls in a library of its own, and call it."""
+    """Import a loader and call it; imported only when used, as each needs a library of its own."""
     loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
     return loader(settings, context)
 
 
 def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
-    """Of generated data, which file they show and where its points are."""
+    """Return file name and ``scene_from_file`` of a rendered mesh; empty for other data."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
 

@@ -17,11 +17,11 @@ from neuprim.core.model.lobes import AMPLITUDE, AXIS, LOG_SHARPNESS
 from neuprim.core.model.prunable import PrunableUnit
 from neuprim.core.model.schema import ParameterSpec, Params
 
-_SHARPNESS = 2.0  # of a fresh lobe: half as bright 49 degrees off its axis
+_SHARPNESS = 2.0  # initial sharpness of a lobe: half as bright 49 degrees off its axis
 
 
 class SphericalHarmonics(ColourField):
-    """c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; C (degree + 1)^2 parameters.
+    """SH colour c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; C (degree + 1)^2 parameters.
 
     While training, one band is unlocked every ``sh_every`` of the budget; a loaded model uses all of them.
     """
@@ -58,7 +58,7 @@ class SphericalHarmonics(ColourField):
         return params["sh_dc"], params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Coefficients, each of one channel."""
+        """Return one unit per coefficient above degree 0 and channel."""
         return sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest")
 
     def script(self) -> str:
@@ -71,10 +71,11 @@ class SphericalHarmonics(ColourField):
 
 
 class SphericalLobes(ColourField):
-    """c = max(0, C0 sh_dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))), d the direction camera -> mu; 0..8 lobes.
+    """Colour of 0..8 spherical Gaussian lobes, c = max(0, C0 sh_dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))).
 
-    C + L (C + 4) parameters: a lobe has an amplitude a_l per channel, an axis m_l (three numbers, normalised when used)
-    and the logarithm of its sharpness s_l. Lobes start at amplitude zero around random axes.
+    d is the direction camera -> mu. C + L (C + 4) parameters: a lobe has an amplitude a_l per channel, an axis m_l
+    (three numbers, normalised when used) and the logarithm of its sharpness s_l. Lobes start at amplitude zero around
+    random axes.
     """
 
     def __init__(self, lobes: int = 2, channels: int = 3) -> None:
@@ -105,7 +106,7 @@ class SphericalLobes(ColourField):
         return SphericalLobes(value, self.channels), lobes.reduce_lobes(params, value)
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Lobes."""
+        """Return one unit per lobe."""
         names = (AMPLITUDE, AXIS, LOG_SHARPNESS)
         return tuple(PrunableUnit(f"lobe {j}", dict.fromkeys(names, (j,))) for j in range(self.lobes))
 

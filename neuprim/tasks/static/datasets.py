@@ -127,7 +127,7 @@ class ColmapSettings(FolderSettings):
 
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a COLMAP project with its points; photographs are undistorted, and what they do not show is masked."""
+    """Load a COLMAP project with its points; photographs are undistorted, pixels outside them masked."""
     asked = validate_settings(ColmapSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     model = folder / asked.model
@@ -178,7 +178,7 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
 
 
 def _warn_of_unposed_images(place: Path, posed: set[Path], model: Path) -> None:
-    """Say how many images of the folder the model has no pose of."""
+    """Warn about images in the folder ``place`` that have no pose in the COLMAP model."""
     images = {p for p in place.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES}
     others = [p for p in images - posed if not p.name.startswith("dynamic_mask_")]
     if others:
@@ -206,7 +206,7 @@ def _colmap_dataset_camera(where: str, image: Any, viewmat: Tensor, file: Path, 
 
 @dataclass(frozen=True)
 class _ColmapDatasetLens(Distortion):
-    """Any COLMAP camera model, scaled to the files' size; the projection is COLMAP's own."""
+    """Distortion of any COLMAP camera model, scaled to the image files' size; pycolmap projects."""
 
     model: str
     width: int
@@ -229,7 +229,7 @@ class _ColmapDatasetLens(Distortion):
 
 
 def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud | None:
-    """The model's points, in order of their numbers; None where it has none."""
+    """Return the reconstruction's points in the order of their ids; None if there are none."""
     points = [p for _, p in sorted(reconstruction.points3D.items())]
     if not points:
         return None

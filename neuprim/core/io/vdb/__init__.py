@@ -1,7 +1,7 @@
-"""OpenVDB files without OpenVDB: numpy, zlib and the package ``blosc``.
+"""Read and write OpenVDB files without the OpenVDB library: by numpy, zlib and the package ``blosc``.
 
-Every failure is a DataError that names the file, what was found and what was expected; no claim in a file makes memory
-be taken that its bytes do not pay for.
+Every failure is a DataError that names the file, what was found and what was expected. Memory is allocated only for
+data that a file's bytes can hold, whatever the file claims.
 """
 
 from neuprim.core.io.vdb.grid import DENSE_LIMIT, Bounds, VdbGrid, VdbTiles, vdb_scale_transform

@@ -1,4 +1,4 @@
-"""Read what an OpenVDB file says about itself; every length is checked before anything is allocated."""
+"""Read the headers of OpenVDB files; every length is checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import numpy as np
 from neuprim.core.errors import BackendUnavailable, DataError, nearest
 
 ZIP, MASK, BLOSC = 1, 2, 4  # the bits of a grid's compression word
-_BLOSC_HEADER = struct.Struct("<4xI4xI")  # of a chunk's 16 bytes: how many it unpacks to, and how many it has
+_BLOSC_HEADER = struct.Struct("<4xI4xI")  # first 16 bytes of a chunk: unpacked size, packed size
 
 
 class VdbCursor:
@@ -29,11 +29,11 @@ class VdbCursor:
         self.end = len(data) if end is None else end
 
     def fail(self, text: str) -> DataError:
-        """The error to raise for something wrong at or before this place."""
+        """Return the error to raise for something wrong at or before this position."""
         return DataError(f"{self.path}: {text}")
 
     def need(self, count: int, what: str) -> None:
-        """Raises DataError unless ``count`` more bytes are there."""
+        """Raise DataError unless ``count`` more bytes are there."""
         if not 0 <= count <= self.end - self.at:
             found = f"{what} at byte {self.at} needs {count} bytes, but {self.end - self.at} are left there"
             raise self.fail(f"{found}; truncated or damaged OpenVDB file")
@@ -48,18 +48,18 @@ class VdbCursor:
         self.at += count
 
     def unpack(self, layout: str, what: str) -> tuple[Any, ...]:
-        """Little-endian values without padding, as in :mod:`struct`."""
+        """Read little-endian values without padding; ``layout`` as in :mod:`struct`."""
         return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout), what))
 
     def text(self, what: str) -> str:
-        """A length (uint32) and so many bytes of UTF-8; bytes that are not become U+FFFD."""
+        """Read a text: its length (uint32) and UTF-8 bytes; invalid bytes become U+FFFD."""
         (length,) = self.unpack("I", f"length of {what}")
         return self.take(length, what).decode("utf-8", errors="replace")
 
 
 @contextmanager
 def open_cursor(path: Path) -> Iterator[VdbCursor]:
-    """A cursor at the start of a file, which is mapped rather than read; raises DataError where it cannot be."""
+    """Yield a cursor at the start of a memory-mapped file; raises DataError if the file cannot be read."""
     if not path.exists():
         raise DataError(f"{path}: file not found; expected an OpenVDB file")
     if not path.is_file():
@@ -76,7 +76,7 @@ def open_cursor(path: Path) -> Iterator[VdbCursor]:
 
 
 def vdb_compression_label(flags: int) -> str:
-    """The words OpenVDB itself uses, for example ``blosc + active values``."""
+    """Return OpenVDB's own name of a compression, for example ``blosc + active values``."""
     codec = "blosc" if flags & BLOSC else "zip" if flags & ZIP else ""
     return " + ".join(word for word in (codec, "active values" if flags & MASK else "") if word) or "none"
 
@@ -140,7 +140,7 @@ VERSIONS = (222, 224)
 _CHANNELS = {"Tree_float_5_4_3": 1, "Tree_vec3s_5_4_3": 3}
 _HALF = "_HalfFloat"
 _DOUBLES = {"UniformScaleMap": 15, "ScaleMap": 15, "UniformScaleTranslateMap": 18, "ScaleTranslateMap": 18}
-_DOUBLES |= {"TranslationMap": 3, "AffineMap": 16, "UnitaryMap": 16}  # numbers that a map is stored as
+_DOUBLES |= {"TranslationMap": 3, "AffineMap": 16, "UnitaryMap": 16}  # how many numbers store a map
 _METADATA = {
     "bool": "?", "int32": "i", "int64": "q", "float": "f", "double": "d",
     "vec2i": "2i", "vec2s": "2f", "vec2d": "2d", "vec3i": "3i", "vec3s": "3f", "vec3d": "3d",
@@ -229,7 +229,7 @@ def read_header(path: Path) -> FileHeader:
 
 
 def parse_header(cursor: VdbCursor) -> FileHeader:
-    """:func:`read_header` for an open file whose cursor is at the start."""
+    """Return the header, as :func:`read_header`, of an open file whose cursor is at the start."""
     if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
         expected = f"{MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
         raise cursor.fail(f"starts with {cursor.data[:8].hex(' ')}; expected {expected}")

@@ -91,7 +91,7 @@ _LEAF = 512  # voxels
 
 
 class NodeSlots:
-    """The children of an internal node: how many, voxels along an edge of each, and their lowest indices in it."""
+    """Layout of the children of an internal node: number, edge length in voxels, and lowest indices in the node."""
 
     def __init__(self, log2: int, edge: int) -> None:
         self.count, self.edge = 1 << 3 * log2, edge
@@ -103,7 +103,7 @@ UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
-    """Decodes the tree of ``source``, called ``what``, into the arrays of a VdbGrid of at most ``max_bytes``."""
+    """Decoder of the tree of ``source``, called ``what``, into the arrays of a VdbGrid of at most ``max_bytes``."""
 
     def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
@@ -118,7 +118,7 @@ class _TreeReader:
         self._leaf_origins: list[np.ndarray] = []
         self._tiles: list[tuple[np.ndarray, int, np.ndarray, np.ndarray]] = []
         self._limit = max_bytes
-        self._left = max_bytes  # what tiles have not taken yet
+        self._left = max_bytes  # bytes that tiles have not used yet
         self._topology()
         self.origins = np.concatenate(self._leaf_origins) if self._leaf_origins else np.zeros((0, 3), np.int32)
         self.tiles = self._collect_tiles(source.channels)
@@ -172,7 +172,7 @@ class _TreeReader:
             self._leaf_origins.append(lower + leaves)
 
     def _node(self, origin: np.ndarray, slots: NodeSlots) -> np.ndarray:
-        """Reads an internal node, keeps its tiles, and returns which slots, in order, are children."""
+        """Read an internal node and store its tiles; return the slots that are children, in order."""
         cursor, what = self._cursor, f"a node of {self._what}"
         children, active = (_unpack_vdb_mask(cursor.take(slots.count // 8, f"masks of {what}")) for _ in range(2))
         values = self._values(active, slots.count, what)
@@ -183,7 +183,7 @@ class _TreeReader:
 
     def _keep_tiles(self, origins: np.ndarray, size: int, values: np.ndarray, active: np.ndarray) -> None:
         different = (values != self.background).any(-1) if self._shape else values != self.background
-        kept = active | different  # the others are what is nowhere stored
+        kept = active | different  # the others are inactive background, which is not stored
         if kept.any():
             self._left -= int(np.count_nonzero(kept)) * (17 + self._full_size)
             if self._left < 0:
@@ -200,7 +200,7 @@ class _TreeReader:
         return VdbTiles(places, repeated, numbers, np.concatenate(active))
 
     def _values(self, active: np.ndarray, count: int, what: str) -> np.ndarray | None:
-        """(count,) or (count, 3) float32; None where all of them are the background and not active."""
+        """Read (count,) or (count, 3) float32 values; return None if all are the background and not active."""
         cursor = self._cursor
         code, low, high, chosen = self._inactive(cursor, count, what)
         whole = not self._flags & MASK or code == ALL_VALUES
@@ -218,7 +218,7 @@ class _TreeReader:
         return values
 
     def _inactive(self, cursor: VdbCursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
-        """The code of a node, its two inactive values, and the mask that chooses the second of them."""
+        """Read the code of a node, its two inactive values, and the mask that chooses the second one, or None."""
         code = cursor.take(1, f"value code of {what}")[0]
         if code > ALL_VALUES:
             raise cursor.fail(f"{what} has the value code {code} at byte {cursor.at - 1}; expected 0 to {ALL_VALUES}")
@@ -230,14 +230,14 @@ class _TreeReader:
         return code, low, high, cursor.take(count // 8, f"selection mask of {what}") if code in (3, 4, 5) else None
 
     def _payload(self, cursor: VdbCursor, count: int, what: str) -> bytes:
-        """The bytes of ``count`` stored values."""
+        """Read and decompress the bytes of ``count`` stored values."""
         size = count * self._stored_size
         if not self._packed:
             return cursor.take(size, f"values of {what}")
         if self._half and not count:
             return b""  # OpenVDB then writes no length either
         (length,) = cursor.unpack("q", f"size of the values of {what}")
-        if length <= 0:  # minus the size of values that are not packed
+        if length <= 0:  # the values are not packed; this is minus their size
             if -length != size:
                 raise cursor.fail(f"{what} has {-length} bytes of values; expected {size}")
             return cursor.take(size, f"values of {what}")
@@ -280,7 +280,7 @@ class _TreeReader:
     def _leaf_bytes(
         self, first: int, last: int
     ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
-        """Masks, leaves with inactive values that are not the background, leaves that store all values, and values."""
+        """Read masks, leaves whose inactive values are not the background, leaves that store all values, and values."""
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
         unit, masked, packed, nothing = self._stored_size, self._flags & MASK, self._packed, self._half

@@ -120,7 +120,7 @@ def _grid_metadata(grid: VdbGrid, flags: int, where: str) -> bytes:
 
 
 def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
-    """The simplest of OpenVDB's maps that is this transform."""
+    """Pack a transform as the simplest of OpenVDB's maps that equals it."""
     matrix = np.asarray(matrix, np.float64)
     sound = matrix.shape == (4, 4) and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
     if not sound or np.linalg.det(matrix) == 0:
@@ -139,7 +139,7 @@ def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
 
 
 class _TreeWriter:
-    """Turns a grid into ``topology`` and ``buffers``, the two parts of its tree."""
+    """Encoder of a grid into ``topology`` and ``buffers``, the two parts of its tree."""
 
     def __init__(self, grid: VdbGrid, flags: int, where: str) -> None:
         self._grid, self._where = grid, where
@@ -170,7 +170,7 @@ class _TreeWriter:
         if grid.half:
             for values in (grid.values, tiles.values):
                 largest = float(np.abs(values[np.isfinite(values)]).max(initial=0.0))
-                if largest >= 65520:  # what rounds to infinity
+                if largest >= 65520:  # rounds to infinity
                     found = f"a value of magnitude {largest:g} does not fit a half float (65504 at most)"
                     raise DataError(f"{self._where}: {found}")
 
@@ -215,7 +215,7 @@ class _TreeWriter:
         tiles: np.ndarray,
         slots: NodeSlots,
     ) -> None:
-        """Appends an internal node: masks of children and of active tiles, and the tiles' values."""
+        """Append an internal node: masks of children and of active tiles, and the tiles' values."""
         grid = self._grid
         has_child, active = np.zeros(slots.count, bool), np.zeros(slots.count, bool)
         values = np.empty((slots.count, *grid.background.shape), np.float32)
@@ -228,7 +228,7 @@ class _TreeWriter:
         parts.append(self._values(values, active))
 
     def _values(self, values: np.ndarray, active: np.ndarray) -> bytes:
-        """The value code, an inactive value if it needs one, and the stored values."""
+        """Encode the values of a node: value code, an inactive value if the code needs one, stored values."""
         grid = self._grid
         inactive = values[~active]
         code, extra = 0, b""
@@ -246,7 +246,7 @@ class _TreeWriter:
 def _group_by_block(
     size: int, leaves: np.ndarray, tiles: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
-    """The blocks of ``size`` voxels that hold leaves or tiles, by corner, with the indices of both in each."""
+    """Return (corner, (leaf indices, tile indices)) for each block of ``size`` voxels that holds any."""
     corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
     order, count = np.argsort(inverse, kind="stable"), len(leaves)
     ends = np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners))).tolist()
@@ -258,18 +258,18 @@ def _group_by_block(
 
 
 def _vdb_slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: NodeSlots) -> np.ndarray:
-    """The slot numbers, in a node at ``origin``, of the children at ``corners`` (n, 3)."""
+    """Return the slot numbers, in a node at ``origin``, of the children at ``corners`` (n, 3)."""
     edge = round(slots.count ** (1 / 3))
     x, y, z = ((corners - np.array(origin)) // slots.edge).astype(np.int64).T
     return np.asarray((x * edge + y) * edge + z)
 
 
 def _value_packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
-    """The function that packs values of ``unit`` bytes, with their length in front as OpenVDB has it."""
+    """Return the function that packs values of ``unit`` bytes: with OpenVDB's length in front if ``flags`` compress."""
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw
     blosc = blosc_module() if flags & BLOSC else None
-    # what the Blosc library itself makes of no bytes, which the Python package refuses to pack: a header alone
+    # the Blosc library packs no bytes as a header alone, which the Python package refuses to do
     nothing = struct.pack("<4B3I", 2, 1, 0x23, unit, 0, 1, 16)
 
     def pack(raw: bytes) -> bytes:

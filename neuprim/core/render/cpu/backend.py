@@ -44,14 +44,14 @@ from neuprim.core.render.rasterize import (
 from neuprim.core.settings import RenderSettings
 
 _PRIMITIVES_PER_CHUNK = 512
-_UNITS_PER_THREAD = 8  # units of work among which threads share a frame
-_TILES_ALONE = 64  # tiles that a thread which shares with no other does at once, at least
+_UNITS_PER_THREAD = 8  # a thread gets about this many units of work per frame, or fewer
+_TILES_ALONE = 64  # least tiles per unit of work of a single thread
 Array = np.ndarray[Any, Any]
 
 
 @dataclass(frozen=True)
 class _PreparedFrame:
-    """What the backward pass shares with the forward pass of one frame."""
+    """Data of one frame that the forward and the backward pass share."""
 
     request: RasterRequest
     tensors: dict[str, Array]  # parameters, and weights of colour networks, by name, all of one dtype
@@ -60,8 +60,8 @@ class _PreparedFrame:
     arrays: FrameArrays
     lists: TileLists
     net: ColourNet | None
-    tiles: int  # of an image
-    chunk: int  # tiles that are one unit of work
+    tiles: int  # per image
+    chunk: int  # tiles per unit of work
 
     @property
     def parameters(self) -> PrimitiveArrays:
@@ -73,7 +73,7 @@ def _cpu_array(tensor: Tensor) -> Array:
 
 
 def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
-    """By name and in one dtype, the widest, so that a mix does not compile kernels of its own."""
+    """Return the arrays by name, float64 if their dtypes differ, so that a mix does not compile more kernels."""
     arrays = [_cpu_array(x) for x in tensors]
     if len({x.dtype for x in arrays}) > 1:
         arrays = [x.astype(np.float64, copy=False) for x in arrays]
@@ -82,7 +82,7 @@ def _rasterizer_arrays_by_name(tensors: Sequence[Tensor]) -> dict[str, Array]:
 
 @lru_cache(maxsize=4)
 def _ray_norms(width: int, height: int, fx: float, fy: float, cx: float, cy: float) -> Array:
-    """(H, W) length of each pixel's ray direction whose camera-z is 1."""
+    """Return (H, W) float32 lengths of the pixels' ray directions with camera-z 1."""
     x = (np.arange(width) + 0.5 - cx) / fx
     y = (np.arange(height) + 0.5 - cy) / fy
     result: Array = np.sqrt(1 + x[None, :] ** 2 + y[:, None] ** 2).astype(np.float32)
@@ -141,10 +141,10 @@ def _prepare_frame(
         alpha_max=np.float32(settings.alpha_max),
         transmittance_min=np.float32(settings.transmittance_min),
         depth_floor=np.float32(settings.depth_floor),
-        neurons=K + K % 2,  # a padded one has amplitude 0
+        neurons=K + K % 2,  # a padding neuron has amplitude 0
     )
-    # Both passes share one unit of work: half a row of tiles, or more where threads are few, as every unit costs a
-    # call.
+    # Both passes use the same unit of work: half a row of tiles, or more if threads are few, because every unit costs
+    # a call.
     across, workers = -(-camera.width // P.TILE), resolve_threads(threads)
     tiles = across * -(-camera.height // P.TILE)
     chunk = max(2 if workers > 1 else _TILES_ALONE, across // 2, tiles // (_UNITS_PER_THREAD * workers))
@@ -260,7 +260,7 @@ def render(
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and depth of each slab, prepared as one frame; see :func:`neuprim.core.render.render_slabs`."""
+    """Return opacity and depth per slab, all prepared as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means = lowered.geometry.means
     request = RasterRequest.of(lowered, camera, settings, RenderStats("cpu", len(means)))
     frame = _prepare_frame(request, camera.viewmat, rasterizer_tensors(lowered), (slabs.numpy(), count))

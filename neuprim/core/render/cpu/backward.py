@@ -1,4 +1,4 @@
-"""Compositing in the order of centres, backward: back to front, transmittance recovered by T/(1 - alpha).
+"""Backward pass of compositing in the order of centres: back to front, recovering T by T/(1 - alpha).
 
 The lanes' optical depths come from the forward pass. Each (tile, primitive) pair writes one gradient row; a primitive's
 rows are added in a fixed order, so that the result has the same bits for any number of threads.
@@ -43,19 +43,19 @@ from neuprim.core.render.cpu.tiles import (
 )
 
 f = np.float32
-index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
+index = np.uint64  # an unsigned index is never negative (from the end), so that LLVM vectorises without slices
 _STEPS = np.arange(P.TILE).astype(np.float32)
 _RGB_GRADIENT = L.RAY_COLOUR + 3 * L.LANES  # dL/d RAY_COLOUR of three channels, behind the C arrays of RAY_COLOUR
 Array = np.ndarray[Any, Any]
 
 
 class ImageGradient(NamedTuple):
-    """What the backward kernels read of a frame, and the rows that they fill."""
+    """Inputs of the backward kernels for one frame, and the gradient rows that they fill."""
 
-    # of the forward pass
+    # results of the forward pass
     transmittance: Array
     last: Array
-    # dL/d of the image's; g_transmittance has the background's share, z is read if with_depth
+    # dL/d of the image's arrays; g_transmittance includes the background's share, z is read if with_depth
     rgb: Array
     g_transmittance: Array
     z: Array
@@ -66,7 +66,7 @@ class ImageGradient(NamedTuple):
 
 @inline
 def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
-    """DEPTH of every lane, as the forward pass computes it."""
+    """Fill DEPTH of every lane, as the forward pass computes it."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
@@ -76,7 +76,7 @@ def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH, with the forward pass's clamp and cut."""
+    """Fill ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH, with the forward pass's clamp and cut."""
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
@@ -89,12 +89,12 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
         S[L.SLOPE + k] = slope if alpha > f(0) else f(0)
 
 
-# ---- One pixel row, as in the forward pass; lanes of other rows keep what they have.
+# ---- One pixel row, as in the forward pass; lanes of other rows do not change.
 
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
-    """Three channels: recover T, dL/d(2 FIELD HALF), dL/d RAY_COLOUR with a ``net``, and 16-wide sums."""
+    """Three channels: recover T; fill GRAD, and dL/d RAY_COLOUR with a ``net``; add to 16-wide sums."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -140,7 +140,7 @@ def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # t
 
 @inline
 def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyped-def]
-    """Any channels: cg += sum of c dL/d colour."""
+    """Any channels: add the sum of c dL/d colour to ``cg``."""
     for c in range(color.shape[0]):
         st = state[L.G_COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -155,7 +155,7 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 
 @inline
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
-    """Any channels and depth: recover T; weights, dL/d(2 FIELD HALF); ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz)."""
+    """Any channels, with depth: recover T; fill weights ``w`` and GRAD; ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz)."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -177,7 +177,7 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 
 @inline
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
-    """Any channels: add w, w x error and the colours' gradients (with a ``net``, dL/d RAY_COLOUR) of one row."""
+    """Any channels: add w, w x error and colour gradients of one row to ``sums``; a ``net``: fill dL/d RAY_COLOUR."""
     st = state[base:]
     for k in range(P.TILE):
         sums[k] += w[k]
@@ -197,7 +197,7 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 @inline
 def _compact_lane_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Move the lanes with a gradient together, zeros behind them; returns their number. Many lanes have none."""
+    """Compact the lanes that have a gradient, as many have none, and append zeros; return their number."""
     count = 0
     for k in range(0, n, P.TILE):
         if with_depths:
@@ -301,7 +301,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
             n16 = ((n + 15) // 16) * 16
             for k in range(0, n16, P.TILE):
                 copy16(S, L.DEPTH + k, depths, first_lane[q] + k)
-            # where nothing but the gradients asks for chords, they are those of the lanes that have a gradient
+            # if only the gradients need chords, compute them later, and only for lanes with a gradient
             later = slots[i] < 0 and net is None and not with_depth
             cut = False
             if not later:
@@ -369,7 +369,7 @@ def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, 
 
 @exact_kernel
 def sum_tile_pair_gradients(start, stop, first, slots, pair_rows, grads, touched):  # type: ignore[no-untyped-def]
-    """grads[i] = sum of primitive i's pair rows, in pair order, for primitives ``start:stop``."""
+    """Fill grads[i], the sum of primitive i's pair rows in pair order, and touched[i], for i in ``start:stop``."""
     for i in range(start, stop):
         g = grads[i]
         g[:] = np.float32(0)

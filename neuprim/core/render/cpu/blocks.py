@@ -1,7 +1,7 @@
-"""Blocks of primitives: the geometry and the neurons of 32 of them at once, in float64.
+"""Geometry and neurons of blocks of 32 primitives at a time, in float64.
 
 A block is one flat array with a column of numbers per quantity, at constant offsets, which LLVM vectorises. Strict
-arithmetic gives each primitive the bits that it would get alone.
+arithmetic gives each primitive the same bits as it would get alone.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from neuprim.core.render import layout as P
 
 Array = np.ndarray[Any, Any]
 
-BLOCK = 32  # primitives: the columns below stay in the first level of cache
+BLOCK = 32  # primitives per block: the columns below fit into the L1 cache
 
 
 def column(number: int) -> int:
-    """Return where a column of a block's memory begins."""
+    """Return the offset of a column in a block's memory."""
     return BLOCK * number
 
 
 # The first columns are those of a row (:mod:`neuprim.core.render.layout`), before the neurons.
 MEANS, LOG_SCALES, QUATS, INVERSE = (column(P.NEURONS + n) for n in (0, 3, 6, 10))
 AXES, CENTRE, B, LOCAL = (column(P.NEURONS + n) for n in (11, 14, 17, 26))  # matrices row by row
-NEURON = column(P.NEURONS + 35)  # of one neuron at a time, as in a row, and its speed
+NEURON = column(P.NEURONS + 35)  # one neuron at a time: the columns of a row, then its speed
 _SPEED = NEURON + column(P.PER_NEURON)
 MOST, TOTAL, BIGGEST, FASTEST, SQUARE, SZZ, REACH = (_SPEED + column(n) for n in range(1, 8))
 SPAN, BOX, STATUS, FLOAT64 = (_SPEED + column(n) for n in (8, 13, 17, 18))
@@ -60,7 +60,7 @@ def dot3(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
-    """Fill geometry and axes s/m of primitives ``which[:n]``; the last one fills up the block."""
+    """Fill geometry and axes s/m of primitives ``which[:n]``; copies of the last one fill up the block."""
     means, log_scales, quats = parameters.means, parameters.log_scales, parameters.quats
     for k in range(BLOCK):
         i = which[min(k, n - 1)]
@@ -76,7 +76,7 @@ def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
 
 @strict
 def project_block(S, view):  # type: ignore[no-untyped-def]
-    """Fill camera-axes orientation B, local orientation and 1/|q|, centre, and anchor (ANCHOR_Z, UX, UY).
+    """Fill orientation B in camera axes, orientation LOCAL in scene axes, 1/|q|, centre, anchor (ANCHOR_Z, UX, UY).
 
     The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
     """
@@ -98,7 +98,7 @@ def project_block(S, view):  # type: ignore[no-untyped-def]
         mean, m = load3(S, MEANS, k), S[M + k]
         c0, c1, c2 = dot3(r0, mean) + t0, dot3(r1, mean) + t1, dot3(r2, mean) + t2
         store3(S, CENTRE, k, (c0, c1, c2))
-        # a centre near or behind the camera, or of what is not seen, is anchored at the camera itself
+        # a primitive near or behind the camera, or wholly before the near plane, is anchored at the camera
         ahead = (c2 > P.ANCHOR_RADII * m) & (c2 + m > near)
         S[ANCHOR_Z + k] = m * np.float64(np.float32(c2 / m)) if ahead else 0.0
         S[UX + k] = np.float64(np.float32(fx * c0 / c2 + cx if ahead else cx))
@@ -107,14 +107,14 @@ def project_block(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
-    """E0, EX, EY and XA along an axis of the ellipsoid, from its column of B: a row of m S^-1 B^T."""
+    """Return E0, EX, EY and XA along an axis of the ellipsoid, from its column of B: a row of m S^-1 B^T."""
     a0, a1, a2 = b[0] / s, b[1] / s, b[2] / s
     return a0 * u + a1 * v + a2, a0 / fx, a1 / fy, dot3((a0, a1, a2), w)
 
 
 @strict
 def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
-    """Fill the rows' affine rays, and what shows whether all is finite and within float32."""
+    """Fill the rows' affine rays; TOTAL and BIGGEST, to check that all is finite and within float32."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     for k in range(BLOCK):
         m, anchor_z, offset = S[M + k], S[ANCHOR_Z + k], S[BLOCK * P.OFFSET + k]
@@ -142,7 +142,7 @@ def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[no-untyped-def]
-    """Fill ``waves`` (K, 6 BLOCK): the neurons of a block and their speeds."""
+    """Fill ``waves`` (K, 6 BLOCK), the neurons of a block and their speeds."""
     W1, b1, w2 = parameters.W1, parameters.b1, parameters.w2
     for k in range(BLOCK):
         S[FASTEST + k] = 0.0
@@ -181,12 +181,12 @@ def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped
 
 @strict
 def store_row(k, S, waves, rate, order, row):  # type: ignore[no-untyped-def]
-    """Copy the row of a block's primitive ``k``, its neurons by rising ``rate``, which is filled with ``order``."""
+    """Copy the row of a block's primitive ``k``, with neurons sorted by rising rate; fill ``rate`` and ``order``."""
     for j in range(P.NEURONS):
         row[j] = S[j * BLOCK + k]
     K = rate.shape[0]
     for neuron in range(K):
-        # counting the slower ones sorts without a branch; neurons as fast keep their order
+        # sort by counting the slower neurons, without a branch; equally fast ones keep their order
         at, speed = np.int64(0), waves[neuron, BLOCK * P.PER_NEURON + k]
         for j in range(K):
             other = waves[j, BLOCK * P.PER_NEURON + k]
@@ -200,7 +200,7 @@ def store_row(k, S, waves, rate, order, row):  # type: ignore[no-untyped-def]
 
 
 class BlockMemory(NamedTuple):
-    """Memory for a block: its columns; ``waves`` (K, 6 BLOCK) its neurons; rising ``rate`` (K,); ``which`` (BLOCK,)."""
+    """Memory for a block: columns ``S``, neurons ``waves`` (K, 6 BLOCK), sorted ``rate`` (K,), ``which`` (BLOCK,)."""
 
     S: Array
     waves: Array

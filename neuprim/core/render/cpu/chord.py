@@ -19,8 +19,8 @@ from neuprim.core.model.edge import NORMS
 from neuprim.core.render import layout as P
 
 EDGE_TYPES: tuple[tuple[int, ...], ...] = ((), (0,), (0, 0))
-"""The exponents p = 0, 1, 2 as kernels take them: as many zeros. A tuple's length belongs to its type, so that numba
-compiles a kernel for each p that is drawn, and none that is not."""
+"""The exponents p = 0, 1, 2 as arguments of kernels: tuples of p zeros. A tuple's length is part of its type, so numba
+compiles a kernel only for each p that is drawn."""
 
 Kernel = Callable[..., Any]
 f = np.float32
@@ -104,7 +104,7 @@ _MEDIUM_SLOPE = {
 
 @inline
 def one_minus_exp(x):  # type: ignore[no-untyped-def]
-    """1 - exp(-x) for x clamped to [0, 9.4] (alpha is clamped to at most 0.9999): expm1 of x/16, doubled four times."""
+    """Return 1 - exp(-x) for x clamped to [0, 9.4] (alpha is at most 0.9999): expm1 of x/16, doubled four times."""
     r = min(max(x, f(0)), _CEIL) * _SIXTEENTH
     q = (((((_E6 * r + _E5) * r + _E4) * r + _E3) * r + _E2) * r + _ONE) * r
     q = q * (q + _TWO)
@@ -116,25 +116,25 @@ def one_minus_exp(x):  # type: ignore[no-untyped-def]
 
 @inline
 def cos_turns(z):  # type: ignore[no-untyped-def]
-    """cos(2 pi r) from z = r^2, |r| <= 1/2."""
+    """Return cos(2 pi r) from z = r^2, |r| <= 1/2."""
     return (((((_C6 * z + _C5) * z + _C4) * z + _C3) * z + _C2) * z + _C1) * z + _C0
 
 
 @inline
 def sinc_turns(z):  # type: ignore[no-untyped-def]
-    """sin(2 pi r)/(2 pi r) from z = r^2, |r| <= 1/2."""
+    """Return sin(2 pi r)/(2 pi r) from z = r^2, |r| <= 1/2."""
     return ((((_S5 * z + _S4) * z + _S3) * z + _S2) * z + _S1) * z + _S0
 
 
 @inline
 def dsinc_turns(z):  # type: ignore[no-untyped-def]
-    """d/dz of :func:`sinc_turns`, from a fit of its own: the difference cos - sinc cancels for small z."""
+    """Return d/dz of :func:`sinc_turns`, from its own fit: the difference cos - sinc would cancel for small z."""
     return ((((_D5 * z + _D4) * z + _D3) * z + _D2) * z + _D1) * z + _D0
 
 
 @inline
 def _chord_sinc_medium(t):  # type: ignore[no-untyped-def]
-    """sinc(2 pi v) from t = v^2 2/1.5^2 - 1, |v| <= 1.5."""
+    """Return sinc(2 pi v) from t = v^2 2/1.5^2 - 1, |v| <= 1.5."""
     low = ((((_M5 * t + _M4) * t + _M3) * t + _M2) * t + _M1) * t + _M0
     high = (((_M10 * t + _M9) * t + _M8) * t + _M7) * t + _M6
     t2 = t * t
@@ -143,7 +143,7 @@ def _chord_sinc_medium(t):  # type: ignore[no-untyped-def]
 
 @inline
 def _chord_dsinc_medium(t):  # type: ignore[no-untyped-def]
-    """d sinc / d(v^2) of :func:`_chord_sinc_medium`."""
+    """Return d sinc / d(v^2) of :func:`_chord_sinc_medium`."""
     return ((((((((_N9 * t + _N8) * t + _N7) * t + _N6) * t + _N5) * t + _N4) * t + _N3) * t + _N2) * t + _N1) * t + _N0
 
 
@@ -152,7 +152,7 @@ def _chord_dsinc_medium(t):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_sincs_slow(v, w):  # type: ignore[no-untyped-def]
-    """|v|, |w| <= 1/2."""
+    """Return sinc(2 pi v) and sinc(2 pi w) for |v|, |w| <= 1/2."""
     return sinc_turns(v * v), sinc_turns(w * w)
 
 
@@ -164,7 +164,7 @@ def _hard_slopes_slow(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_sincs_medium(v, w):  # type: ignore[no-untyped-def]
-    """|v|, |w| <= 3/2."""
+    """Return sinc(2 pi v) and sinc(2 pi w) for |v|, |w| <= 3/2."""
     return _chord_sinc_medium(v * v * _TO_UNIT - _ONE), _chord_sinc_medium(w * w * _TO_UNIT - _ONE)
 
 
@@ -181,7 +181,7 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
-    """v and w reduced to half a turn, whether they were within, and reciprocals (1 where within) by one division."""
+    """Return v and w reduced to half a turn, whether they were within it, 1/v and 1/w (1 if within) by one division."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w
@@ -191,8 +191,8 @@ def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
-    """sinc(2 pi v) and its derivative by v of v = whole + r, iv = 1/v: r/v sinc(2 pi r), and (cos - sinc)/v beyond half
-    a turn; where ``near``, the polynomials."""
+    """Return sinc(2 pi v) and its derivative by v, for v = whole + r and iv = 1/v: the polynomials if ``near``, else
+    (beyond half a turn) r/v sinc(2 pi r) and (cos - sinc)/v."""
     z = r * r
     x = sinc_turns(z)
     b = x if near else x * r * iv
@@ -200,7 +200,7 @@ def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
 
 
 def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
-    """The polynomial with these coefficients, lowest first, unrolled."""
+    """Return an unrolled function of the polynomial with these coefficients, lowest first."""
     first = f(coefficients[0])
     if len(coefficients) == 1:
 
@@ -219,7 +219,7 @@ def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
 
 
 def _split_chord_polynomial(coefficients: tuple[float, ...]) -> Kernel:
-    """The same as two shorter chains, whose latencies overlap; ten coefficients."""
+    """Return the same for ten coefficients as two shorter chains, whose latencies overlap."""
     low, high = _horner_polynomial(coefficients[:5]), _horner_polynomial(coefficients[5:])
 
     @inline
@@ -266,7 +266,7 @@ def _soft_reduced(p: int) -> Kernel:
 
     @inline
     def reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
-        """(B_p, dB_p/dv) of v = whole + r, iv = 1/v; the polynomial where ``near``."""
+        """Return (B_p, dB_p/dv) for v = whole + r and iv = 1/v; the polynomial if ``near``."""
         z, iz = r * r, iv * f(1 / TAU)  # iz = 1/(2 pi v)
         b0, cosine = sinc_turns(z) * r * iv, cos_turns(z)
         b1 = f(3) * (b0 - cosine) * iz * iz
@@ -282,7 +282,7 @@ def _soft_reduced(p: int) -> Kernel:
 
 
 def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
-    """Any v and w."""
+    """Return functions for B_p(2 pi v), B_p(2 pi w), and the same with derivatives, for any v and w."""
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -308,16 +308,16 @@ profiles_fast = compile_dispatch_by_length(*(profiles for profiles, _ in _fast))
 slopes_slow = compile_dispatch_by_length(_hard_slopes_slow, _soft_slow[0][1], _soft_slow[1][1])
 slopes_medium = compile_dispatch_by_length(_hard_slopes_medium, _soft_medium[0][1], _soft_medium[1][1])
 slopes_fast = compile_dispatch_by_length(*(slopes for _, slopes in _fast))
-# (edge, v, whether |v| <= 1/2, v less its nearest whole number, 1/v or 1) -> B_p(2 pi v) and its derivative by v
+# (edge, v, whether |v| <= 1/2, v minus the nearest integer, 1/v or 1) -> B_p(2 pi v) and its derivative by v
 reduced_profile = compile_dispatch_by_length(*_reduced)
 
 
-_MEANS = tuple(f(n / 2) for n in NORMS)  # of (1 - u^2)^p over [-1, 1]
+_MEANS = tuple(f(n / 2) for n in NORMS)  # means of (1 - u^2)^p over [-1, 1]
 
 
 @inline_source
 def load_ray(p):  # type: ignore[no-untyped-def]
-    """What :func:`intersect_chord` reads of a primitive's row, read once for all lanes."""
+    """Return the numbers of a primitive's row that :func:`intersect_chord` needs; load them once for all lanes."""
     return (
         p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2],
         p[P.XA], p[P.XA + 1], p[P.XA + 2], p[P.XU], p[P.XU + 1], p[P.XU + 2], p[P.XV], p[P.XV + 1], p[P.XV + 2],
@@ -327,9 +327,9 @@ def load_ray(p):  # type: ignore[no-untyped-def]
 
 @inline_source
 def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
-    """The chord of one pixel of the tile, named as in the layout; ``half`` is 0 where the ray misses.
+    """Return the chord of one pixel of the tile, named as in the layout; ``half`` is 0 where the ray misses.
 
-    fx0, fy0: the tile corner's pixel centre from the anchor; row: from :func:`load_ray`.
+    fx0, fy0: offset of the tile corner's pixel centre from the anchor; row: from :func:`load_ray`.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
     y = np.floor(pixel * f(1 / P.TILE))
@@ -358,13 +358,13 @@ def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 
 @inline_source
 def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
-    """dh/dD of h = sqrt(D/a), with the floor on D; a soft edge needs none, as D^p tames what grows as D^-1/2."""
+    """Return dh/dD of h = sqrt(D/a), with the floor on D; a soft edge needs none: D^p outweighs the growing D^-1/2."""
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
 
 @inline_source
 def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
-    """FADE of a whole chord, the mean of (1 - |y|^2)^p, and its derivative by D; 1 and 0 for a hard edge."""
+    """Return FADE of a whole chord, the mean of (1 - |y|^2)^p, and its derivative by D; 1 and 0 for a hard edge."""
     inner = max(D, f(0))
     if len(edge) == 0:
         return f(1), f(0)
@@ -377,9 +377,9 @@ def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
 def chord_backward(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
-    """From dL/d(half, MID), dL/d(chord middle) = q, dL/d(half e) = v to dL/d(origin m, direction e) of the ray.
+    """Return dL/d(origin m, direction e) of the ray, from dL/d(half, MID), dL/d(chord middle) = q, dL/d(half e) = v.
 
-    g_tm, gD, gA: what reaches closest approach, D = 1 - |p|^2 and a = e.e other than through the chord's ends.
+    g_tm, gD, gA: gradients of the closest approach, D = 1 - |p|^2 and a = e.e that bypass the chord's ends.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)
@@ -398,13 +398,13 @@ def chord_backward(  # type: ignore[no-untyped-def]
 
 @inline
 def zero_ray_sums():  # type: ignore[no-untyped-def]
-    """The sums of :func:`add_ray_gradient` at the start."""
+    """Return the initial sums of :func:`add_ray_gradient`."""
     return f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0)
 
 
 @inline
 def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
-    """One lane's share of dL/d(E0, EX, EY, XA), from dL/dm and dL/de; ``reach`` is tc + slide."""
+    """Return the sums plus one lane's dL/d(E0, EX, EY, XA), from dL/dm and dL/de; ``reach`` is tc + slide."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
     return (
@@ -416,7 +416,7 @@ def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez): 
 
 @inline
 def store_ray_gradient(sums, out):  # type: ignore[no-untyped-def]
-    """Write the sums into a gradient row."""
+    """Write the sums of :func:`add_ray_gradient` into a gradient row."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     out[P.E0], out[P.E0 + 1], out[P.E0 + 2] = a0, a1, a2
     out[P.EX], out[P.EX + 1], out[P.EX + 2] = a3, a4, a5

@@ -1,8 +1,8 @@
 """Colour networks (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and colours of lanes.
 
-A network sees the chord's middle, which the density's pixel stage leaves in the lanes. Its first layer goes to whitened
-axes and turns once per primitive, as the density's neurons do; nothing here depends on the camera. RAY_COLOUR holds
-colours before max(0, .). Three channels have fused loops; other counts, and float64, go unit by unit through ``V``.
+The input of a network is the chord's middle, which the density's pixel stage leaves in the lanes. Its first layer is
+converted to whitened axes and turns once per primitive, like the density's neurons; nothing here depends on the camera.
+RAY_COLOUR holds colours before max(0, .). Three channels have fused loops; other counts, and float64, go through ``V``.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Array = np.ndarray[Any, Any]
 
 
 class ColourNet(NamedTuple):
-    """The networks of one frame, as the pixel kernels take them."""
+    """The colour networks of one frame, as inputs of the pixel kernels."""
 
     # (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
     # weights
     rows: Array
-    wide: Array  # the same in float64 of the primitives that are drawn so, by slot
-    hidden: int  # units per primitive, padded to a whole number of pairs by units without output
+    wide: Array  # the same in float64 for primitives drawn in float64, by slot
+    hidden: int  # units per primitive, padded to an even number by units without output
 
 
 # ---- Per primitive
@@ -41,7 +41,7 @@ class ColourNet(NamedTuple):
 
 @exact_kernel
 def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, fast):  # type: ignore[no-untyped-def]
-    """Rows ``out[n]`` of primitives ``which[n]``; ``fast[n]`` where a unit turns too fast for float32."""
+    """Fill rows ``out[n]`` of primitives ``which[n]``; set ``fast[n]`` if a unit turns too fast for float32."""
     H, C = Wx.shape[1], Wout.shape[1]
     local, axes = np.empty((3, 3)), np.empty(3)
     for n in range(start, stop):
@@ -71,7 +71,7 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
 
 
 def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Return the network rows of primitives ``which``, float64 if ``wide``, and which of them have a fast unit."""
+    """Return network rows of primitives ``which``, float64 if ``wide``, and which have a unit too fast for float32."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
@@ -84,9 +84,9 @@ def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool,
 def colour_net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
-    """Chain rule from gradient rows, networks' columns from ``first`` on, to parameters of ``start:stop``.
+    """Backpropagate gradient rows, whose network columns begin at ``first``, to parameters of ``start:stop``.
 
-    Adds to ``g_log_scales`` and ``g_quats``; what flows through the chord's middle is in the density's columns already.
+    Adds to ``g_log_scales`` and ``g_quats``; the gradient by the chord's middle is in the density's columns already.
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)
@@ -144,7 +144,7 @@ def _ray_rgb_unit(p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
-    """RAY_COLOUR += output of two units, three channels; with ``slopes`` also their cos and d cos/d turn."""
+    """Add the outputs of two units to RAY_COLOUR, three channels; with ``slopes`` fill their cos and d cos/d turn."""
     ax, ay, az, ab, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, bb, b0, b1, b2 = _ray_rgb_unit(p, o2)
     for k in range(n):
@@ -167,7 +167,7 @@ def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyp
 
 @inline
 def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
-    """cos and d cos/d turn of one unit."""
+    """Fill cos and d cos/d turn of one unit."""
     wx, wy, wz, b = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE]
     for k in range(n):
         u = S[L.QX + k] * wx + S[L.QY + k] * wy + S[L.QZ + k] * wz + b
@@ -179,7 +179,7 @@ def _unit_waves(S, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
-    """The same from a float64 row and float64 chord middles."""
+    """Fill cos and d cos/d turn of one unit from a float64 row and float64 chord middles."""
     for k in range(n):
         r = chord_phase_float64(D, k, p, o)
         z = r * r
@@ -189,7 +189,7 @@ def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
-    """RAY_COLOUR += output of all units, any channels, from their cos in ``V``."""
+    """Add the outputs of all units to RAY_COLOUR, any channels, from their cos in ``V``."""
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
         for j in range(hidden):
@@ -200,7 +200,7 @@ def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-untyped-def]
-    """RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also ``V`` for :func:`ray_colour_gradient`."""
+    """Fill RAY_COLOUR of ``n`` lanes of primitive ``i``; with ``slopes`` also ``V`` for :func:`ray_colour_gradient`."""
     C, p = base.shape[0], net.rows[i]
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
@@ -222,7 +222,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
-    """Gradients of two units, three channels, and their share of dL/dQ."""
+    """Fill the gradients of two units, three channels, and add their share of dL/dQ."""
     ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
@@ -258,7 +258,7 @@ def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped
 
 @inline
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
-    """Gradients of one unit, any channels, and its share of dL/dQ. Uses up the unit's cos in ``V0``."""
+    """Fill the gradients of one unit, any channels, and add its share of dL/dQ. Overwrites the unit's cos in ``V0``."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
@@ -286,7 +286,7 @@ def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
-    """From dL/d RAY_COLOUR of every lane to the gradient row: base at ``base_at``, then the units; adds to dL/dQ."""
+    """Fill the gradient row from dL/d RAY_COLOUR of the lanes: base at ``base_at``, then the units; add to dL/dQ."""
     p, row = net.rows[i], out[base_at + C :]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)

@@ -1,9 +1,9 @@
 """Compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
 
 A first pass over a tile's primitives lists the hits. Each pixel's hits are sorted and composited front to back. The
-backward pass lists and composites again, walks back to front to dL/d(2 FIELD HALF) of every hit, and in a second pass
-over the primitives writes the gradient rows of the default kernel. Nothing can stop early, so hidden primitives cost
-time. Entries that agree in float32 keep the order of the centres, and so do chords that the near plane cuts.
+backward pass lists and composites again, computes GRAD of every hit back to front, and in a second pass over the
+primitives writes the same gradient rows as the default kernel. Nothing can stop early, so hidden primitives cost time.
+Entries that agree in float32, and chords that the near plane cuts, keep the order of the centres.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ from neuprim.core.render.cpu.tiles import box_pixels, chord_field_values, compac
 
 f = np.float32
 
-# One row per hit of the tile, because hits are read in another order than they are written. The backward pass fills the
-# last three. H_DEPTH: camera-z of the chord's middle.
+# One row per hit of the tile, because hits are not read in the order in which they are written. The backward pass fills
+# the last three. H_DEPTH: camera-z of the chord's middle.
 H_ENTRY, H_ALPHA, H_SLOPE, H_DEPTH, H_OPTICAL, H_WEIGHT, H_BEFORE, H_GRAD = range(8)
 H_FLOATS = 8
 H_PIXEL, H_LANE, H_PAIR = 0, 1, 2  # pixel of the tile, lane of the pair, pair of the tile
@@ -34,7 +34,7 @@ Array = np.ndarray[Any, Any]
 
 
 class _PairLanes(NamedTuple):
-    """Memory for the lanes of one pair; ``waves`` of a colour network, else None."""
+    """Scratch memory for the lanes of one pair; ``waves`` is for a colour network, else None."""
 
     S: Array
     D: Array
@@ -76,7 +76,7 @@ def _allocate_lanes(C, net):  # type: ignore[no-untyped-def]
 
 @inline
 def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-def]
-    """Room for the hits of any of the tiles ``start:stop``: their boxes' pixels."""
+    """Allocate room for the hits of any of the tiles ``start:stop``: the pixels in its pairs' boxes."""
     room, pairs = 1, 1
     for t in range(start, stop):
         first, end = frame.starts[t], frame.starts[t + 1]
@@ -104,7 +104,7 @@ def _gather_lanes(lanes, frame, pair):  # type: ignore[no-untyped-def]
 
 @inline
 def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
-    """Ray norms of a tile's pixels, and which of its rows lie in the image."""
+    """Load the ray norms of a tile's pixels, and which of its rows lie in the image."""
     height, width = norms.shape
     for y in range(P.TILE):
         lanes.rows_live[y] = f(1) if ty + y < height else f(0)
@@ -155,9 +155,9 @@ def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge): 
 
 @inline
 def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
-    """Fill ``listing`` and ``pixel_start``.
+    """Fill ``listing``, the hits sorted by pixel and entry, and ``pixel_start``, each pixel's first index in it.
 
-    Counting sort by pixel, which keeps the order of the centres, then a stable insertion sort: few hits move far.
+    A counting sort by pixel keeps the order of the centres; a stable insertion sort follows, as few hits move far.
     """
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     begin[:] = 0
@@ -169,7 +169,7 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
         j = marks[s, H_PIXEL]
         listing[begin[j]] = s
         begin[j] += 1
-    for j in range(P.PIXELS):  # every begin has moved to its end: move them back
+    for j in range(P.PIXELS):  # each begin is now its end: shift them back
         begin[P.PIXELS - j] = begin[P.PIXELS - j - 1]
     begin[0] = 0
     for j in range(P.PIXELS):
@@ -185,7 +185,7 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` gets the hits per pixel."""
+    """Do what :func:`~neuprim.core.render.cpu.forward.composite_tiles` does; ``image.last`` gets the hits per pixel."""
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE
@@ -231,7 +231,7 @@ def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # t
 
 @inline
 def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net):  # type: ignore[no-untyped-def]
-    """Composite the hits of one tile again and walk back: weights and dL/d(2 FIELD HALF) of every hit."""
+    """Composite the hits of one tile again, then go back to front: fill weight and GRAD of every hit."""
     values, marks, listing, begin = hits.values, hits.marks, hits.listing, hits.pixel_start
     height, width = norms.shape
     for y in range(min(P.TILE, height - ty)):
@@ -264,7 +264,7 @@ def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net)
 
 @kernel
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.backward.backward_tiles`, but composites anew."""
+    """Do what :func:`~neuprim.core.render.cpu.backward.backward_tiles` does, but composite again."""
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE
     C, neurons, with_depth = colors.shape[1], frame.neurons, image.with_depth

@@ -1,7 +1,7 @@
-"""The float64 pixel stage, for the few primitives that float32 cannot follow; results are rounded to float32 lanes.
+"""The float64 pixel stage, for the few primitives that need more than float32; results are rounded to float32 lanes.
 
-Whole chords take the functions of the float32 stage, with phases reduced in float64. Where the near plane cuts a chord
-with a soft edge these do not apply. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the
+Whole chords use the functions of the float32 stage, with phases reduced in float64. These do not apply where the near
+plane cuts a chord with a soft edge. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the
 closest approach, a = e.e and shift from there to the middle. Its p-th power is a polynomial q; the mean of
 q cos(phase + z u) follows from the moments
 
@@ -24,8 +24,8 @@ from neuprim.core.render.cpu.chord import TAU, chord_edge_fade, cos_turns, reduc
 f = np.float32
 _PI2 = 2.0 * np.pi
 _TERMS = 14
-# float64 lanes: chord middle and half chord vector in whitened space, then 1 - |y|^2 at the closest approach, how far
-# the middle is from it and the half chord (units of m along e), and e.e
+# float64 lanes: chord middle and half chord vector in whitened space, 1 - |y|^2 at the closest approach, shift from
+# there to the middle, e.e, and half chord (shift and half chord in units of m along e)
 _Q0, _Q1, _Q2 = _Q = L.lane_array(0), L.lane_array(1), L.lane_array(2)
 _V0, _V1, _V2 = _V = L.lane_array(3), L.lane_array(4), L.lane_array(5)
 _INNER, _SHIFT, _SQUARE, _HALF = L.lane_array(6), L.lane_array(7), L.lane_array(8), L.lane_array(9)
@@ -34,7 +34,7 @@ FLOAT64_SCRATCH = L.lane_array(10)
 
 @inline
 def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """As :func:`~neuprim.core.render.cpu.tiles.lane_chords` from the float64 row; returns whether a chord is cut."""
+    """Do what :func:`~neuprim.core.render.cpu.tiles.lane_chords` does, in float64; return whether a chord is cut."""
     p, fx0, fy0 = frame.wide[frame.slots[pair.i]], pair.tx + 0.5, pair.ty + 0.5
     e0, e1, e2, tc, near = p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.TC], p[P.NEAR]
     x0, x1, x2, y0, y1, y2 = p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2]
@@ -82,14 +82,14 @@ def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ign
 
 @inline
 def chord_phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Phase at the chord's middle of the unit at ``o`` of a float64 row, reduced to half a turn."""
+    """Return the phase, at the chord's middle, of the unit at ``o`` of a float64 row, reduced to half a turn."""
     u = X[k + _Q0] * p[o + P.WX] + X[k + _Q1] * p[o + P.WY] + X[k + _Q2] * p[o + P.WZ] + p[o + P.PHASE]
     return f(u - np.rint(u))
 
 
 @inline
 def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Phase at the chord's middle, reduced to half a turn, and half its change, in turns."""
+    """Return the phase at the chord's middle, reduced to half a turn, and its change over half a chord, in turns."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
     v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
@@ -98,7 +98,7 @@ def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) B_p(half its change) of every neuron; in ``V`` the gradients' products."""
+    """Add w2 cos(phase at the middle) B_p(half its change) of every neuron to FIELD; fill ``V`` for gradients."""
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
         wx, wy, wz, phase, amplitude = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], f(p[o + P.AMPLITUDE])
@@ -117,7 +117,7 @@ def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyp
 
 @inline
 def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
-    """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
+    """Fill ``j`` with j_0 to j_5 of any z: by a series below 2, where upward recursion loses digits."""
     if abs(z) < 2.0:
         square, power = 0.5 * z * z, 1.0
         for n in range(6):
@@ -136,7 +136,7 @@ def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
 
 @inline
 def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
-    """M[n] = C_n for even n, S_n for odd n, n = 0..5."""
+    """Fill M[n] = C_n for even n, S_n for odd n, n = 0..5."""
     _chord_bessel(z, j)
     M[0], M[1] = j[0], j[1]
     M[2], M[3] = (j[0] - 2.0 * j[2]) / 3.0, (3.0 * j[1] - 2.0 * j[3]) / 5.0
@@ -146,7 +146,7 @@ def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
 
 @inline
 def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
-    """Coefficients q[0..4] of (D - a (shift + half u)^2)^p, and their mean over the chord."""
+    """Fill coefficients q[0..4] of (D - a (shift + half u)^2)^p; return the polynomial's mean over the chord."""
     c0, c1, c2 = D - square * shift * shift, -2.0 * square * shift * half, -square * half * half
     q[0], q[1], q[2], q[3], q[4] = c0, c1, c2, 0.0, 0.0
     if soft == 2:
@@ -156,8 +156,8 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 
 @inline
 def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
-    """The same of a soft edge where the near plane cuts, and FADE; with ``V`` also what gradients need of p q^(p - 1)
-    and its moments."""
+    """Add the neurons' weighted means to FIELD, and fill FADE, where the near plane cuts soft-edged chords; with ``V``
+    also fill it and BY_D, BY_A, BY_TM, which need p q^(p - 1) and its moments."""
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
         D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]
@@ -200,7 +200,7 @@ def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped
 
 @inline
 def neurons_float64(S, X, V, n, p, neurons, cut, edge):  # type: ignore[no-untyped-def]
-    """FIELD += the weighted mean of every neuron, and FADE of ``cut`` chords; in ``V`` (None: not) for gradients."""
+    """Add every neuron's weighted mean to FIELD; fill FADE of ``cut`` chords and, unless None, ``V`` for gradients."""
     if len(edge) > 0 and cut:
         _cut_chord_neurons(S, X, V, n, p, neurons, len(edge))
     else:

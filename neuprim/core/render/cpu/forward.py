@@ -1,7 +1,7 @@
-"""Compositing in the order of centres, forward, and what it saves for the backward pass.
+"""Forward pass of compositing in the order of centres, and the data that it saves for backward.
 
 Saved are the optical depth of every evaluated lane (4 bytes), and per pair its live tile rows (2 bytes) and its first
-lane in its chunk of tiles (4 bytes), so that the backward pass composites before it has evaluated a neuron.
+lane in its chunk of tiles (4 bytes). So the backward pass can composite before it evaluates a neuron.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from neuprim.core.render.cpu.tiles import (
 )
 
 f = np.float32
-index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
+index = np.uint64  # an unsigned index is never negative (from the end), so that LLVM vectorises without slices
 _STEPS = np.arange(P.TILE).astype(np.float32)
-_LIVE_EVERY = 4  # pairs between two counts of live pixels: a dead row costs a few lanes, a count a reduction per row
+_LIVE_EVERY = 4  # pairs between two checks for live pixels: a dead row wastes a few lanes, a check reduces every row
 Array = np.ndarray[Any, Any]
 
 
@@ -41,16 +41,16 @@ class TileImage(NamedTuple):
     rgb: Array
     transmittance: Array
     zsum: Array  # (H, W) sum of w z, filled if with_depth
-    last: Array  # (H, W) rank + 1 of each pixel's last contributor; sorted by entry, the number of its hits
+    last: Array  # (H, W) rank + 1 of each pixel's last contributor; if sorted by entry, its hits
     background: Array
     with_depth: bool
 
 
 @dataclass
 class SavedForBackward:
-    """What the forward pass of one frame saves."""
+    """Data that the forward pass of one frame saves for backward."""
 
-    # (pairs,) bit y is set where row y of the tile was live when the pair was drawn; no pairs if nothing is saved
+    # (pairs,) bit y is set if row y of the tile was live when the pair was drawn; no pairs if nothing is saved
     live: Array
     first_lane: Array  # (pairs,) first lane of each pair in the depths of its chunk
     # per chunk of tiles (lanes,) optical depth of each evaluated lane
@@ -58,7 +58,7 @@ class SavedForBackward:
 
     @classmethod
     def allocate(cls, pairs: int) -> SavedForBackward:
-        """Room for this many pairs; 0 saves nothing."""
+        """Allocate memory for this many pairs; 0 saves nothing."""
         return cls(np.empty(pairs, np.uint16), np.empty(pairs, np.int32))
 
 
@@ -72,7 +72,7 @@ def _live_tile_row_bits(rows_live):  # type: ignore[no-untyped-def]
 
 @inline
 def _depth_array(floats):  # type: ignore[no-untyped-def]
-    """Floats that begin a cache line, uninitialised: memory is taken where it is written."""
+    """Return uninitialised floats aligned to a cache line; the system provides memory only where it is written."""
     block = np.empty(floats + 16, np.float32)
     shift = -(np.int64(block.ctypes.data) // 4) % 16
     return block[shift : shift + floats]
@@ -80,7 +80,7 @@ def _depth_array(floats):  # type: ignore[no-untyped-def]
 
 @inline
 def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
-    """An upper bound of the lanes of tiles ``start:stop``, in whole vectors."""
+    """Return an upper bound of the lanes of tiles ``start:stop``, in whole vectors."""
     lanes = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
@@ -91,7 +91,7 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
-    """ALPHA: 0 below alpha_min and for integrals that are not positive, at most alpha_max; depth to ``depths``."""
+    """Fill ALPHA: 0 below alpha_min and for integrals <= 0, at most alpha_max; if ``keep``, fill ``depths``."""
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
@@ -104,13 +104,13 @@ def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-un
         S[L.ALPHA + k] = alpha if depth > f(0) else f(0)
 
 
-# ---- One pixel row; ``at`` is the lane of the row's pixel 0. A pixel is live while T >= T_min. A ``net`` has left the
-# lanes' own colours in RAY_COLOUR, before max(0, .).
+# ---- One pixel row; ``at`` is the lane of the row's pixel 0. A pixel is live while T >= T_min. With a ``net``,
+# RAY_COLOUR holds the lanes' own colours, before max(0, .).
 
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
-    """Three channels: colour += alpha T c, then T."""
+    """Three channels: add alpha T c to the colour, then update T."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -131,7 +131,7 @@ def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # typ
 
 @inline
 def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-untyped-def]
-    """Any channels and depth: T alone; leaves the weights in ``w``."""
+    """Any channels, with depth: update T only, and fill the weights ``w``."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -146,7 +146,7 @@ def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-
 
 @inline
 def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
-    """Any channels: colour += w c."""
+    """Any channels: add w c to the colour."""
     for c in range(color.shape[0]):
         st = state[L.COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -161,7 +161,7 @@ def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-
 
 @inline
 def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
-    """A tile that no primitive reaches."""
+    """Fill a tile that no primitive reaches with the background."""
     for y in range(down):
         Y = index(ty + y)
         for x in range(wide_row):
@@ -195,12 +195,12 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 
 @kernel
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
-    """Draw tiles ``start:stop``; returns the number of evaluated lanes and, if ``live`` has room, their depths.
+    """Draw tiles ``start:stop``; returns the number of evaluated lanes and, unless ``live`` is empty, their depths.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
         colors: (N, C) colours, or the bases of the networks' colours.
-        net: :class:`~neuprim.core.render.cpu.colour_net.ColourNet`; None leaves no trace in the compiled kernel.
+        net: :class:`~neuprim.core.render.cpu.colour_net.ColourNet`; None compiles a kernel without networks.
         edge: one of :data:`~neuprim.core.render.cpu.chord.EDGE_TYPES`.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
@@ -261,7 +261,7 @@ def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, ed
                 for y in range(pair.y0, pair.y1):
                     a, b = bounds[y], bounds[y + P.TILE]
                     if b > a:
-                        # the row's lanes start at offset[y], its pixels at a: shift so that both run with k
+                        # the row's lanes start at offset[y], its pixels at a: shift both so that k indexes them
                         at, base = offset[y] - a, y * P.TILE
                         if C == 3 and not with_depth:
                             _composite_rgb_row(state, S, base, at, a, b, tmin, rank, colors[i], net)

@@ -1,7 +1,7 @@
-"""From dL/d(2 FIELD HALF FADE) of every lane of a pair to its gradient row, for both orders of compositing.
+"""Compute the gradient row of a pair from dL/d(2 FIELD HALF FADE) of its lanes, for both orders of compositing.
 
 :func:`neuron_gradients` and :func:`chord_gradient` read chords from the lanes, which float64, colour networks and many
-neurons need. :func:`gradients_at_once` holds a chord in registers from end to end, with at most two neurons.
+neurons need. :func:`gradients_at_once` keeps a chord in registers throughout, with at most two neurons.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.tiles import lane_chords
 
 f = np.float32
-AT_ONCE = 2  # neurons, at most, whose sums stay in registers beside those of the chord
+AT_ONCE = 2  # largest number of neurons whose sums fit into registers with those of the chord
 _TINY = f(1e-30)
 
 
@@ -41,7 +41,7 @@ def _load_neuron(p, o):  # type: ignore[no-untyped-def]
 
 
 def _neuron_products(slopes):  # type: ignore[no-untyped-def]
-    """cos B, d(cos B)/d phase and cos dB/d rate of two neurons on a chord with middle q and half chord vector v."""
+    """Return a function for cos B, d(cos B)/d phase, cos dB/d rate of two neurons; q: chord middle, v: half chord."""
 
     @inline
     def products(edge, qx, qy, qz, vx, vy, vz, first, second):  # type: ignore[no-untyped-def]
@@ -65,7 +65,7 @@ _slow, _medium, _fast = _neuron_products(slopes_slow), _neuron_products(slopes_m
 
 @inline
 def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """One lane's share of dL/d(amplitude, phase, W) but for the amplitude, from the three products times dL/d FIELD."""
+    """Return the sums plus a lane's dL/d(amplitude, phase, W), without factor amplitude, from products x dL/d FIELD."""
     s0, s1, s2, s3, s4 = sums
     return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
 
@@ -78,7 +78,7 @@ def _store_neuron_gradient(sums, amplitude, m, out):  # type: ignore[no-untyped-
     out[o + P.WX], out[o + P.WY], out[o + P.WZ] = amplitude * s2, amplitude * s3, amplitude * s4
 
 
-# ---------------------------------------------------------------- a chord in registers from end to end
+# ---------------------------------------------------------------- the chord stays in registers
 
 
 @inline
@@ -154,7 +154,7 @@ _with_two_fast = _gradients_of_two_neurons(_fast)
 
 @inline
 def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
-    """The gradient row of a pair with at most :data:`AT_ONCE` neurons from PIXEL and GRAD of its lanes."""
+    """Fill the gradient row of a pair with at most :data:`AT_ONCE` neurons, from PIXEL and GRAD of its lanes."""
     if frame.neurons == 0:
         _gradients_without_neurons(S, n, frame, pair, edge, out)
         return
@@ -167,13 +167,13 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
         _with_two_fast(S, n, frame, pair, edge, out)
 
 
-# ---------------------------------------------------------------- a chord in the lanes
+# ---------------------------------------------------------------- the chord is in the lanes
 
 
 @inline
 def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped-def]
-    """Chords of ``n`` lanes of a pair; in float64 also the three products per neuron, in ``V``. Returns whether it is
-    in float64 and a chord is cut."""
+    """Fill the chords of ``n`` lanes of a pair; in float64 also the three products per neuron, in ``V``. Return whether
+    the pair is in float64 and the near plane cuts a chord."""
     slot = frame.slots[pair.i]
     if slot >= 0:
         cut = chords_float64(S, D, n, frame, pair, False, True, edge)
@@ -185,7 +185,7 @@ def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped
 
 @inline
 def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyped-def]
-    """From dL/d(2 FIELD HALF FADE) to dL/d FIELD, with FIELD from the optical depth; sums for b2 and log m."""
+    """Fill dL/d FIELD from dL/d(2 FIELD HALF FADE), and FIELD from the optical depth; sum up dL/d b2 and log m."""
     offset, log_m = f(0), f(0)
     for k in range(n):
         g = f(2) * S[L.GRAD + k]
@@ -201,7 +201,7 @@ def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyp
 
 
 def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
-    """Gradients of neurons m and m + 1, and their share of dL/dQ and dL/d(half e); None: products from V0 and V1."""
+    """Return a function for gradients of neurons m and m + 1, dL/dQ and dL/d(half e); None: products from V0, V1."""
 
     @inline
     def add(S, V0, V1, n, p, m, edge, out):  # type: ignore[no-untyped-def]
@@ -244,7 +244,7 @@ _two_float64 = _two_neuron_lane_gradients(None)
 
 @inline
 def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  # type: ignore[no-untyped-def]
-    """Gradients of b2, log m and every neuron of a pair, and dL/dQ and dL/d(half e) of its lanes."""
+    """Fill the gradients of b2, log m and every neuron of a pair, and dL/dQ and dL/d(half e) of its lanes."""
     _chord_field_gradient(S, n, out, edge, in_float64)
     for m in range(0, neurons, 2):
         kind = kinds[m // 2]
@@ -263,19 +263,19 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  #
 
 @inline
 def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
-    """From chord middle, half chord and direction back to the affine ray (E0, EX, EY, XA).
+    """Fill dL/d(E0, EX, EY, XA) of the affine ray from the gradients by chord middle, half chord and direction.
 
-    A hard edge has the gradient of its ends, t0 and t1. A soft one has none there, but its weight depends on D = 1 -
-    |p|^2, and on a = e.e and the closest approach where the near plane cuts the chord. Where it cuts no chord of the
-    pair, BY_D is d FADE/dD, and the ends' share through HALF is kept. Otherwise (float64) the ends are left out, and
-    BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
+    A hard edge has gradients by the chord's ends, t0 and t1. A soft edge has none, but its weight depends on D = 1 -
+    |p|^2, and on a = e.e and the closest approach if the near plane cuts the chord. If it cuts no chord of the pair,
+    BY_D is d FADE/dD, and the ends' share through HALF is used. Otherwise (float64) the ends are left out, and BY_D,
+    BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()
     for k in range(n):
         half, ex, ey, ez = S[L.HALF + k], S[L.EXL + k], S[L.EYL + k], S[L.EZL + k]
         mid, tm, slide = S[L.MID + k], S[L.TM + k], S[L.SLIDE + k]
-        shift = mid - tm  # the closest point again: three stores fewer before
+        shift = mid - tm  # recompute the closest point: this saves three stores per lane
         px, py, pz = S[L.QX + k] - shift * ex, S[L.QY + k] - shift * ey, S[L.QZ + k] - shift * ez
         gqx, gqy, gqz = S[L.GQX + k], S[L.GQY + k], S[L.GQZ + k]
         gvx, gvy, gvz = S[L.GEX + k], S[L.GEY + k], S[L.GEZ + k]

@@ -7,12 +7,12 @@ from __future__ import annotations
 
 from neuprim.core.render.layout import G_NEURONS, NET_OUT, NEURONS, PER_NEURON, PIXELS
 
-# ---- Range of a pair of neurons' change over a half chord, in turns. Neurons are stored by rising rate, so that pairs
-# are alike.
+# ---- Range of rates of a pair of neurons: change over a half chord, in turns. Neurons are stored by rising rate, so
+# both neurons of a pair have similar rates.
 SLOW, MEDIUM, FAST = 0, 1, 2
 SLOW_TURNS, MEDIUM_TURNS = 0.4999, 1.4999
 
-LANES = 288  # 256 pixels of a tile, padded so that a vector may run over the end
+LANES = 288  # 256 pixels of a tile, padded so that a vector may extend past the end
 
 
 def _padded_row_width(floats: int) -> int:
@@ -67,7 +67,7 @@ BY_D, BY_A, BY_TM = lane_array(34), lane_array(35), lane_array(36)
 INSIDE = lane_array(37)  # dL/dQ . e of the density alone
 FORWARD_SCRATCH = lane_array(21)
 BACKWARD_SCRATCH = lane_array(38)
-# With a colour network also, forward and backward: C arrays of colours before max(0, .), then C of dL/d those.
+# With a colour network, forward and backward: C arrays of colours before max(0, .), then C of dL/d these colours.
 RAY_COLOUR = BACKWARD_SCRATCH
 # Per neuron of the float64 backward pass: cos sinc, -2 pi sin sinc, cos dsinc.
 N_COS, N_SIN, N_DSINC = lane_array(0), lane_array(1), lane_array(2)

@@ -1,7 +1,7 @@
 """The per-primitive stage, in float64: anchors, whitening, exact bounds.
 
 Each primitive is anchored at its own projected centre, so that whitened rays are affine in the pixel offset and float32
-never sees the distance to the camera (method: "Line integral"). Anchor and unit of t are constants without gradient.
+does not have to represent the distance to the camera (method: "Line integral"). Anchor and unit of t have no gradient.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Array = np.ndarray[Any, Any]
 
 
 class PrimitiveArrays(NamedTuple):
-    """Geometry and density of N primitives with K neurons, or the gradients by them."""
+    """Geometry and density of N primitives with K neurons, or gradients by them."""
 
     means: Array
     log_scales: Array
@@ -58,7 +58,7 @@ class PrimitiveArrays(NamedTuple):
 
 
 class View(NamedTuple):
-    """A camera: rotation and translation from world, intrinsics, size, near plane; ``turns``: omega0 / 2 pi."""
+    """A camera: world-to-camera rotation and translation, intrinsics, size, near plane; ``turns``: omega0 / 2 pi."""
 
     R: Array
     t: Array
@@ -73,7 +73,7 @@ class View(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """What :func:`prepare_primitives` fills for each primitive."""
+    """Results of :func:`prepare_primitives` for each primitive."""
 
     rows: Array  # (N, row_width) float32 rows of the pixel kernels
     # (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes
@@ -87,7 +87,7 @@ class Projected(NamedTuple):
 
     @classmethod
     def allocate(cls, count: int, neurons: int) -> Projected:
-        """Room for primitives with ``neurons`` each, which the kernels take in pairs."""
+        """Allocate memory for primitives with ``neurons`` each, padded to pairs for the kernels."""
         padded = neurons + neurons % 2
         return cls(
             rows=np.empty((count, L.row_width(padded)), np.float32),
@@ -103,13 +103,13 @@ class Projected(NamedTuple):
 
 @strict
 def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
-    """Whether no chord can reach the depth ``least``: no half chord is longer than the longest semi-axis."""
+    """Return whether no chord can reach the optical depth ``least``: no half chord exceeds the longest semi-axis."""
     return most <= 0.0 or most * NORMS[edge] <= least
 
 
 @strict
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
-    """r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
+    """Return r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
 
     ``most``: F; ``longest``: s, in units of the longest semi-axis. Rounded to float32, so that backends agree.
     """
@@ -123,7 +123,7 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
 
 @strict
 def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
-    """Whether the numbers of a primitive that is not drawn are finite, ``most`` for its amplitudes."""
+    """Return whether the numbers of a primitive that is not drawn are finite; ``most`` includes its amplitudes."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
     for a in range(3):
@@ -137,7 +137,7 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 
 @strict
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
-    """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels.
+    """Return the pixel range of the silhouette, scaled by ``square`` ** 0.5, along a screen axis.
 
     Tangents as in ``screen_boxes`` of the reference, in units of m; ``b``, ``towards``: rows of B of the screen axis
     and of depth; ``s22``: S_zz of the whole ellipsoid.
@@ -152,7 +152,7 @@ def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middl
 
 @strict
 def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length):  # type: ignore[no-untyped-def]
-    """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes.
+    """Return an upper bound, <= 1, of the half chords of all rays that hit the ellipsoid, in longest semi-axes.
 
     A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
     slopes. 1 where the anchor is not the centre.
@@ -171,7 +171,7 @@ def _cross(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def _moment_slope(x, e, axis, tc):  # type: ignore[no-untyped-def]
-    """How the moment x x e of the ray changes along a screen axis."""
+    """Return the derivative of the ray's moment, the cross product of x and e, along a screen axis."""
     a, b = _cross(x, axis), _cross(axis, e)
     return a[0] + tc * b[0], a[1] + tc * b[1], a[2] + tc * b[2]
 
@@ -208,7 +208,7 @@ def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
         S[BOX + k], S[BOX + BLOCK + k], S[BOX + 2 * BLOCK + k], S[BOX + 3 * BLOCK + k] = x0, y0, x1, y1
         reached, beyond = c[2] + reach > near, S[BIGGEST + k] > P.FLOAT32_MAX
         drawn = reached & (x1 > x0) & (y1 > y0) & (not (whole & (square == 0.0)))
-        # beyond float32: a scale or weight, or so small against its distance that no pixel centre can hit it
+        # beyond float32: an error if m > 1 (scale or weight); else too small for its distance to hit a pixel centre
         bad = (not (abs(S[TOTAL + k]) < np.inf)) | (reached & beyond & (m > 1.0))
         status = P.VISIBLE if drawn & (not beyond) else P.CULLED
         S[STATUS + k] = P.NON_FINITE if bad else status
@@ -241,11 +241,11 @@ def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
         ex, ey, x = load3(S, BLOCK * P.EX, k), load3(S, BLOCK * P.EY, k), load3(S, BLOCK * P.XA, k)
         ux, uy, c, axes, reach = S[UX + k], S[UY + k], load3(S, CENTRE, k), load3(S, AXES, k), S[REACH + k]
         ellipse = hy < P.UNBOUNDED
-        # the pixel offsets that meet the silhouette on the screen
+        # the largest pixel offsets of the silhouette on the screen
         tall = min(abs(yc) + hy, max(abs(0.5 - uy), abs(height - 0.5 - uy)))
         broad = min(abs(xc) + abs(skew) * (abs(yc) + hy) + hx, max(abs(0.5 - ux), abs(width - 0.5 - ux)))
-        # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle each
-        # is many radii of its thin axis, and they cancel
+        # the rest of sliding the origin, s G, and the two terms of the closest point: across a slanted needle, each is
+        # many radii of its thin axis long, and they cancel
         slide = abs(S[BLOCK * P.TU + k]) * broad + abs(S[BLOCK * P.TV + k]) * tall
         cancels = slide * (np.sqrt(dot3(ex, ex)) * broad + np.sqrt(dot3(ey, ey)) * tall) > P.FLOAT64_RADII
         xu, xv = load3(S, BLOCK * P.XU, k), load3(S, BLOCK * P.XV, k)
@@ -256,7 +256,7 @@ def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
         coarse |= dot3(x, x) > P.FLOAT64_ANCHOR**2  # centre far from the anchor, in the thinnest axis
         ratio = P.FLOAT64_RATIO_NEAR if tc == 0.0 else P.FLOAT64_RATIO
         coarse |= min(axes[0], axes[1], axes[2]) * ratio < 1.0
-        # only in float64 are there integrals of cut chords with a soft edge
+        # only the float64 stage can integrate cut chords with a soft edge
         coarse |= soft & (c[2] - reach < near + P.CUT * reach)
         coarse |= ellipse & cancels
         S[FLOAT64 + k] = 1.0 if coarse else 0.0
@@ -306,7 +306,7 @@ def _store_block(block, n, S, waves, rate, out):  # type: ignore[no-untyped-def]
 def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
     """Fill ``out`` for primitives ``start:stop``; silhouettes are those of rays that reach the optical depth ``least``.
 
-    A primitive that cannot reach it anywhere gets a status, an empty box and a depth of 0 alone.
+    A primitive that reaches it nowhere gets only a status, an empty box and a depth of 0.
     """
     parameters, view, out = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(out)
     w2, b2, boxes = parameters.w2, parameters.b2, out.boxes
@@ -317,7 +317,7 @@ def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type
         most = np.float64(b2[i])
         for k in range(w2.shape[1]):
             most += abs(np.float64(w2[i, k]))
-        if _is_too_faint_to_draw(most, edge, least):  # whatever its place
+        if _is_too_faint_to_draw(most, edge, least):  # wherever it is
             boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = 0, 0, 0, 0
             out.in_float64[i], out.depth[i] = False, 0.0
             out.status[i] = P.CULLED if _is_finite_undrawn_primitive(i, parameters, most) else P.NON_FINITE

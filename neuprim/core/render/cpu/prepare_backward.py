@@ -1,4 +1,4 @@
-"""The chain rule of the per-primitive stage: from gradient rows to parameters, in float64, in blocks."""
+"""Backward pass of the per-primitive stage: from gradient rows to parameters, in float64, in blocks."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from neuprim.core.render.cpu.blocks import (
     store3,
 )
 
-# Behind the columns of a block: dL/d(E0, EX, EY, XA), as in a gradient row, and dL/d of
+# Columns after those of a block: dL/d(E0, EX, EY, XA), as in a gradient row, then dL/d of the named quantities
 _RAYS = column(COLUMNS)
 _G_B, _G_LOCAL, _G_LOG_SCALES, _G_CENTRE, _G_LOG_M = (column(COLUMNS + n) for n in (12, 21, 30, 33, 36))
 _G_MEANS, _G_QUATS = (column(COLUMNS + n) for n in (37, 40))
@@ -40,7 +40,7 @@ _COLUMNS = COLUMNS + 56
 
 @strict
 def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-def]
-    """dL/d of a column of B and of the logarithm of its axis s, and what of dL/d centre, times -m, comes from it.
+    """Return dL/d of a column of B and of the logarithm of its axis s, and its share of -m dL/d centre.
 
     ``g``: dL/d(E0, EX, EY, XA) along the axis.
     """
@@ -54,7 +54,7 @@ def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-de
 
 @strict
 def _rays_backward(S, view):  # type: ignore[no-untyped-def]
-    """From dL/d rays to dL/d(B, log scales, centre) of a block."""
+    """Fill dL/d(B, log scales, centre) of a block from dL/d rays."""
     fx, fy, cx, cy = view.fx, view.fy, view.cx, view.cy
     for k in range(BLOCK):
         m, c, s = S[M + k], load3(S, CENTRE, k), load3(S, AXES, k)
@@ -97,7 +97,7 @@ def _neuron_backward(S, turns):  # type: ignore[no-untyped-def]
 
 @strict
 def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
-    """From dL/d(B, local axes, log m, centre) of a block to dL/d(means, log scales, quaternions)."""
+    """Fill dL/d(means, log scales, quaternions) of a block from dL/d(B, local axes, log m, centre)."""
     x, y, z = (R[0, 0], R[1, 0], R[2, 0]), (R[0, 1], R[1, 1], R[2, 1]), (R[0, 2], R[1, 2], R[2, 2])
     for k in range(BLOCK):
         logs, g_log, log_m, c = (
@@ -106,7 +106,7 @@ def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
             S[_G_LOG_M + k],
             load3(S, _G_CENTRE, k),
         )
-        second = logs[1] > logs[0]  # the longest axis is the first of equals
+        second = logs[1] > logs[0]  # of equal axes, the first counts as the longest
         third = logs[2] > (logs[1] if second else logs[0])
         store3(
             S, _G_LOG_SCALES, k,
@@ -132,7 +132,7 @@ def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
 
 @strict
 def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S):  # type: ignore[no-untyped-def]
-    """The chain rule of primitives ``which[:n]``."""
+    """Apply the chain rule to primitives ``which[:n]``."""
     W1, rows, order, turns = parameters.W1, projected.rows, projected.order, view.turns
     load_block(which, n, parameters, S)
     project_block(S, view)
@@ -179,10 +179,10 @@ def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S
 
 @exact_kernel
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
-    """Chain rule from gradient rows to parameters, for primitives ``start:stop``; zeros for those not ``touched``.
+    """Apply the chain rule from gradient rows to parameters of ``start:stop``; zeros for those not ``touched``.
 
-    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each one's part of dL/d(R | t), zeros
-    before; empty: unwanted.
+    Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t).
+    Pass ``g_view`` as zeros, or empty if it is not needed.
     """
     parameters, view, projected = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(projected)
     grads, out, g_view = borrow_array(grads), borrow_arrays(out), borrow_array(g_view)

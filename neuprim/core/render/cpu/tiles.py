@@ -33,10 +33,10 @@ from neuprim.core.render.cpu.float64 import chords_float64, neurons_float64
 from neuprim.core.render.cpu.prepare import Projected
 
 f = np.float32
-index = np.uint64  # an unsigned index cannot count from the end: LLVM vectorises without slicing first
+index = np.uint64  # an unsigned index is never negative (from the end), so that LLVM vectorises without slices
 _STEPS = np.arange(P.TILE).astype(np.float32)
-_NUMBERS = np.arange(P.PIXELS + P.TILE).astype(np.float32)  # of the tile's pixels, and a vector beyond
-_MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # pixels, and per pixel of the ellipse; a lane too many is rejected by its own D
+_NUMBERS = np.arange(P.PIXELS + P.TILE).astype(np.float32)  # of the tile's pixels, plus one vector
+_MARGIN, _ROUNDING = f(2e-3), f(4e-7)  # of a span: pixels, and per pixel of the ellipse; D rejects superfluous lanes
 Array = np.ndarray[Any, Any]
 
 
@@ -47,7 +47,7 @@ class TileLists:
     starts: NDArray[np.int64]  # (tiles + 1,) first pair of each tile
     ids: NDArray[np.int32]  # (pairs,) primitive of each pair
     first: NDArray[np.int64]  # (N + 1,) first entry of each primitive in slots
-    slots: NDArray[np.int32]  # (pairs,) where each primitive's pairs lie in ids
+    slots: NDArray[np.int32]  # (pairs,) index in ids of each primitive's pairs
 
     @property
     def pairs(self) -> int:
@@ -55,7 +55,7 @@ class TileLists:
 
 
 def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Front-to-back order; equal depths keep their index order.
+    """Return the front-to-back order; equal depths keep their index order.
 
     Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. Depths
     that agree to about 1e-9 of their value (1 million primitives) count as equal.
@@ -71,9 +71,9 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 
 @exact_kernel
 def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
-    """Tiles that the silhouettes of primitives ``start:stop`` reach, row by row, up to 1e-3 pixels more.
+    """Return the tiles that the silhouettes of primitives ``start:stop`` reach, row by row, up to 1e-3 pixels more.
 
-    ``first[i + 1]`` gets the number of primitive i. Primitives come in memory order, not in that of their depths.
+    ``first[i + 1]`` gets the number of tiles of primitive i. Primitives come in memory order, not in depth order.
     """
     rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
@@ -114,7 +114,7 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
 
 @exact_kernel
 def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
-    """Counting sort by tile; primitives come in depth order, so each tile's list is front to back."""
+    """Sort pairs by tile, by counting; primitives come in depth order, so each tile's list is front to back."""
     for k in range(tiles.shape[0]):
         starts[tiles[k] + 1] += 1
     for t in range(starts.shape[0] - 1):
@@ -132,7 +132,7 @@ def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignor
 def bin_primitives(
     projected: Projected, width: int, height: int, threads: int, images: tuple[Array, int] | None = None
 ) -> TileLists:
-    """Return the tile lists of a frame; with ``images``, (N,) numbers and their count, of several frames in a row."""
+    """Return the tile lists of a frame; with ``images``, (N,) image of each primitive and a count, of all images."""
     count = projected.depth.shape[0]
     across, down = -(-width // P.TILE), -(-height // P.TILE)
     first = np.zeros(count + 1, np.int64)
@@ -148,7 +148,7 @@ def bin_primitives(
 
 
 class FrameArrays(NamedTuple):
-    """One frame as the pixel kernels read it."""
+    """One frame, as input of the pixel kernels."""
 
     rows: Array  # (N, row_width) float32, one row per primitive (layout)
     wide: Array  # (M, row_width) float64 rows of the primitives that are drawn in float64
@@ -161,7 +161,7 @@ class FrameArrays(NamedTuple):
     starts: Array
     ids: Array
     norms: Array  # (H, W) length of each pixel's ray direction whose camera-z is 1
-    # of the settings, float32
+    # values of the settings, float32
     alpha_min: Any
     alpha_max: Any
     transmittance_min: Any
@@ -170,7 +170,7 @@ class FrameArrays(NamedTuple):
 
 
 class PairWindow(NamedTuple):
-    """Where primitive ``i`` meets the tile at (tx, ty): pixels x0:x1 of rows y0:y1; tile corner from the anchor."""
+    """Pixels x0:x1, rows y0:y1 of the tile at (tx, ty) in the box of primitive i; fx0, fy0: corner from the anchor."""
 
     i: int
     tx: int
@@ -194,7 +194,7 @@ def pair_window(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
-    """Pixels of a tile that lie in the box of primitive ``i``: an upper bound of the pair's lanes."""
+    """Return how many pixels of a tile are in the box of primitive ``i``: an upper bound of the pair's lanes."""
     box = frame.boxes[i]
     wide = min(box[2] - tx, P.TILE) - max(box[0] - tx, 0)
     high = min(box[3] - ty, P.TILE) - max(box[1] - ty, 0)
@@ -203,21 +203,21 @@ def box_pixels(frame, i, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def aligned_tile_zeros(floats):  # type: ignore[no-untyped-def]
-    """Zeros that begin a cache line; numba aligns to 32 bytes, and a vector across two lines costs twice."""
+    """Return zeros aligned to a cache line; numba aligns to 32 bytes, and a vector across two lines costs twice."""
     room = np.zeros(floats + 16, np.float32)
     shift = -(np.int64(room.ctypes.data) // 4) % 16
     return room[shift : shift + floats]
 
 
 def _emit_prefetch(context, address):  # type: ignore[no-untyped-def]
-    """Ask memory for the cache line at an address. Nothing is read, so that no address is wrong."""
+    """Prefetch the cache line at an address. Nothing is read, so any address is allowed."""
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
         byte, i32 = ir.IntType(8).as_pointer(), ir.IntType(32)
         function = builder.module.declare_intrinsic(
             "llvm.prefetch", (byte,), ir.FunctionType(ir.VoidType(), [byte, i32, i32, i32])
         )
-        builder.call(function, [builder.inttoptr(arguments[0], byte), i32(0), i32(3), i32(1)])  # to read, to stay, data
+        builder.call(function, [builder.inttoptr(arguments[0], byte), i32(0), i32(3), i32(1)])  # read, keep, data
         return context.get_dummy_value()
 
     return types.void(types.intp), code
@@ -228,7 +228,7 @@ _prefetch: Any = intrinsic(_emit_prefetch)
 
 @inline
 def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
-    """Ask memory for what the next pair, of primitive ``i``, reads first."""
+    """Prefetch the data that the next pair, of primitive ``i``, reads first."""
     rows, spans, boxes = frame.rows, frame.spans, frame.boxes
     row = rows.ctypes.data + i * rows.strides[0]
     for at in range(0, rows.strides[0], 64):
@@ -239,14 +239,14 @@ def prefetch_pair(i, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def prefetch_lane_depths(depths, first, stop):  # type: ignore[no-untyped-def]
-    """Ask memory for the optical depths of a pair's lanes ``first:stop``."""
+    """Prefetch the optical depths of a pair's lanes ``first:stop``."""
     for at in range(first, stop, 16):
         _prefetch(depths.ctypes.data + 4 * at)
 
 
 @inline
 def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, all 16 rows in one vector."""
+    """Fill pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, 16 rows in one vector."""
     skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
     ihy = f(1) / span[P.HY]
     low, high, top, bottom = f(pair.x0), f(pair.x1), f(pair.y0), f(pair.y1)
@@ -270,7 +270,7 @@ def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-
     """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Returns the lane count.
 
     Padding is the first lane's pixel with a norm of 0. Every row copies a whole vector without a branch; the next row,
-    or the padding, overwrites what stands over.
+    or the padding, overwrites the excess.
     """
     n = 0
     for y in range(y0, y1):
@@ -289,9 +289,9 @@ def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-
 
 @inline
 def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Chord middle Q, direction E and half length of n lanes; HALF = 0 where the ray misses.
+    """Fill chord middle Q, direction E and half length of n lanes; HALF = 0 where the ray misses.
 
-    A soft-edged chord may not be cut: such primitives are drawn in float64.
+    The near plane must not cut a soft-edged chord: such primitives are drawn in float64.
     """
     p, fx0, fy0, depth_floor = frame.rows[pair.i], pair.fx0, pair.fy0, frame.depth_floor
     row, offset = load_ray(p), p[P.OFFSET]
@@ -320,7 +320,7 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
 
 
 def _neuron_values(profiles):  # type: ignore[no-untyped-def]
-    """FIELD += w2 cos(phase at the middle) B_p(rate x half chord) of two neurons in one range of rates."""
+    """Return a function: FIELD += w2 cos(phase at middle) B_p(rate x half chord) of two neurons, one range of rates."""
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]
@@ -350,7 +350,7 @@ _values_fast = _neuron_values(profiles_fast)
 
 @inline
 def chord_field_values(S, D, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Chords and FIELD of ``n`` lanes of a pair, in float64 where float32 is too coarse; see :func:`lane_chords`."""
+    """Fill chords and FIELD of ``n`` lanes of a pair, in float64 if necessary; see :func:`lane_chords`."""
     i = pair.i
     if frame.slots[i] >= 0:
         cut = chords_float64(S, D, n, frame, pair, with_mid, backward, edge)

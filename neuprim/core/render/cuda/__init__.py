@@ -1,2 +1,2 @@
-"""NVIDIA backend in Warp: float64 preparation per primitive, float32 pixels; the same source runs on Warp's CPU blocks,
-for tests."""
+"""CUDA backend in Warp: float64 preparation per primitive, float32 pixels. For tests, the same source runs on Warp's
+CPU blocks."""

@@ -1,4 +1,4 @@
-"""The CUDA backend as one differentiable operation, on the tensors' device and the caller's stream."""
+"""The CUDA backend as one differentiable operation, on the tensors' device and torch's current stream."""
 
 from __future__ import annotations
 
@@ -119,7 +119,7 @@ def render(
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and depth of each slab, in one frame; see :func:`neuprim.core.render.render_slabs`."""
+    """Return opacity and depth of each slab, all drawn as one frame; see :func:`neuprim.core.render.render_slabs`."""
     means, settings = lowered.geometry.means, replace(settings, depth=True)
     tensors = rasterizer_tensors(lowered)
     blank = torch.zeros(len(means), 1, device=means.device)

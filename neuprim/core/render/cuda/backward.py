@@ -1,10 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Compositing, backward, over what the forward pass left in the pixels' slots.
+"""Backward pass of compositing, from the data that the forward pass saved in the pixels' slots.
 
-First a block a tile, a thread a pixel: it walks its hits back to front and leaves dL/dI and the weight in each slot.
-Then a warp a (tile, primitive) pair: chord and neurons again, sums in registers, one row per pair. A primitive's rows
-are added in the order of its pairs, so that reruns give the same bits. With 8 neurons the sums alone are 59 registers
-of 128, so over the neurons nothing is kept that a few operations give again.
+First, one block per tile, one thread per pixel: it visits its hits back to front and stores dL/dI and the weight in
+each slot. Then, one warp per (tile, primitive) pair: it recomputes chord and neurons, sums in registers, and writes one
+row per pair. A primitive's rows are added in the order of its pairs, so that reruns give the same bits. With 8 neurons
+the sums alone take 59 registers of 128, so values that a few operations can recompute are not kept over the neurons.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    """Return the pixels' kernel of a form; ``depth``: with a gradient of the sum of w z."""
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -82,8 +82,8 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
         transmittance: Floats, reached: Ints, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats,
         hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
-        """``g_transmittance`` has the background's share. With b the light behind a hit, dL/dI = (1 - alpha) T dL/dw -
-        b."""
+        """``g_transmittance`` includes the background's share. dL/dI = (1 - alpha) T dL/dw - b; b, the light behind the
+        hit, is the sum of w dL/dw of later hits and T dL/dT."""
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel_of_lane(lane)
@@ -132,7 +132,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    """Return the pairs' kernel of a form; ``depth``: with a gradient of the sum of w z."""
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -143,8 +143,8 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
     mean = float(NORMS[P])
     by_rate = -TAU * TAU / (2.0 * P + 3.0)  # B' = -z B_(p+1)/(2p + 3), and z = 2 pi v
 
-    # 128 registers: 16 warps a multiprocessor instead of 12. With 5 to 8 neurons; fewer need no cap, and with more they
-    # would spill
+    # a cap of 128 registers allows 16 warps per multiprocessor instead of 12. With 5 to 8 neurons only: fewer need no
+    # cap, and more would spill
     bounds = (L.WARP, 16) if 4 < K <= 8 else None
 
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False, launch_bounds=bounds)
@@ -156,7 +156,7 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
         tile = tiles[n]
         across = (size[0] + L.TILE - 1) // L.TILE
         i = ids[n]
-        if rows[i, L.REST][3] == 0.0:  # the others' rows come from a kernel in float64
+        if rows[i, L.REST][3] == 0.0:  # a float64 kernel writes the rows of the others
             total = row_of()
             if n < reached[tile]:
                 which = wp.tile_load(ids, shape=1, offset=n, storage="shared")
@@ -176,7 +176,7 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
                 gz = vecK()
                 gp = vecK()
                 ga = vecK()
-                # here, as no compiler moves a division out of a branch
+                # outside the loop, as no compiler moves a division out of a branch
                 corner = tile % across | (tile // across) << 16
                 begin = offsets[n]
                 count = offsets[n + 1] - begin
@@ -279,7 +279,7 @@ def sum_pairs(
     first: Ints, slots: Ints, pair_rows: Floats2d,
     grads: Floats2d,
 ):  # fmt: skip
-    """Thread (i, c): column c of primitive i's pair rows, in the order of its pairs."""
+    """Thread (i, c) sums column c of primitive i's pair rows, in the order of its pairs."""
     i, c = wp.tid()
     total = float(0.0)
     for k in range(first[i], first[i + 1]):
@@ -289,7 +289,7 @@ def sum_pairs(
 
 @functools.cache
 def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Back to front: (alpha, T) becomes (dL/dI, weight), as in ``pixels_kernel``."""
+    """Return a kernel for sorted hits, which does what ``pixels_kernel`` does: (alpha, T) to (dL/dI, weight)."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
 
@@ -338,7 +338,7 @@ class ImageGradient:
     """Gradients of an image, float32 and contiguous, and the error of each pixel for the contributions."""
 
     rgb: Tensor  # (H W, C)
-    transmittance: Tensor  # (H W,), with the background's share
+    transmittance: Tensor  # (H W,), includes the background's share
     z: Tensor | None  # (H W,)
     error: Tensor  # (H W,)
 
@@ -351,7 +351,7 @@ def rasterizer_gradient_rows(
     settings: RenderSettings,
     gradient: ImageGradient,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return (N, gradient_width) rows, and (N, net_gradient_row_width) of networks; uses up the slots' contents."""
+    """Return (N, gradient_width) rows, and (N, net_gradient_row_width) of networks or None; overwrites the slots."""
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     a = KernelArrays(frame, net, settings, drawn.spans, drawn.offsets)
@@ -391,7 +391,7 @@ def rasterizer_gradient_rows(
 
 
 def _sum_pair_rows(frame: Frame, pair_rows: Tensor) -> Tensor:
-    """(N, width) sums of the rows of each primitive's pairs."""
+    """Return (N, width) sums of the rows of each primitive's pairs."""
     grads = torch.empty(frame.rows.shape[0], pair_rows.shape[1], dtype=torch.float32, device=frame.device)
     lists = (warp_array(frame.lists.first), warp_array(frame.lists.slots_of))
     launch_kernel(sum_pairs, grads.shape, (*lists, warp_array(pair_rows), warp_array(grads)), frame.device)

@@ -1,7 +1,7 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Silhouettes, tile lists on the device, and the pixels of each pair; the twin of :mod:`neuprim.core.render.cpu.tiles`.
+"""Silhouettes, tile lists and pixels of each pair; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
 
-Everything is counted before it is written, and sorted by integers: a rerun gives the same bits. The host waits once.
+Everything is counted before it is written, and sorted by integers, so reruns give the same bits. Synchronises once.
 """
 
 import functools
@@ -45,13 +45,13 @@ _RADII = wp.constant(d(FLOAT64_RADII))
 (_N0, _N1, _N2), (_P0, _P1, _P2), (_W0, _W1, _W2) = (
     [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, RIM_POWERS, MIN_RIM_SHARES)
 )
-_MARGIN, _ROUNDING = 2e-3, 4e-7  # pixels, and per pixel of the ellipse; a pixel too many is rejected by its own D
+_MARGIN, _ROUNDING = 2e-3, 4e-7  # of a span: pixels, and per pixel of the ellipse; D rejects superfluous pixels
 _MOST = 2**31  # indices of pairs are int32
 
 
 @dataclass(frozen=True)
 class TileCounts:
-    """What the host learns of a frame."""
+    """Counts of a frame on the host, and running sums on the device."""
 
     pairs: int  # (tile, primitive) pairs
     in_float64: int  # primitives that are drawn in float64
@@ -61,13 +61,13 @@ class TileCounts:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs sorted by image, where there are several, then by tile, by depth and by index."""
+    """Pairs sorted by image (if there are several), then by tile, by depth and by index."""
 
     starts: Tensor  # (tiles + 1,) int32, first pair of each tile, of all images
     ids: Tensor  # (pairs,) int32, primitive of each pair
-    tile_of: Tensor  # (pairs,) int32, its tile of its image
+    tile_of: Tensor  # (pairs,) int32, tile of each pair in its image
     first: Tensor  # (N + 1,) int32, first entry of each primitive in slots_of
-    slots_of: Tensor  # (pairs,) int32, where each primitive's pairs lie in ids
+    slots_of: Tensor  # (pairs,) int32, index in ids of each primitive's pairs
 
     @property
     def pairs(self) -> int:
@@ -75,10 +75,10 @@ class TileLists:
 
 
 def count_tiles(counts: Tensor, bad: Tensor) -> TileCounts:
-    """Running sums of what ``prepare`` counted; the host waits here, once. BackendUnavailable: too many pairs."""
+    """Return totals and running sums of ``prepare``'s counts; synchronises. BackendUnavailable: too many pairs."""
     ends = torch.stack(
         [torch.cumsum(row, 0, dtype=torch.int64) for row in counts]
-    )  # along one row torch's scan is ten times faster
+    )  # torch's scan of a single row is ten times faster
     if counts.shape[1] == 0:
         return TileCounts(0, 0, -1, ends)
     pairs, in_float64, first_bad = torch.cat((ends[:, -1], bad.long())).tolist()
@@ -91,13 +91,13 @@ def count_tiles(counts: Tensor, bad: Tensor) -> TileCounts:
 
 @wp.func
 def projected_covariance(p: ProjectedPrimitive, i: int, j: int):
-    """Entry (i, j) of the covariance in camera axes, in units of m^2."""
+    """Return entry (i, j) of the covariance in camera axes, in units of m^2."""
     return wp.dot(wp.cw_mul(p.B[i], p.B[j]), wp.cw_mul(p.axes, p.axes))
 
 
 @wp.func
 def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.float64, square: wp.float64):
-    """Where the silhouette, ``square`` ** 0.5 times as large, begins and ends along a screen axis, in pixels."""
+    """Return the pixel range of the silhouette, scaled by ``square`` ** 0.5, along a screen axis."""
     z, ci, szz = p.centre[2] / p.m, p.centre[axis] / p.m, square * s22
     sii, siz = square * projected_covariance(p, axis, axis), square * projected_covariance(p, axis, 2)
     D = z * z * sii - d(2.0) * ci * z * siz + ci * ci * szz - (sii * szz - siz * siz)
@@ -109,7 +109,7 @@ def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.
 
 @wp.struct
 class SilhouetteSpans:
-    """A silhouette's row spans; whether it is an ellipse, and too coarse for float32."""
+    """A silhouette's row spans (hx, hy UNBOUNDED if it is no ellipse), and whether it needs float64."""
 
     skew: wp.float64
     xc: wp.float64
@@ -121,7 +121,7 @@ class SilhouetteSpans:
 
 @wp.func
 def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """|r e|^2 - |x x e|^2 > 0, r^2 = ``square``, as row spans: centre XC + SKEW (dv - YC), half width from (HX, HY)."""
+    """Return spans of |r e|^2 - |x x e|^2 > 0, r^2 = ``square``: centre XC + SKEW (dv - YC), half width by HX, HY."""
     o = SilhouetteSpans()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
@@ -141,13 +141,13 @@ def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, squ
             o.yc = round_projected_to_float32(yc)
             o.hx = round_projected_to_float32(wp.sqrt(peak) / -q3)
             o.hy = round_projected_to_float32(wp.sqrt(-peak / d2))
-            # the pixel offsets that meet the silhouette on the screen
+            # the largest pixel offsets of the silhouette on the screen
             ux, uy, half = p.anchor[1], p.anchor[2], d(0.5)
             tall = wp.min(wp.abs(yc) + o.hy, wp.max(wp.abs(half - uy), wp.abs(d(height) - half - uy)))
             broad = wp.abs(o.xc) + wp.abs(o.skew) * (wp.abs(yc) + o.hy) + o.hx
             broad = wp.min(broad, wp.max(wp.abs(half - ux), wp.abs(d(width) - half - ux)))
-            # what sliding the origin leaves over, s G, and the two terms of the closest point: across a slanted needle
-            # each is many radii of its thin axis, and they cancel
+            # the rest of sliding the origin, s G, and the two terms of the closest point: across a slanted needle, each
+            # is many radii of its thin axis long, and they cancel
             slide = wp.abs(r.tu) * broad + wp.abs(r.tv) * tall
             if slide * (wp.sqrt(wp.dot(r.ex, r.ex)) * broad + wp.sqrt(wp.dot(r.ey, r.ey)) * tall) > _RADII:
                 o.in_float64 = 1
@@ -160,7 +160,7 @@ def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, squ
 
 @wp.func
 def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
-    """A bound, at most 1, of the half chords of all rays that meet the ellipsoid, in its longest semi-axes."""
+    """Return an upper bound, <= 1, of the half chords of all rays that hit the ellipsoid, in longest semi-axes."""
     bound, one = d(1.0), d(1.0)
     if r.tc != d(0.0):
         z = p.centre[2]
@@ -179,7 +179,7 @@ def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64
 
 @wp.func
 def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
-    """An array would be a stack: its index is not known to the compiler."""
+    """Select a number by edge exponent. An array, indexed by a variable, would need stack memory."""
     number = hard
     if edge == 1:
         number = one
@@ -190,13 +190,13 @@ def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.f
 
 @wp.func
 def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
-    """Whether no chord can reach the depth ``least``, however long."""
+    """Return whether no chord, however long, can reach the optical depth ``least``."""
     return most <= d(0.0) or most * _chord_bound_by_edge(edge, _N0, _N1, _N2) <= least
 
 
 @wp.func
 def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
+    """Return r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
     square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
     if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
         square = d(1.0)
@@ -221,7 +221,7 @@ class Ellipse:
 
 @wp.func
 def silhouette_ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.float32, box: wp.vec4i):
-    """``span``: SKEW, XC, YC, HX."""
+    """Return the ellipse of a silhouette; ``span``: SKEW, XC, YC, HX."""
     e = Ellipse()
     e.box = box
     e.skew = d(span[0])
@@ -237,7 +237,7 @@ def silhouette_ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.flo
 
 @wp.func
 def tile_range(e: Ellipse, ty: int):
-    """First tile and one past the last that the silhouette reaches in row ``ty`` of tiles."""
+    """Return the first tile, and one past the last, that the silhouette reaches in row ``ty`` of tiles."""
     lo, hi = e.box[0] // _TILE, (e.box[2] - 1) // _TILE + 1
     if e.bounded > 0:
         d0 = wp.max(d(wp.max(ty * _TILE, e.box[1])) + e.base, -e.hy)
@@ -263,7 +263,7 @@ def _binning_kernels() -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Longs, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """A key tile << 32 | rank for every tile of the primitive of depth rank ``tid``; ``tiles`` per image, or 0."""
+        """Write keys tile << 32 | rank for the tiles of the primitive of depth rank tid; ``tiles`` per image, or 0."""
         rank = wp.tid()
         i = int(order[rank])
         last = int(ends[0, i])
@@ -289,7 +289,7 @@ def _binning_kernels() -> tuple[Any, Any]:
         keys: Longs, came_from: Longs, order: Longs, pairs: int, tiles: int, each: int,
         starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
-        """From sorted keys to lists; dim (pairs,). ``tiles``: of all images; ``each``: of one."""
+        """Fill the lists from sorted keys; dim (pairs,). ``tiles``: of all images; ``each``: of one."""
         k = wp.tid()
         key = keys[k]
         tile, rank = int(key >> wp.int64(32)), int(key & wp.int64(0xFFFFFFFF))
@@ -357,10 +357,10 @@ def row_spans(
     rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, ids: Ints, tiles: Ints, size: wp.vec2i, spans: Shorts2d,
     counts: Ints,
 ):  # fmt: skip
-    """Thread n: the pixels of its tile that pair n covers, start << 8 | last << 4 | first for each of 16 rows.
+    """Thread n fills the pixels of its tile that pair n covers: start << 8 | last << 4 | first for each of 16 rows.
 
-    Each has a slot, in the order of pairs, rows and pixels, for what the backward pass needs: a fifth of whole tiles'
-    memory.
+    Each pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. This takes a fifth
+    of the memory of whole tiles.
     """
     n = wp.tid()
     i = ids[n]

@@ -1,13 +1,13 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Native functions of the kernels: operations of a whole block, and array elements in one instruction each.
 
-Every thread of a block calls a block's operation; on Warp's CPU blocks a static buffer takes the hardware's place.
-Warp's indices may be negative and its strides are 64 bits: nine instructions for a row's span, of which two are needed
-in loops over hits, whose indices start at zero and whose arrays are contiguous
+Every thread of a block must call a block's operation; on Warp's CPU blocks, a static buffer replaces the hardware.
+Warp's own indexing takes nine instructions for a row's span, as it allows negative indices and 64-bit strides. Two
+suffice in loops over hits: their indices are not negative and their arrays contiguous
 (:func:`neuprim.core.compute.warp.array`).
 """
 
-# annotations are values here: Warp reads them, and cannot find what a function's own scope names in a text
+# annotations must be values, not text: Warp reads them, and cannot look up the local names of a function
 import functools
 from collections.abc import Callable
 from typing import Any
@@ -32,13 +32,14 @@ _ANY = """
 
 @wp.func_native(_ANY)
 def any_tile_thread(yes: int) -> int:
-    """Whether any thread of the block says so."""
+    """Return whether ``yes`` is not 0 in any thread of the block."""
 
 
 def _halving_sums(width: int) -> str:
-    """Each step keeps half of the values and adds a partner lane's: 31 shuffles per 32 values instead of 160.
+    """Return code that sums values over a warp: 31 shuffles per 32 values instead of 160.
 
-    Lane l ends with values l m to l m + m - 1, m = width/32. Loops run over constants alone, so that they are unrolled.
+    Each step keeps half of the values and adds a partner lane's; lane l ends with l m to l m + m - 1, m = width/32.
+    Loops have constant bounds, so that they are unrolled.
     """
     steps = ""
     for bit in (16, 8, 4, 2, 1):
@@ -74,13 +75,13 @@ def _halving_sums(width: int) -> str:
 
 @functools.cache
 def gradient_row_type(width: int) -> Any:
-    """A gradient row in registers."""
+    """Return the type of a gradient row in registers."""
     return wp.types.vector(length=width, dtype=wp.float32)
 
 
 @functools.cache
 def gradient_row_sums(width: int) -> Callable[..., Any]:
-    """A function (x, lane, out, pair) that writes sums over a warp's lanes to a pair's row; ``width`` is 32 times n."""
+    """Return a function (x, lane, out, pair) that writes sums over a warp to a pair's row; ``width``: 32 times n."""
     row = gradient_row_type(width)
 
     @wp.func_native(_halving_sums(width))
@@ -99,17 +100,17 @@ def int_at(numbers: Ints, at: int) -> int: ...
 
 @wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
 def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float:
-    """Of rows of ``width`` numbers."""
+    """Return one number of an array whose rows have ``width`` numbers."""
 
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
 def span_of(spans: Shorts2d, pair: int, y: int) -> int:
-    """Of a pair's row of pixels (:mod:`~neuprim.core.render.cuda.binning`)."""
+    """Return the span of a pair's row of pixels, see :func:`~neuprim.core.render.cuda.binning.row_spans`."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")
 def load_rasterizer_row_column(rows: Vec4s2d, row: int, width: int, column: int) -> wp.vec4:
-    """Of primitives' rows of ``width`` columns."""
+    """Return one float4 column of a primitive's row; rows have ``width`` columns."""
 
 
 @wp.func_native("return hits.data[slot];")

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The line integral along one pixel's chord on the device, forward and backward: the CPU's in vectors.
+"""The line integral along one pixel's chord, forward and backward: the CPU's formulas with Warp's vectors.
 
 An optical depth is I = N_p |d| D^p half field, with field the mean of the density's numerator, weighted by the edge.
 cos and B_p of a phase in turns are polynomials up to half a turn, recursions beyond (:mod:`neuprim.core.model.edge`).
@@ -37,7 +37,7 @@ Function = Callable[..., Any]
 
 @wp.func
 def cos_turns(y: float):
-    """cos(2 pi r) of y = r^2, |r| <= 1/2."""
+    """Return cos(2 pi r) of y = r^2, |r| <= 1/2."""
     return (((((_C6 * y + _C5) * y + _C4) * y + _C3) * y + _C2) * y + _C1) * y + _C0
 
 
@@ -57,12 +57,12 @@ _sinc = _B[0]
 
 @wp.func
 def sin_turns(r: float):
-    """sin(2 pi r), |r| <= 1/2."""
+    """Return sin(2 pi r), |r| <= 1/2."""
     return TAU * r * _sinc(r * r)
 
 
 def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
-    """Warp functions v -> B_p and v -> (B_p, B_(p+1)), p = 0, 1, 2, for any v."""
+    """Return Warp functions v -> B_p and v -> (B_p, B_(p+1)), p = 0, 1, 2, for any v."""
     low, high = _B[edge], _B[edge + 1]
 
     @wp.func
@@ -102,7 +102,7 @@ def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
 
 @wp.func
 def opacity_of_depth(I: float):  # type: ignore[no-untyped-def]
-    """1 - exp(-I), I >= 0; a faint one keeps its digits, which the difference would lose."""
+    """Return 1 - exp(-I), I >= 0; by a series for small I, where the difference would lose digits."""
     if I < 0.25:
         return I * (((((-I / 720.0 + 1.0 / 120.0) * I - 1.0 / 24.0) * I + 1.0 / 6.0) * I - 0.5) * I + 1.0)
     return 1.0 - wp.exp(-I)
@@ -110,7 +110,7 @@ def opacity_of_depth(I: float):  # type: ignore[no-untyped-def]
 
 @wp.struct
 class Ray:
-    """What a chord reads of a primitive's row, but for what its loops read themselves."""
+    """The columns of a primitive's row that :func:`intersect_chord` needs; kernels read the others themselves."""
 
     e0: wp.vec4
     ex: wp.vec4
@@ -131,9 +131,9 @@ class Chord:
     x: wp.vec3  # closest point
     D: float  # 1 - |x|^2
     ia: float  # 1/(e.e)
-    tm: float  # where the closest point is
+    tm: float  # t of the closest point
     h: float  # half chord before the near plane cuts it
-    uncut: float  # 1 where it does not
+    uncut: float  # 1 if the near plane does not cut it
     mid: float
     half: float  # 0 where the ray misses
 
@@ -145,13 +145,13 @@ def xyz(a: wp.vec4):
 
 @wp.func
 def neuron_phase(q: wp.vec3, w: wp.vec4):
-    """Of a neuron at q, in turns: three multiplications with additions, as the sum begins with its own phase."""
+    """Return a neuron's phase at q, in turns: three fused multiply-adds, as the sum begins with the neuron's phase."""
     return w[3] + q[0] * w[0] + q[1] * w[1] + q[2] * w[2]
 
 
 @wp.func
 def load_ray(rows: Any, j: int):
-    """From row ``j`` of a tile of rows or of the whole array."""
+    """Return the ray of row ``j``, from a tile of rows or the whole array."""
     r = Ray()
     r.e0 = rows[j, L.E0]
     r.ex = rows[j, L.EX]
@@ -164,7 +164,7 @@ def load_ray(rows: Any, j: int):
 
 @wp.func
 def intersect_chord(r: Ray, px: float, py: float):
-    """Of the pixel centre (px, py)."""
+    """Return the chord of the pixel centre (px, py)."""
     c = Chord()
     c.du = px - r.e0[3]
     c.dv = py - r.ex[3]
@@ -200,7 +200,7 @@ class Pull:
 def chord_ends_backward(
     c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3
 ):
-    """From dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD has what reaches D through ``h``, too."""
+    """Return dL/d(m, e) from dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD includes D's part by h."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     tm = g_tm + gt0 + gt1
@@ -216,7 +216,7 @@ def chord_ends_backward(
 
 @wp.func
 def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
-    """The same in float32, where dh/dD = ``by_depth`` and nothing reaches a ray on other ways than D and the ends."""
+    """Do the same in float32, with dh/dD = ``by_depth`` and no gradients other than through D and the chord's ends."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     return chord_ends_backward(c, g_half, g_mid, 0.0, gD + (gt1 - gt0) * by_depth, 0.0, gq, gv)
@@ -224,13 +224,13 @@ def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: f
 
 @wp.func
 def pixel_of_lane(lane: int):
-    """(x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better."""
+    """Return (x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better."""
     return wp.vec2i((lane & 7) | ((lane >> 2) & 8), ((lane >> 3) & 3) | ((lane >> 4) & 12))
 
 
 @wp.func
 def slot_of_pixel(span: int, offset: int, x: int):
-    """Slot of pixel x of a tile row, -1 outside its span (start << 8 | last << 4 | first)."""
+    """Return the slot of pixel x of a tile row, -1 outside its span (start << 8 | last << 4 | first)."""
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):
         slot = offset + (span >> 8) + x - (span & 15)
@@ -239,7 +239,7 @@ def slot_of_pixel(span: int, offset: int, x: int):
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """(x, y) in the tile of pixel ``s`` of pair ``n``: in the last row of ``spans`` that starts at or before it."""
+    """Return (x, y) in the tile of pixel ``s`` of pair ``n``: the last row of ``spans`` that starts at or before it."""
     y = int(0)
     for b in range(4):
         if int(spans[n, y + (8 >> b)]) >> 8 <= s:

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Colour networks, per primitive in float64 and at pixels; the twin of :mod:`neuprim.core.render.cpu.colour_net`.
+"""Colour networks, per primitive and at pixels; the CUDA version of :mod:`neuprim.core.render.cpu.colour_net`.
 
-A slot's hue is the colour before max(0, .), which the forward pass leaves there. A network's share of a ray's gradient
-comes through the chord's middle alone; it is linear, and added to the density's row.
+The per-primitive stage is in float64. A slot's hue is the colour before max(0, .), which the forward pass saves. A
+network's share of a ray's gradient comes only through the chord's middle; it is linear, and added to the density's row.
 """
 
 import functools
@@ -54,8 +54,8 @@ from neuprim.core.render.cuda.prepare_backward import quaternion_gradient
 from neuprim.core.render.cuda.projection import EXACT, PER_BLOCK, View, project_primitive
 
 FIRST_COLOUR = L.G_NEURONS
-"""Column of a network's gradient row where the C bases begin, then (WX, WY, WZ, PHASE, C weights) of each unit; the
-ray's come first."""
+"""Column of a network's gradient row where the C bases begin. The columns of the ray come before, and (WX, WY, WZ,
+PHASE, C weights) of each unit after."""
 
 d, f = wp.float64, wp.float32
 _TURNS = wp.constant(d(1.0 / (2.0 * math.pi)))
@@ -65,13 +65,13 @@ _FAST = wp.constant(d(W.FLOAT64_TURNS**2))
 
 @dataclass
 class ColourNet:
-    """The networks of a frame; the parameters are contiguous, float32 or float64 alike."""
+    """The networks of a frame; the parameters are contiguous, all float32 or all float64."""
 
     Wx: Tensor  # (N, H, 3)
     bias: Tensor  # (N, H)
     Wout: Tensor  # (N, C, H)
     rows: Tensor  # (N, H rasterizer_net_columns(C), 4) float32, see rasterizer_net_columns
-    fast: Tensor  # (N,) bool, where a unit turns too fast for float32
+    fast: Tensor  # (N,) bool, whether a unit turns too fast for float32
     wide: Tensor  # (M, H, 4) float64 (WX, WY, WZ, PHASE) of the primitives that are drawn in float64
 
     @property
@@ -81,7 +81,7 @@ class ColourNet:
 
 @wp.func
 def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
-    """(WX, WY, WZ, PHASE): on whitened axes and in turns."""
+    """Return (WX, WY, WZ, PHASE) of a unit, on whitened axes and in turns."""
     p = project_primitive(wp.vec3d(), log_scale, quat, View())
     on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
     turns = _TURNS * phase
@@ -98,7 +98,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         bias: wp.array2d(dtype=real),
         Wout: wp.array3d(dtype=real), channels: int, rows: Vec4s2d, fast: Bools2d,
     ):  # fmt: skip
-        """Thread (i, j): unit j of primitive i."""
+        """Thread (i, j) fills the row of unit j of primitive i."""
         i, j = wp.tid()
         unit = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
         fast[i, j] = unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2] > _FAST
@@ -116,7 +116,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         which: Ints, log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
         bias: wp.array2d(dtype=real), wide: Vec4ds2d,
     ):  # fmt: skip
-        """Thread (m, j): unit j of primitive ``which[m]``."""
+        """Thread (m, j) fills unit j of primitive ``which[m]``."""
         m, j = wp.tid()
         i = which[m]
         wide[m, j] = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
@@ -127,7 +127,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         channels: int, weights: Floats2d, grads: Floats2d, first: int, g_log_scales: Vec3s, g_quats: Vec4s,
         g_Wx: Vec3s2d, g_bias: Floats2d, g_Wout: Floats3d,
     ):  # fmt: skip
-        """Thread i; column G_WEIGHT of ``weights`` says whether it was seen. Adds to g_log_scales and g_quats."""
+        """One thread per primitive; visible if column G_WEIGHT of ``weights`` > 0. Adds to g_log_scales and g_quats."""
         i = wp.tid()
         seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
         logs, quat = wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
@@ -172,7 +172,7 @@ def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
 def prepare_rasterizer_colour_net(
     log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor
 ) -> ColourNet:
-    """Rows of all primitives; ``wide`` is empty, see :func:`fill_wide_net`."""
+    """Return the networks with rows of all primitives; ``wide`` is empty, see :func:`fill_wide_net`."""
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
     dtype = torch.float64 if double else torch.float32
@@ -192,7 +192,7 @@ def prepare_rasterizer_colour_net(
 
 
 def fill_wide_net(net: ColourNet, which: Tensor, log_scales: Tensor, quats: Tensor) -> None:
-    """Fill ``net.wide`` for primitives ``which`` (M,) int32; parameters as the frame has them."""
+    """Fill ``net.wide`` for primitives ``which`` (M,) int32; ``log_scales`` and ``quats`` are the frame's."""
     M, H, device = len(which), net.hidden, net.Wx.device
     double = net.Wx.dtype == torch.float64
     real, vec3, vec4 = _kernel_types(double)
@@ -236,13 +236,13 @@ def colour_net_backward(
 
 
 def net_gradient_row_width(form: KernelForm) -> int:
-    """Columns of a network's gradient row."""
+    """Return the number of columns of a network's gradient row."""
     return L.gradient_width(0, form.channels, form.hidden)
 
 
 @functools.cache
 def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
-    """A warp a pair: gradients of its network, and the ray's share through the chord's middle."""
+    """Return a kernel, one warp per pair: gradients of its network, and the ray's share through the chord's middle."""
     C, H, P = form.channels, form.hidden, form.edge
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     columns, net_columns = L.rasterizer_row_columns(form.neurons, C), max(H * each, 1)
@@ -258,14 +258,14 @@ def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
         tile = tiles[n]
         across = (size[0] + L.TILE - 1) // L.TILE
         i = ids[n]
-        if rows[i, L.REST][3] == 0.0:  # the others' rows come from a kernel in float64
+        if rows[i, L.REST][3] == 0.0:  # a float64 kernel writes the rows of the others
             total = row_of()
             if n < reached[tile]:
                 which = wp.tile_load(ids, shape=1, offset=n, storage="shared")
                 row = wp.tile_load_indexed(rows, indices=which, shape=(1, columns), axis=0, storage="shared")
                 units = wp.tile_load_indexed(net, indices=which, shape=(1, net_columns), axis=0, storage="shared")
                 begin = offsets[n]
-                left = (tile % across) * L.TILE  # here, as no compiler moves a division out of a branch
+                left = (tile % across) * L.TILE  # outside the loop, as no compiler moves a division
                 top = (tile // across) * L.TILE
                 for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
                     weight = hits[begin + s][1]
@@ -318,7 +318,7 @@ def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
 
 @functools.cache
 def float64_hues_kernel(channels: int) -> Any:
-    """Hues of the in_float64 pairs' slots, in float64."""
+    """Return a kernel that fills the hues of the float64 pairs' slots, in float64."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_hues(
@@ -348,7 +348,7 @@ def float64_hues_kernel(channels: int) -> Any:
 
 @functools.cache
 def float64_net_kernel(form: KernelForm) -> Any:
-    """:func:`rasterizer_net_gradient_kernel` for in_float64 pairs, in float64."""
+    """Return the :func:`rasterizer_net_gradient_kernel` of the float64 pairs, in float64."""
     C = form.channels
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

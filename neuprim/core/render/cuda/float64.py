@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The pixel stage in float64, for the few primitives that float32 cannot follow: chords, opacities, gradients.
+"""The pixel stage in float64, for the few primitives that need more than float32: chords, opacities, gradients.
 
-The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are left
-in the pixels' slots before compositing. Gradients of edges: :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are
+stored in the slots before compositing. Gradients of edges: :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _TERMS = 14
 
 @wp.struct
 class Chord64:
-    """As :class:`~neuprim.core.render.cuda.chord.Chord`; the ray's origin does not slide."""
+    """A :class:`~neuprim.core.render.cuda.chord.Chord` in float64; the ray's origin does not slide."""
 
     du: wp.float64
     dv: wp.float64
@@ -50,7 +50,7 @@ def _wide_row_vector(wide: Doubles2d, r: int, c: int):
 
 @wp.func
 def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
-    """Of pixel (X, Y) and row ``r``."""
+    """Return the chord of pixel (X, Y) in the primitive of row ``r`` of ``wide``."""
     c = Chord64()
     zero, one = d(0.0), d(1.0)
     c.du = d(X) + d(0.5) - wide[r, W.UX]
@@ -75,7 +75,7 @@ def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
 
 @wp.struct
 class Weight:
-    """q of u, its mean, and of d q/d(1 - |y|^2) as a polynomial b0 + b1 u + b2 u^2."""
+    """Coefficients of q(u), its mean, and d q/d(1 - |y|^2) as a polynomial b0 + b1 u + b2 u^2."""
 
     q: vec5d
     mean: wp.float64
@@ -86,7 +86,7 @@ class Weight:
 
 @wp.func
 def chord_edge_polynomial64(c: Chord64, edge: int):
-    """(D - a (shift + half u)^2)^p."""
+    """Return the weight q(u) = (D - a (shift + half u)^2)^p."""
     w = Weight()
     two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
     c0, c1, c2 = c.D - a * shift * shift, -two * a * shift * c.half, -a * c.half * c.half
@@ -113,7 +113,7 @@ def chord_edge_polynomial64(c: Chord64, edge: int):
 
 @wp.func
 def _chord_bessel(z: wp.float64):
-    """j_0 to j_5 of any z: a series below 2, where upward recursion loses digits."""
+    """Return j_0 to j_5 of any z: by a series below 2, where upward recursion loses digits."""
     j = vec6d()
     if wp.abs(z) < d(2.0):
         square, power = d(0.5) * z * z, d(1.0)
@@ -137,7 +137,7 @@ def _chord_bessel(z: wp.float64):
 
 @wp.func
 def chord_moments(z: wp.float64):
-    """C_0, S_1, C_2, S_3, C_4, S_5."""
+    """Return C_0, S_1, C_2, S_3, C_4, S_5."""
     j = _chord_bessel(z)
     two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
@@ -152,14 +152,14 @@ def chord_moments(z: wp.float64):
 
 @wp.func
 def chord_phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
-    """At the chord's middle, in radians, of less than half a turn."""
+    """Return the phase at the chord's middle, in radians, reduced to half a turn."""
     u = wp.dot(c.q, w) + phase
     return d(_TWO_PI) * (u - wp.rint(u))
 
 
 @wp.func
 def rate64(c: Chord64, w: wp.vec3d):
-    """z, radians over half a chord."""
+    """Return z, the phase change over half a chord in radians."""
     return d(_TWO_PI) * c.half * wp.dot(c.e, w)
 
 
@@ -175,7 +175,7 @@ class Moments:
 
 @wp.func
 def weighted_moments64(w: Weight, M: vec6d):
-    """The moments of a weight."""
+    """Return the moments of a weight; ``M``: from :func:`chord_moments`."""
     out = Moments()
     out.even = w.q[0] * M[0] + w.q[2] * M[2] + w.q[4] * M[4]
     out.odd = w.q[1] * M[1] + w.q[3] * M[3]
@@ -186,7 +186,7 @@ def weighted_moments64(w: Weight, M: vec6d):
 
 @wp.struct
 class Pull64:
-    """dL/d(origin m, direction e) of a ray, and with respect to what grows with the pixel offset."""
+    """dL/d(origin m, direction e, G) of a ray; G = du EX + dv EY grows with the pixel offset."""
 
     m: wp.vec3d
     e: wp.vec3d
@@ -199,7 +199,7 @@ def chord_backward64(
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """As :func:`~neuprim.core.render.cuda.chord.chord_ends_backward`, with dh/dD from the floor on D."""
+    """Do what :func:`~neuprim.core.render.cuda.chord.chord_ends_backward` does, with dh/dD from the floor on D."""
     half, two = d(0.5), d(2.0)
     gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
     tm, g_h = g_tm + gt0 + gt1, gt1 - gt0
@@ -215,7 +215,7 @@ def chord_backward64(
 
 @wp.func
 def ray_norm(lens: wp.vec4, X: int, Y: int):
-    """Length of the ray direction whose camera-z is 1."""
+    """Return the length of the ray direction whose camera-z is 1."""
     x = (d(X) + d(0.5) - d(lens[2])) / d(lens[0])
     y = (d(Y) + d(0.5) - d(lens[3])) / d(lens[1])
     return wp.sqrt(x * x + y * y + d(1.0))
@@ -223,14 +223,14 @@ def ray_norm(lens: wp.vec4, X: int, Y: int):
 
 @functools.cache
 def float64_opacity_kernel(depth: bool) -> Any:
-    """For any form; ``depth``: also camera-z of the chords' middles."""
+    """Return the kernel of opacities, for any form; ``depth``: also camera-z of the chords' middles."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_opacity(
         pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
         lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
     ):  # fmt: skip
-        """A warp a pair of those listed in ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
+        """One warp for each of ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
         member, lane = wp.tid()
         n = pairs[member]
         r = slots[ids[n]]
@@ -268,7 +268,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Of a form; ``depth``: a gradient of the sum of w z arrives, too."""
+    """Return the pairs' gradient kernel of a form; ``depth``: with a gradient of the sum of w z."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

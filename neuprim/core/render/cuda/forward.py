@@ -1,9 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Compositing, forward: a block a tile, a thread a pixel; and both passes where each ray has an order of its own.
+"""Forward pass of compositing: one block per tile, one thread per pixel. For ``sort = "entry"``, it has two passes.
 
-Rows come to shared memory in batches; a tile ends when no pixel sees light through it. (alpha, transmittance before) of
-every hit goes to its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). Float64 pairs have their opacities
-there beforehand (:mod:`~neuprim.core.render.cuda.float64`).
+Rows are loaded into shared memory in batches; a tile ends when T < T_min in all of its pixels. (alpha, transmittance
+before) of every hit is stored in its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). The slots of float64
+pairs contain their opacities beforehand (:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from neuprim.core.settings import RenderSettings
 
 @wp.func
 def entry_sort_key(pixel: int, entry: float):
-    """Sorts by pixel, then by entry: floats in the order of integers."""
+    """Return a key that sorts by pixel, then by entry: the bits of floats, mapped to integers of the same order."""
     bits = wp.int64(wp.cast(entry, wp.int32))
     if bits < wp.int64(0):
         bits = wp.int64(-1) - bits  # negative floats: larger ones have more bits
@@ -67,9 +67,9 @@ BATCH = 16  # rows in shared memory at a time
 
 @functools.cache
 def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
-    """``keep``: fill the slots, and take float64 primitives from there; ``depth``: also the sum of w z.
+    """Return a kernel. ``keep``: fill the slots, read float64 primitives from them; ``depth``: also the sum of w z.
 
-    ``listing``: only list every hit, its key and pair, for :func:`composite_kernel`; ``several``: images in a row.
+    ``listing``: only list every hit, its key and pair, for :func:`composite_kernel`; ``several``: more than one image.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
@@ -184,7 +184,7 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
                         weight = alpha * T
                         if wp.static(listing):
                             weight = 0.0
-                            before = 0.0  # of slots that are no hits, which nothing else will touch
+                            before = 0.0  # for slots without a hit, which nothing else writes
                             keys[slot] = entry_sort_key(
                                 wp.where(alpha > 0.0, Y * size[0] + X, size[0] * size[1]), entry
                             )
@@ -223,14 +223,14 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
     return forward
 
 
-# ---- sort = "entry". Every hit is listed, with a key of pixel and entry, and the list is sorted. A thread a pixel
-# walks its part. Entries that agree in float32 keep the order of the centres, and so do all chords that the near plane
-# cuts: slots lie in that order, and the sort is stable. Nothing can stop early before the list is complete.
+# ---- sort = "entry". Every hit is listed, with a key of pixel and entry, and the list is sorted. One thread per
+# pixel composites its part. Entries that agree in float32, and all chords that the near plane cuts, keep the order of
+# the centres: slots are in that order, and the sort is stable. Nothing can stop early before the list is complete.
 
 
 @wp.func
 def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
-    """The first of the sorted keys that belongs to this pixel or a later one."""
+    """Return the index of the first sorted key that belongs to this pixel or a later one."""
     low, high = int(0), int(count)
     while low < high:
         middle = low + (high - low) // 2
@@ -243,7 +243,7 @@ def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
 
 @functools.cache
 def composite_kernel(form: KernelForm, depth: bool) -> Any:
-    """A thread a pixel, front to back; slots keep (alpha, transmittance before), alpha 0 behind the last."""
+    """Return a kernel, one thread per pixel, front to back; slots get (alpha, T before), alpha 0 if hidden."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
@@ -302,19 +302,19 @@ _NUMBERS = {
 
 @dataclass
 class CompositedFrame:
-    """What a forward pass leaves."""
+    """Results of a forward pass, and data saved for backward."""
 
     rgb: Tensor  # (H W, C)
     transmittance: Tensor  # (H W,)
-    zsum: Tensor  # (H W,) sum of w z, empty if no depth is wanted
-    spans: Tensor  # (pairs, 16) int16, which with the offsets say the pixels of each pair, see row_spans
+    zsum: Tensor  # (H W,) sum of w z, empty without depth
+    spans: Tensor  # (pairs, 16) int16; with the offsets, the pixels of each pair, see row_spans
     offsets: Tensor  # (pairs + 1,) int32
-    hits: Tensor  # (slots, 2) opacity and transmittance before it, if they were kept
-    depths: Tensor  # (slots,) camera-z, if wanted
+    hits: Tensor  # (slots, 2) opacity and transmittance before it, if slots are kept
+    depths: Tensor  # (slots,) camera-z, empty without depth
     hues: Tensor  # (slots, C) colours before max(0, .), of colour networks
     reached: Tensor  # (tiles,) int32, the pairs before it were composited
-    in_float64: Tensor  # (D,) int32, the pairs that are drawn in float64, rising
-    # where hits were sorted by entry:
+    in_float64: Tensor  # (D,) int32, the pairs that are drawn in float64, in order
+    # only if hits were sorted by entry:
     order: Tensor | None = None  # (slots,) int64 slots by pixel and entry
     begins: Tensor | None = None  # (H W + 1,) int32, first of each pixel
     owners: Tensor | None = None  # (slots,) int32, pair of each slot
@@ -325,7 +325,7 @@ def warp_array(tensor: Tensor) -> Any:
 
 
 class KernelArrays:
-    """Arrays and numbers of a frame as the kernels take them."""
+    """Arrays and numbers of a frame as arguments of kernels."""
 
     def __init__(
         self, frame: Frame, net: ColourNet | None, settings: RenderSettings, spans: Tensor, offsets: Tensor
@@ -349,14 +349,14 @@ class KernelArrays:
 
 
 def _marked_pairs(marked: Tensor, count: int) -> Tensor:
-    """(count,) int32, where a mask with so many is set; the host does not wait."""
+    """Return the (count,) int32 indices of a mask's True values, whose number is known; no synchronisation."""
     place = torch.where(marked, torch.cumsum(marked, 0) - 1, count)
     numbers = torch.arange(marked.shape[0], dtype=torch.int32, device=marked.device)
     return torch.empty(count + 1, dtype=torch.int32, device=marked.device).index_copy_(0, place, numbers)[:count]
 
 
 def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
-    """Number of slots, (pairs + 1,) first slot of each pair, float64 pairs; waits. BackendUnavailable: too many."""
+    """Return slot count, (pairs + 1,) first slots, float64 pairs; synchronises. BackendUnavailable: too many slots."""
     in_float64 = torch.empty(0, dtype=torch.int32, device=frame.device)
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int32, device=frame.device)
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
@@ -384,7 +384,7 @@ def composite_frame(
     differentiable: bool,
     images: int = 1,
 ) -> CompositedFrame:
-    """Draw; several ``images`` without gradients, sorted by centres. The host waits where slots are kept."""
+    """Draw one image, or several without gradients and sorted by centres. Synchronises if slots are kept."""
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
 

@@ -1,6 +1,6 @@
-"""Columns of the kernels' arrays on the device; :mod:`neuprim.core.render.layout` says what the numbers mean.
+"""Columns of the CUDA kernels' arrays; :mod:`neuprim.core.render.layout` explains the numbers.
 
-A primitive's row is a whole number of float4: one load of 16 bytes brings a vector and a scalar.
+A primitive's row is a whole number of float4: one load of 16 bytes reads a vector and a scalar.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ from neuprim.core.render.layout import (  # noqa: F401 - kernels read them as L.
 )
 
 E0, EX, EY, XA, XU, XV, REST, NEURONS = 0, 1, 2, 3, 4, 5, 6, 7
-"""float4 columns: a vector each, and beside it a scalar, see :data:`SCALARS`; REST holds four scalars, then come the
-neurons."""
+"""float4 columns, each with a vector and a scalar, see :data:`SCALARS`; REST holds four scalars, and the neurons come
+after it."""
 
 SCALARS = {E0: "UX", EX: "UY", EY: "NEAR", XA: "OFFSET", XU: "TU", XV: "TV"}
-"""The fourth number of each column. Those of REST are TC, UNIT, ANCHOR_Z and whether float32 is too coarse (0 or 1); of
-a neuron (WX, WY, WZ, PHASE)."""
+"""The fourth number of each column. REST holds TC, UNIT, ANCHOR_Z and whether the primitive needs float64 (0 or 1); a
+neuron's column holds (WX, WY, WZ, PHASE)."""
 
 AMPLITUDE = 4  # place of the amplitude among the five numbers of a neuron in a gradient row
 
@@ -38,7 +38,7 @@ CUT_AT = -1e30  # entry of every chord that the near plane cuts: in front of all
 
 @dataclass(frozen=True)
 class KernelForm:
-    """What a kernel is compiled for: neurons K, exponent p, channels C, hidden units H (-1: constant colours)."""
+    """The form of a compiled kernel: neurons K, exponent p, channels C, hidden units H (-1: constant colours)."""
 
     neurons: int
     edge: int
@@ -47,31 +47,31 @@ class KernelForm:
 
 
 def rasterizer_amplitude_column(neurons: int) -> int:
-    """First column of the neurons' amplitudes, four in each."""
+    """Return the first column of the neurons' amplitudes, four per column."""
     return NEURONS + neurons
 
 
 def rasterizer_colour_column(neurons: int) -> int:
-    """First column of the colours, four channels in each."""
+    """Return the first column of the colours, four channels per column."""
     return rasterizer_amplitude_column(neurons) + -(-neurons // 4)
 
 
 def rasterizer_row_columns(neurons: int, channels: int) -> int:
-    """float4 columns of a primitive's row."""
+    """Return the number of float4 columns of a primitive's row."""
     return rasterizer_colour_column(neurons) + -(-channels // 4)
 
 
 def wide_width(neurons: int) -> int:
-    """Numbers in the float64 row of a primitive: the CPU's columns without padding."""
+    """Return the length of a primitive's float64 row: the CPU's columns without padding."""
     return layout.NEURONS + PER_NEURON * neurons
 
 
 def rasterizer_net_columns(channels: int) -> int:
-    """float4 columns per unit of a colour network: (WX, WY, WZ, PHASE), then its output weights, four in each."""
+    """Return the float4 columns per unit of a colour network: (WX, WY, WZ, PHASE), then four output weights in each."""
     return 1 + -(-channels // 4)
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Columns of a gradient row with H units of a colour network, a multiple of a warp's lanes."""
+    """Return the columns of a gradient row with H units of a colour network, a multiple of a warp's lanes."""
     used = G_NEURONS + PER_NEURON * neurons + channels + (4 + channels) * hidden
     return -(-used // WARP) * WARP

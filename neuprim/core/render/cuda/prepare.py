@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""A frame on the device, and the per-primitive stage that fills it: one thread a primitive, float64 inside.
+"""A frame on the device, and the per-primitive stage that fills it: one thread per primitive, in float64.
 
-The twin of :mod:`neuprim.core.render.cpu.prepare`. Rows are float4 with the colours in them, and neurons stay in the
-model's order. Each primitive's tiles are counted, too.
+The CUDA version of :mod:`neuprim.core.render.cpu.prepare`. Rows are float4 and include the colours; neurons stay in the
+model's order. The stage also counts each primitive's tiles.
 """
 
 import functools
@@ -82,7 +82,7 @@ def store_float4(rows: Vec4s2d, i: int, j: int, x: float, y: float, z: float, w:
 
 @wp.func
 def _store_vector(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64):
-    """16 bytes at once: Warp's own store of a vector is four."""
+    """Store 16 bytes in one instruction; Warp's own store of a vector takes four."""
     store_float4(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
 
 
@@ -93,16 +93,16 @@ def _largest_ray_component(v: wp.vec3d):
 
 @wp.func
 def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
-    """A neuron's frequencies on whitened axes, in turns."""
+    """Return a neuron's frequencies on whitened axes, in turns."""
     t = wp.transpose(p.local) * w
     return wp.vec3d(turns * p.axes[0] * t[0], turns * p.axes[1] * t[1], turns * p.axes[2] * t[2])
 
 
 @functools.cache
 def project_primitives_kernel(double: bool) -> Any:
-    """Fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
+    """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
 
-    ``counts`` (2, N): tiles reached, and 1 where float32 is too coarse and something is seen. ``bad`` (1,): the first
+    ``counts`` (2, N): tiles reached, and 1 if the primitive is visible and needs float64. ``bad`` (1,): the first
     primitive that is not finite, colours included. ``least``: the optical depth below which nothing is drawn.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
@@ -119,7 +119,7 @@ def project_primitives_kernel(double: bool) -> Any:
         most = d(b2[i])
         for k in range(neurons):
             most += d(wp.abs(w2[i, k]))
-        if is_too_faint_to_draw(most, edge, least):  # whatever its place
+        if is_too_faint_to_draw(most, edge, least):  # wherever it is
             state = int(_CULLED)
             given, turn = wp.vec3d(means[i]) + wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
             given_sum = most + given[0] + given[1] + given[2] + d(1.0) / wp.dot(turn, turn)
@@ -177,7 +177,7 @@ def project_primitives_kernel(double: bool) -> Any:
         thinnest, ratio = wp.min(wp.min(p.axes[0], p.axes[1]), p.axes[2]), _RATIO
         if r.tc == d(0.0):
             ratio = _RATIO_NEAR
-        # a centre far from the anchor, in the thinnest axis, among them
+        # the third: the centre is far from the anchor, in the thinnest axis
         if (
             fastest > _TURNS
             or wp.max(wp.abs(ux), wp.abs(uy)) > _PIXELS
@@ -190,7 +190,7 @@ def project_primitives_kernel(double: bool) -> Any:
                 in_float64 = 1
         s22 = projected_covariance(p, 2, 2)
         reach = wp.sqrt(m * m * s22)
-        if edge > 0 and z - reach < near + _CUT * reach:  # only there are integrals of cut chords with a soft edge
+        if edge > 0 and z - reach < near + _CUT * reach:  # only float64 integrates cut chords with a soft edge
             in_float64 = 1
 
         state, box, tiles = int(_CULLED), wp.vec4i(), wp.int32(0)
@@ -199,7 +199,7 @@ def project_primitives_kernel(double: bool) -> Any:
             state = int(_NON_FINITE)
         elif z + reach > near:
             if biggest > _FLOAT32_MAX:
-                # so small against its distance that no pixel centre can hit it, or a scale or weight beyond float32
+                # too small for its distance to hit a pixel centre, or, if m > 1, a scale or weight beyond float32
                 if m > d(1.0):
                     state = int(_NON_FINITE)
             else:
@@ -211,7 +211,7 @@ def project_primitives_kernel(double: bool) -> Any:
                     one = d(1.0)
                     square = visible_square(most, longest_half_chord(p, r, v, reach), edge, least)
                     if square == d(0.0):
-                        x1 = x0  # nothing can be seen of it
+                        x1 = x0  # invisible
                     else:
                         across = silhouette_screen_extent(p, v, 0, s22, square)
                         down = silhouette_screen_extent(p, v, 1, s22, square)
@@ -262,7 +262,7 @@ def _store_wide_vector(wide: Doubles2d, n: int, column: int, v: wp.vec3d):
 
 @functools.cache
 def wide_kernel(double: bool) -> Any:
-    """Fills ``wide``, the float64 rows of primitives ``which``, which the pixel stage draws in float64; dim (M,)."""
+    """Return a kernel that fills ``wide``, the rows of primitives ``which`` that are drawn in float64; dim (M,)."""
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -301,7 +301,7 @@ def wide_kernel(double: bool) -> Any:
 
 
 class NotFinitePrimitive(ValueError):
-    """Primitive ``row`` is not finite, or outside float32; the caller says which of its numbers."""
+    """Primitive ``row`` is not finite, or outside float32; the caller reports which of its numbers."""
 
     def __init__(self, row: int) -> None:
         super().__init__(f"primitive {row} is not finite")
@@ -310,11 +310,11 @@ class NotFinitePrimitive(ValueError):
 
 @dataclass(frozen=True)
 class Projection:
-    """A view as the kernels take it."""
+    """A view as argument of the kernels."""
 
     matrix: Tensor  # (16,) float64 on the device, world to camera
     camera: Camera  # focal lengths and centre in pixels, size
-    near: float  # of the near plane, in scene units
+    near: float  # depth of the near plane, in scene units
     turns: float  # omega0 / 2 pi
 
     @property
@@ -331,7 +331,7 @@ class Frame:
     rows: Tensor  # (N, columns(K, C), 4) float32
     wide: Tensor  # (M, wide_width(K)) float64, rows of the primitives in float64, columns of layout
     slots: Tensor  # (N,) int32, row in wide, or -1
-    which: Tensor  # (M,) int32, primitive of each row of wide, rising
+    which: Tensor  # (M,) int32, primitive of each row of wide, in order
     spans: Tensor  # (N, 8) float32, silhouettes
     boxes: Tensor  # (N, 4) int32, pixel boxes x0, y0, x1, y1
     depth: Tensor  # (N,) float64, camera z of the centres
@@ -371,22 +371,22 @@ def prepare_frame(
     forced: Tensor | None = None,
     images: tuple[Tensor, int] | None = None,
 ) -> Frame:
-    """Return everything that the pixel kernels read of one view; the host waits for the device once.
+    """Return the data of one view for the pixel kernels; synchronises with the device once.
 
     Args:
         palette: (N, C) colours.
         tensors: those of :data:`~neuprim.core.render.rasterize.PARAMETERS`, all on one device.
-        forced: (N,) bool, primitives to draw in float64 whatever this stage finds.
+        forced: (N,) bool, primitives to draw in float64 in any case.
         images: (N,) int32, the image of each primitive, and their number; None for one.
 
-    Raises NotFinite, or BackendUnavailable where primitives reach 2^31 tiles or more.
+    Raises NotFinitePrimitive, or BackendUnavailable if primitives reach 2^31 tiles or more.
     """
-    # float64 where any is, else float32; the kernels compute in float64 in any case
+    # float64 if any tensor is, else float32; the kernels compute in float64 in any case
     dtype = torch.float64 if any(x.dtype == torch.float64 for x in tensors) else torch.float32
     parameters = tuple(x.detach().to(dtype).contiguous() for x in tensors)
     device, (N, K, _), C = parameters[0].device, parameters[3].shape, palette.shape[1]
     double, camera, settings = dtype == torch.float64, request.camera, request.settings
-    # a plain copy would wait
+    # a blocking copy would synchronise
     matrix = viewmat.detach().to(device, torch.float64, non_blocking=device.type == "cuda").reshape(16).contiguous()
     projection = Projection(matrix, camera, settings.near_plane, request.turns)
 

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The chain rule from gradient rows to parameters, one thread a primitive; the CPU's ``prepare_backward``."""
+"""The chain rule from gradient rows to parameters, one thread per primitive, like the CPU's ``prepare_backward``."""
 
 import functools
 from typing import Any
@@ -36,7 +36,7 @@ def _load_gradient_vector(grads: Floats2d, i: int, column: int):
 
 @wp.func
 def quaternion_gradient(q: wp.vec4d, n: wp.float64, g: wp.mat33d):
-    """dL/dq from dL/dR; the normalisation projects out the radial part."""
+    """Return dL/dq from dL/dR; the normalisation projects out the radial part."""
     two = d(2.0)
     w, x, y, z = q[0] * n, q[1] * n, q[2] * n, q[3] * n
     gw = two * (x * (g[2, 1] - g[1, 2]) + y * (g[0, 2] - g[2, 0]) + z * (g[1, 0] - g[0, 1]))
@@ -127,7 +127,7 @@ def _prepare_backward_kernel(double: bool) -> Any:
 
 
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Float32 gradients of the parameters, and with ``want_view`` (3, 4) float64 of (R | t).
+    """Return float32 gradients of the parameters, and with ``want_view`` the (3, 4) float64 one of (R | t).
 
     ``grads``: (N, gradient_width) float32 rows; those whose weight is 0 give zeros.
     """

@@ -5,11 +5,11 @@ from neuprim.core.compute.warp import OPTIONS, Doubles, wp
 from neuprim.core.render.layout import ANCHOR_RADII
 
 EXACT = {**OPTIONS, "fuse_fp": False}
-"""Options of the per-primitive kernels: every product is rounded, so that two kernels that count the same tiles, and
-the CPU, agree."""
+"""Options of the per-primitive kernels: every product is rounded (no fused multiply-add), so that two kernels that
+count the same tiles, and the CPU, agree."""
 
 PER_BLOCK = 64
-"""Primitives of a block: float64 takes 163 registers, and a few more small blocks fit on a multiprocessor than large
+"""Primitives per block: float64 takes 163 registers, and a few more small blocks fit on a multiprocessor than large
 ones."""
 
 d = wp.float64
@@ -42,7 +42,7 @@ class ProjectedPrimitive:
 
 @wp.struct
 class Ray:
-    """A = m S^-1 B^T and rays in whitened space, x(t) = (xa + du xu + dv xv + s G) + t (e0 + G)."""
+    """A = m S^-1 B^T and coefficients of rays in whitened space, x(t) = (xa + du xu + dv xv + s G) + t (e0 + G)."""
 
     A: wp.mat33d
     ref: wp.vec3d
@@ -59,13 +59,13 @@ class Ray:
 
 @wp.func
 def round_projected_to_float32(x: wp.float64):
-    """The nearest float32."""
+    """Return ``x`` rounded to the nearest float32."""
     return wp.float64(wp.float32(x))
 
 
 @wp.func
 def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64):
-    """``matrix``: the 16 numbers of a world-to-camera matrix, on the device."""
+    """Return the :class:`View` of ``matrix``, the 16 numbers of a world-to-camera matrix, on the device."""
     v = View()
     v.R = wp.mat33d(matrix[0], matrix[1], matrix[2], matrix[4], matrix[5], matrix[6], matrix[8], matrix[9], matrix[10])
     v.t = wp.vec3d(matrix[3], matrix[7], matrix[11])
@@ -77,7 +77,7 @@ def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64
 
 @wp.func
 def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
-    """The anchor is rounded *before* it is used, so that pixel kernels subtract the same number."""
+    """Return the projection. The anchor is rounded *before* its use, so that pixel kernels subtract the same number."""
     one, two = d(1.0), d(2.0)
     p = ProjectedPrimitive()
     n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])
@@ -97,7 +97,7 @@ def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: Vi
     p.B = v.R * p.local
     p.anchor = wp.vec3d(
         d(0.0), round_projected_to_float32(v.centre[0]), round_projected_to_float32(v.centre[1])
-    )  # near or behind the camera, or nothing is seen of it
+    )  # for a primitive near or behind the camera, or wholly before the near plane
     if c[2] > _ANCHOR_RADII * m and c[2] + m > v.near:
         p.anchor = wp.vec3d(
             m * round_projected_to_float32(c[2] / m),

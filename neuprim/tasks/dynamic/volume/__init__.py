@@ -1,1 +1,1 @@
-"""Datasets from OpenVDB sequences: grids become a medium of light, rays through it the ground-truth images."""
+"""Datasets from OpenVDB sequences: a medium of their grids, ray-marched to ground truth."""

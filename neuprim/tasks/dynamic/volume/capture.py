@@ -1,4 +1,4 @@
-"""Capture a sequence: cameras around the unit box, the images of every frame, and where they are stored.
+"""Capture a volume sequence: cameras around the unit box, the images of every frame, and their files.
 
 volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
 volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
@@ -59,7 +59,7 @@ POINTS = 8192
 """Starting points stored per frame."""
 
 LAST_FILE = "points.npz"
-"""The file of a frame that is written last."""
+"""The last file that is written for a frame; its presence marks the frame as complete."""
 
 _SCENE_FILE = "scene.json"
 _POINTS_BYTES = 2 * POINTS * 3 * 4 + 2**16
@@ -67,12 +67,12 @@ _POINTS_BYTES = 2 * POINTS * 3 * 4 + 2**16
 
 @dataclass(frozen=True)
 class Capture:
-    """Everything the images depend on.
+    """A volume sequence and everything its images depend on.
 
     Attributes:
         frames: the files, in order.
         cameras: all of them, the last ``held_out`` of which are not trained on; ``samples``: rays per pixel side.
-        lights: of each frame, which the training cameras take in turns; of more than one, held-out cameras have others.
+        lights: number per frame, which training cameras take in turns; if several, held-out cameras have other lights.
         bounds: (2, 3) box around all matter, scene units.
         ends: frame numbers whose times are 0 and 1; None: the first and the last frame's.
         measured: frame number -> extent of its extinction grid; empty if unknown.
@@ -92,7 +92,7 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The extinction grid's meaning if flames add to its extinction and its part is stored apart."""
+        """The extinction grid's meaning if flames add to sigma and its part is stored; else empty."""
         return (self.reader.extinction,) if self.optics.mixes(self.reader.names) else ()
 
     @property
@@ -101,16 +101,16 @@ class Capture:
         return self.ends or (self.frames[0].number, self.frames[-1].number)
 
     def time(self, frame: VdbFrame) -> float:
-        """A frame's time 0..1, proportional to its number, so that a gap in the numbers is one in time."""
+        """Return a frame's time 0..1; it is linear in the number, so gaps in numbers are gaps in time."""
         first, last = self.clock
         return (frame.number - first) / max(last - first, 1)
 
     def select_frames(self, first: int, last: int) -> Capture:
-        """The frames from one number to another; times and image folder stay those of all frames."""
+        """Return the capture of frames ``first`` to ``last``, with times and image folder of all frames."""
         return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
     def key(self) -> str:
-        """A short hash of everything; files count by name, size and modification time."""
+        """Return a short hash of all inputs; files count by name, size and modification time."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
         optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
@@ -118,7 +118,7 @@ class Capture:
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def frame_lights(self, frame: VdbFrame) -> list[Light | None]:
-        """The lights of a frame by camera. The first camera has the optics' own; held-out cameras keep theirs."""
+        """Return each camera's light: the optics' own for the first, constant in time if held out."""
         if self.lights == 1:
             return [self.optics.light] * len(self.cameras)
         lights = [self.optics.light, *draw_lights(self.optics, self.lights - 1, frame.number)]
@@ -126,7 +126,7 @@ class Capture:
         return [lights[c % self.lights] for c in range(training)] + draw_lights(self.optics, self.held_out)
 
     def medium(self, frame: VdbFrame) -> Medium:
-        """The medium of a frame's file without its light; empty if the file lacks the grids that absorb in others."""
+        """Build the medium of a frame's file without its light; empty if no grid of the file absorbs."""
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids and not (self.components and self.optics.flame_grid in grids):
             return Medium.without_voxels()
@@ -137,7 +137,7 @@ class Capture:
             raise DataError(f"{frame.path}: {error}") from error
 
     def placement(self) -> DensityGridPlacement:
-        """How the scene lies in the world of its files; times as in the dataset."""
+        """Return how the scene maps to the world of its files, with the dataset's times."""
         optics, names = self.optics, self.reader.names
         flames_absorb = optics.flame_extinction > 0 and optics.flame_grid in names
         return DensityGridPlacement(
@@ -152,21 +152,24 @@ class Capture:
         )
 
     def frame_folder(self, frame: VdbFrame) -> str:
-        """Name of the folder of a frame's files."""
+        """Return the name of the folder of a frame's files."""
         return f"frame_{frame.number:05d}"
 
     def fetch_image(self, store: Store, frame: VdbFrame, camera: int) -> Path:
-        """Local file of one image. Raises DataError if the store cannot be read."""
+        """Return the local file of one image; raises DataError if the store cannot be read."""
         pixels = self.cameras[camera].width * self.cameras[camera].height
         return store.fetch_file(f"{self.frame_folder(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
 
     def fetch_points(self, store: Store, frame: VdbFrame) -> Path:
-        """Local file of a frame's points: means (M, 3) scene units, colors (M, 3) linear radiance, weight () total
-        extinction, largest () extinction, brightest () radiance of its images."""
+        """Return the local points file of a frame.
+
+        It holds means (M, 3) scene units, colors (M, 3) linear radiance, weight () total extinction, largest ()
+        extinction, brightest () radiance of the frame's images.
+        """
         return store.fetch_file(f"{self.frame_folder(frame)}/{LAST_FILE}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
-        """The content of ``scene.json``."""
+        """Return the content of ``scene.json``."""
         return {
             "renderer_version": RENDERER_VERSION,
             "frames": [{"number": f.number, "file": str(f.path)} for f in self.frames],
@@ -235,10 +238,10 @@ class CapturedVdbFrames(DatasetImages):
     """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
 
     A frame's folder appears when all of its files are written. So an interrupted run continues with the missing frames,
-    and of two runs that render the same frame the slower one keeps the other's.
+    and if two runs render the same frame, the files of the first are kept.
 
     Args:
-        store: of ground truth; the images are in ``volumes/KEY`` of it.
+        store: the store of ground truth; the images are in its ``volumes/KEY``.
     """
 
     def __init__(self, capture: Capture, store: Store) -> None:
@@ -292,7 +295,7 @@ class CapturedVdbFrames(DatasetImages):
                 self.store.write_file(_SCENE_FILE, lambda path: write_json(path, self.capture.describe()))
 
     def render_missing(self, progress: Callable[[str, float], None]) -> Store:
-        """Render missing frames in this process; returns the store of the images.
+        """Render missing frames in this process; return the store of the images.
 
         Raises:
             DataError: a file cannot be read, or the place cannot be written.
@@ -310,7 +313,7 @@ class CapturedVdbFrames(DatasetImages):
 
 @contextmanager
 def _describe_capture_write_errors(store: Store) -> Iterator[None]:
-    """Turn errors of the disk into one line that names the store."""
+    """Convert disk errors to a DataError of one line that names the store."""
     try:
         yield
     except (OSError, DataError) as error:
@@ -326,7 +329,7 @@ def _describe_capture_write_errors(store: Store) -> Iterator[None]:
 # ---------------------------------------------------------------- cameras
 
 _TEST_CAMERAS = (0.4, 0.75)
-"""Positions of the test cameras in the sequence from rim to pole: neighbours on all sides, 90 degrees apart."""
+"""Positions of the test cameras from rim to pole: neighbours on all sides, 90 degrees apart."""
 
 _DISTANCE = 2.7  # of cameras from the origin, the centre of the box, scene units (box sides)
 _ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the highest camera
@@ -335,11 +338,13 @@ _ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the hig
 def hemisphere_capture_cameras(
     size: int, cameras: int = 40, *, up: str = "z", field_of_view: float = 27.0
 ) -> tuple[list[Camera], list[Camera]]:
-    """Training cameras and two test cameras on a Fibonacci lattice over the upper hemisphere around the unit box.
+    """Return training cameras and two test cameras around the unit box.
+
+    They are on a Fibonacci lattice over the upper hemisphere.
 
     Args:
         size: edge of the square images in pixels.
-        cameras: of both kinds, at least 4.
+        cameras: number of cameras of both kinds, at least 4.
         up: 'y' or 'z'.
         field_of_view: whole angle, degrees.
     """
@@ -375,7 +380,10 @@ _COMPARED_PER_THIRD = 3  # frames
 def sample_extinction(
     medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], part: bool = False
 ) -> np.ndarray:
-    """(X, Y, Z) float32 extinction at a lattice's points, trilinear; with ``part`` only the extinction grid's part."""
+    """Return (X, Y, Z) float32 extinction at a lattice's points, trilinear.
+
+    With ``part``, it is only the extinction grid's part.
+    """
     if medium.values.size == 0:
         return np.zeros(shape, np.float32)
     chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
@@ -386,10 +394,10 @@ def sample_extinction(
 
 
 class CaptureDensity(DensityGridSource):
-    """The frames of ``path`` or the scene's own; grids, optics, placement and times are those of the scene.
+    """Ground-truth density of ``path`` or of the scene's own files.
 
-    Frames of a folder outside the scene's times are left out; a single file outside them has no time. Models are
-    compared on a frame's own voxels within the sequence's box.
+    Grids, optics, placement and times are those of the scene. Frames of a folder outside the scene's times are left
+    out; a single file outside them has no time. Models are compared on a frame's own voxels within the sequence's box.
 
     Raises:
         DataError: no file, or no frame within the scene's times.
@@ -414,7 +422,7 @@ class CaptureDensity(DensityGridSource):
         self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]
 
     def medium(self, frame: int) -> Medium:
-        """The medium of a frame's file; the last one is cached, as grids are requested in parts."""
+        """Return the medium of a frame's file; the last one is cached, as grids are requested in parts."""
         if self._cached is None or self._cached[0] != frame:
             self._cached = (frame, self.capture.medium(self._files[frame]))
         return self._cached[1]
@@ -444,7 +452,7 @@ class CaptureDensity(DensityGridSource):
 
 
 def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
-    """Errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
+    """Measure errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
     ``sigma_frames`` has the numbers of every compared frame
     (:func:`~neuprim.core.volumes.density_truth.measure_density_errors`); thirds are means over three of them, evenly

@@ -31,15 +31,15 @@ TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
 
 LIGHT_DISTANCE = 1e4
-"""Of directional lights from the middle of the scene, scene units."""
+"""Distance of directional lights from the middle of the scene, scene units."""
 
-_MIN_ALPHA = 1.0 / 255.0  # of a pixel that shows matter
+_MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
 
 T = TypeVar("T")
 
 
 class _RecentFrames(Generic[T]):
-    """Items by index, read when first used; the least recently used are dropped beyond ``memory`` bytes."""
+    """LRU cache of items by index, read on first use; old ones are dropped beyond ``memory`` bytes."""
 
     def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
         self._read, self._size, self._memory = read, size, memory
@@ -58,7 +58,7 @@ class _RecentFrames(Generic[T]):
 
 
 class VdbFrameViews(ViewSet):
-    """Frames of some cameras, camera by camera; half floats, decoded when first used.
+    """Frames of some cameras, camera by camera; half floats, decoded on first use.
 
     Args:
         folder: store of the images.
@@ -80,13 +80,13 @@ class VdbFrameViews(ViewSet):
         self._images = _RecentFrames(self._decode, lambda rgba: rgba.numel() * 2, memory)
         self.frames = capture.frames[::every]
         self.times = [torch.tensor(capture.time(frame)) for frame in self.frames]
-        self._lights = [capture.frame_lights(frame) for frame in self.frames]  # drawn once: every step asks for a view
+        self._lights = [capture.frame_lights(frame) for frame in self.frames]  # once, as every step needs a view
 
     def __len__(self) -> int:
         return len(self.cameras) * len(self.times)
 
     def _split_index(self, index: int) -> tuple[int, int]:
-        """The number of a view's camera, and the position of its frame."""
+        """Return the camera number of a view, and the position of its frame."""
         camera, frame = divmod(index, len(self.times))
         return self.cameras[camera], frame
 
@@ -116,8 +116,10 @@ class VdbFrameViews(ViewSet):
 
 
 def light_conditions(capture: Capture, light: Light | None) -> dict[str, Tensor]:
-    """What a view says of its light: a position so far away that its rays are parallel, and the irradiance; nothing
-    where all views have one light."""
+    """Return a view's light conditions: position and irradiance.
+
+    The position is so far away that rays are parallel. Empty if all views have the same light.
+    """
     if capture.lights == 1 or light is None:
         return {}
     towards = torch.tensor(light.direction, dtype=torch.float64)
@@ -178,7 +180,7 @@ class VolumeRecording:
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
 
     def matter_mask(self, index: int) -> Tensor:
-        """(H, W) bool, pixels that show matter in some frame of a test view's camera; cached per camera."""
+        """Return an (H, W) bool mask of matter in any frame of a test view's camera; cached per camera."""
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
@@ -190,8 +192,13 @@ class VolumeRecording:
 
 @dataclass(frozen=True)
 class TrainingFrames:
-    """What a run uses of a sequence: every n-th frame for training, numbers of the first and last frame for training
-    and evaluation (None: all), and bytes of decoded images and voxels in memory."""
+    """Part of a sequence that a run uses.
+
+    Attributes:
+        every: train on every n-th frame.
+        span: numbers of the first and last frame for training and evaluation; None: all.
+        memory: bytes of decoded images and voxels in memory.
+    """
 
     every: int = 1
     span: tuple[int, int] | None = None
@@ -207,7 +214,9 @@ def volume_dataset(
     up: Tensor,
     used: TrainingFrames = TrainingFrames(),
 ) -> Dataset:
-    """The dataset of a rendered sequence; colours are linear radiance over the brightest value that any camera sees.
+    """Return the dataset of a rendered sequence.
+
+    Colours are linear radiance over the brightest value that any camera sees.
 
     Raises:
         DataError: every frame is black, or a file is damaged.
@@ -270,7 +279,7 @@ def read_vdb_frame_points(path: Path, *names: str) -> dict[str, Any]:
 
 
 def total_extinction_of_vdb_frame(capture: Capture, store: Store, frame: VdbFrame) -> float:
-    """The total extinction of a frame, from its points file."""
+    """Read the total extinction of a frame from its points file."""
     return float(read_vdb_frame_points(capture.fetch_points(store, frame), "weight")["weight"])
 
 
@@ -279,7 +288,7 @@ def total_extinction_of_vdb_frame(capture: Capture, store: Store, frame: VdbFram
 _NEAR, _FAR = 0.2, 0.1  # shares of the points around voxels with matter, and anywhere in the box
 _ANY_FRAME = 0.1  # share of the draws that take any frame, so that nearly empty frames are learned as well
 _MAX_OFFSET = 6  # voxels from one with matter, along each axis
-_MARGIN = 0.1  # on each side of the sequence's box, in its longest side
+_MARGIN = 0.1  # margin on each side of the sequence's box, as a share of its longest side
 
 _VOXEL_ARRAYS = {
     "index": (np.int64, (None,)),
@@ -308,7 +317,7 @@ class MediumVoxels:
 
     @staticmethod
     def of(medium: Medium) -> MediumVoxels:
-        """The voxels of a medium that are not all zero."""
+        """Return the voxels of a medium that have a non-zero value."""
         flat = medium.values.reshape(-1, 4)
         if medium.scattering is not None:
             flat = np.concatenate([flat, medium.scattering.reshape(-1, 1)], 1)
@@ -327,7 +336,7 @@ class MediumVoxels:
         return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), squares[4:].sum()))  # type: ignore[return-value]
 
     def write(self, path: Path) -> None:
-        """Write a file of arrays. Raises OSError."""
+        """Write the arrays to an .npz file; raises OSError."""
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS}
         with open(path, "wb") as file:
             np.savez(file, **arrays)
@@ -353,7 +362,7 @@ class MediumVoxels:
         return MediumVoxels(index, values, (x, y, z), matrix)
 
     def values_at_cells(self, cells: np.ndarray) -> np.ndarray:
-        """(M, C) values at (M, 3) integer indices; 0 outside."""
+        """Return (M, C) values at (M, 3) integer indices; 0 outside."""
         values = np.zeros((len(cells), self.values.shape[1]), np.float32)
         inside = ((cells >= 0) & (cells < np.array(self.shape))).all(1)
         if len(self.index) and inside.any():
@@ -364,7 +373,7 @@ class MediumVoxels:
 
 
 class FrameVoxels(PointSupervision):
-    """Draws points at voxel centres of one frame at a time, to supervise the extinction directly.
+    """Sampler of voxel centres, one frame at a time, to supervise the extinction directly.
 
     A frame is drawn in proportion to its extinction, and one draw in ten takes any frame. 70 % of the points are voxels
     with matter, 20 % lie up to six voxels away from one, and 10 % anywhere in a box larger than the sequence's.
@@ -424,7 +433,7 @@ class FrameVoxels(PointSupervision):
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
-        """With all light where there is one, else with that which depends on no light: models add the others."""
+        """Return a frame's medium, lit if there is one light; of several, models add each themselves."""
         medium = self.capture.medium(frame)
         return light_medium(medium, self.capture.frame_lights(frame)[0]) if self.capture.lights == 1 else medium
 

@@ -121,11 +121,11 @@ class Optics:
         validate_fields(self, "scene.optics")
 
     def mixes(self, names: Container[str]) -> bool:
-        """Whether flames add to the extinction of the extinction grid, given the grids ``names``."""
+        """Return whether flames add to the extinction grid's extinction, given the grids ``names``."""
         return self.extinction > 0 and self.flame_extinction > 0 and self.flame_grid in names
 
     def turn_to_axis(self, up: Axis) -> Optics:
-        """The same optics for sequences whose up axis is ``up``; the light turns along."""
+        """Return the optics for sequences with the up axis ``up``; the light is rotated, too."""
         if up == self.up or self.light is None:
             return replace(self, up=up)
         x, y, z = self.light.direction
@@ -142,7 +142,7 @@ EMBERGEN_FIRE = Optics(
     kelvin=(1050.0, 2155.0),
     emission=2.0,
 )
-"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, and a grey of 0.05 shows the rest."""
+"""EmberGen's free fire, which has no density: hot gas absorbs, flames glow, an ambient grey of 0.05 shows the rest."""
 
 SMOKE_FIRE = Optics(
     extinction=14.0,
@@ -194,14 +194,14 @@ OPTICS_PRESETS = {
 
 
 def optics_preset(name: str, up: Axis = "z") -> Optics:
-    """The preset ``scene.look`` of that name, for sequences with this up axis; ConfigError if there is none."""
+    """Return the preset ``scene.look=name`` for the up axis ``up``; ConfigError if there is none."""
     if name not in OPTICS_PRESETS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, OPTICS_PRESETS)}")
     return OPTICS_PRESETS[name].turn_to_axis(up)
 
 
 def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
-    """Apply ``scene.optics.KEY=VALUE``; a light keeps the part of it that is not given.
+    """Apply ``scene.optics.KEY=VALUE`` to optics; a light keeps the settings that are not given.
 
     Raises:
         ConfigError: no such setting, a value of another form, or an impossible one.
@@ -215,11 +215,11 @@ def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
 
 # ---------------------------------------------------------------- further lights
 
-_LOWEST = math.radians(10.0)  # of drawn lights, above the horizon
+_LOWEST = math.radians(10.0)  # lowest elevation of random lights
 
 
 def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
-    """Lights as strong as the optics' own, from directions uniform over the sky; another ``key`` draws others."""
+    """Draw lights as strong as the optics' own, uniform over the sky; ``key`` seeds the draw."""
     own = optics.light
     if own is None:
         return [None] * count
@@ -236,7 +236,7 @@ def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
 
 
 def light_medium(medium: Medium, light: Light | None) -> Medium:
-    """The medium with the part of a light that it scatters once, isotropically, with shadows."""
+    """Return the medium with its single scattering of a light added: isotropic, with shadows."""
     if light is None or medium.empty or medium.scattered is None:
         return medium
     values = medium.values.copy()
@@ -294,10 +294,10 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
 
 
 def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
-    """Bounds, under another index-to-world map, of the voxels whose centres lie in the box of a grid's active ones."""
+    """Return bounds in indices of ``transform``: of voxels with centres in a grid's active box."""
     if grid.bounds is None or _same_voxels(grid.transform, transform):
         return grid.bounds
-    ends = np.array(grid.bounds, np.float64) - 0.5  # of the voxels' own extent
+    ends = np.array(grid.bounds, np.float64) - 0.5  # faces of the outermost voxels, not centres
     corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
     chain = np.linalg.inv(transform) @ grid.transform
     index = corners @ chain[:3, :3].T + chain[:3, 3]
@@ -316,7 +316,7 @@ def _make_medium_bounds(low: np.ndarray, high: np.ndarray) -> Bounds:
 
 
 def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
-    """Whether two index-to-world maps have the same voxels, to a millionth of one."""
+    """Return whether two index-to-world maps have the same voxels, to a millionth of a voxel."""
     scale = float(np.abs(b[:3, :3]).max())
     shift = np.linalg.inv(b) @ a[:, 3]  # not a difference, as the world's origin may be far away
     same_axes = np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * scale)
@@ -324,7 +324,10 @@ def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
 
 
 def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
-    """The grid at the voxel centres of ``box`` under ``transform``; 0 where it is not finite, or a scalar negative."""
+    """Sample a grid at the voxel centres of ``box`` under ``transform``.
+
+    Values that are not finite and negative scalars become 0.
+    """
     if grid.channels != channels:
         raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
     limit = DENSE_LIMIT // 4 * channels  # the medium has four numbers per voxel
@@ -348,7 +351,7 @@ def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, chann
 def _scattering_albedo(
     grids: Mapping[str, VdbGrid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
 ) -> np.ndarray:
-    """An array that broadcasts to (X, Y, Z, 3)."""
+    """Return the albedo, times colour grid or gradient, such that it broadcasts to (X, Y, Z, 3)."""
     albedo = np.array(optics.albedo, np.float32)
     if optics.color_grid is not None and optics.color_grid in grids:
         return albedo * np.clip(_sample_medium_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
@@ -364,7 +367,7 @@ def _scattering_albedo(
 
 
 def _flame_radiance(flame: np.ndarray, optics: Optics) -> np.ndarray:
-    """(X, Y, Z, 3) float32 emission · B(K(flame))."""
+    """Return (X, Y, Z, 3) float32 emission · B(K(flame))."""
     low, high = optics.flame_range
     table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
     where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
@@ -388,7 +391,7 @@ def _black_body_observer_lobe(mean: float, below: float, above: float) -> np.nda
 
 @cache
 def _standard_observer() -> np.ndarray:
-    """(3, L) colour matching functions, CIE 1931 2° observer: the fit of Wyman, Sloan and Shirley (JCGT 2013)."""
+    """Return (3, L) CIE 1931 2° colour matching functions: fit of Wyman, Sloan, Shirley (JCGT 2013)."""
     x = 0.362 * _black_body_observer_lobe(442.0, 0.0624, 0.0374) + 1.056 * _black_body_observer_lobe(
         599.8, 0.0264, 0.0323
     )
@@ -403,13 +406,16 @@ def _standard_observer() -> np.ndarray:
 
 
 def black_body_xyz(kelvin: np.ndarray) -> np.ndarray:
-    """(…, 3) CIE XYZ of black bodies in one unit of radiance: ∫ B(λ, T) (x̄, ȳ, z̄) dλ, B ∝ λ⁻⁵ / (exp(hc/λkT) - 1)."""
+    """Return (…, 3) CIE XYZ of black bodies in one unit of radiance.
+
+    XYZ = ∫ B(λ, T) (x̄, ȳ, z̄) dλ, B ∝ λ⁻⁵ / (exp(hc/λkT) - 1).
+    """
     exponent = _SECOND_RADIATION_CONSTANT / (_WAVELENGTHS * np.asarray(kelvin, np.float64)[..., None])
     spectrum = (_WAVELENGTHS / 560.0) ** -5.0 / np.expm1(np.minimum(exponent, 700.0))
     return spectrum @ _standard_observer().T
 
 
 def black_body_rgb(kelvin: np.ndarray, hottest: float) -> np.ndarray:
-    """(…, 3) linear sRGB radiance relative to a body of ``hottest`` kelvin (largest channel 1), clipped at 0."""
+    """Return (…, 3) linear sRGB of black bodies, clipped at 0; the largest channel at ``hottest`` is 1."""
     top = np.maximum(black_body_xyz(np.array(hottest)) @ _SRGB_FROM_XYZ.T, 0.0).max()
     return np.maximum(black_body_xyz(kelvin) @ _SRGB_FROM_XYZ.T, 0.0) / top

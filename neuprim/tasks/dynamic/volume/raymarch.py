@@ -1,4 +1,4 @@
-"""A voxel medium, and rays through the cells between its voxel centres: images, and a light's transmittance.
+"""Ray marching of a voxel medium, cell by cell: images, and the transmittance to a light.
 
 A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic
 polynomial, which two Gauss points integrate exactly, so a ray's optical depth has no discretisation error. For the
@@ -44,7 +44,7 @@ _NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest so
 
 @dataclass(frozen=True, eq=False)
 class Medium:
-    """Extinction and source on voxel centres, trilinear between them; without voxels an empty medium.
+    """Extinction and source of a medium on voxel centres, trilinear between; may have no voxels.
 
     The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at its end.
 
@@ -53,7 +53,7 @@ class Medium:
             The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
         scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
-        scattered: (X, Y, Z, 3) float32, that part times the albedo, by which light is scattered; None: by nothing.
+        scattered: (X, Y, Z, 3) float32, that part times the scattering albedo; None if it scatters no light.
     """
 
     values: np.ndarray
@@ -68,7 +68,7 @@ class Medium:
         scattering: np.ndarray | None = None,
         scattered: np.ndarray | None = None,
     ) -> Medium:
-        """The medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels.
+        """Build the medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels.
 
         Raises:
             DataError: a value is not finite.
@@ -91,7 +91,7 @@ class Medium:
 
     @property
     def empty(self) -> bool:
-        """No voxels, or not enough for a cell between them."""
+        """Whether there is no cell: fewer than two voxels along some axis."""
         return min(self.values.shape[:3]) < 2
 
     @cached_property
@@ -101,7 +101,7 @@ class Medium:
 
     @cached_property
     def skips(self) -> np.ndarray:
-        """(X-1, Y-1, Z-1) uint8: chessboard distance in cells to the nearest one that holds anything, at most 255.
+        """Chessboard distance of cells to the nearest non-empty one, up to 255; (X-1, Y-1, Z-1) uint8.
 
         A ray in a cell of distance d may leave the cube of 2d-1 cells around it at once.
         """
@@ -138,9 +138,10 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 
 
 def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
-    """(X, Y, Z) float32 exp(-∫ σ ds) from each voxel centre towards a directional light, exact up to rounding.
+    """Return (X, Y, Z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
-    ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction get 1 without a ray.
+    It is exact up to rounding. ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction
+    get 1 without a ray.
     """
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
@@ -157,7 +158,7 @@ def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarra
 
 @inline
 def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
-    """The part of [near, far] in which ``o + t d`` is within 0..size."""
+    """Return the part of [near, far] in which ``o + t d`` is within 0..size."""
     if abs(d) < 1e-12:
         return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
     a, b = -o / d, (size - o) / d
@@ -166,19 +167,19 @@ def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
 
 @inline
 def _first_march_cell(o, d, t, cells):  # type: ignore[no-untyped-def]
-    """The cell of a point, per axis."""
+    """Return the cell index along one axis of the point ``o + t d``."""
     return min(max(math.floor(o + t * d), 0), cells - 1)
 
 
 @inline
 def _inverse_march_direction(d):  # type: ignore[no-untyped-def]
-    """1 / d; 0 where the ray runs along the cells."""
+    """Return 1 / d; 0 if the ray does not leave its cells along this axis."""
     return 1.0 / d if abs(d) > 1e-12 else 0.0
 
 
 @inline
 def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
-    """Where the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
+    """Return the t at which the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
     if inverse > 0.0:
         return (cell + reach + 1 - o) * inverse
     if inverse < 0.0:
@@ -188,7 +189,7 @@ def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
 
 @inline
 def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
-    """The cell beyond ``t``, per axis: exact on the axis that is crossed, so that rounding never holds a ray up."""
+    """Return the cell beyond ``t`` on one axis; exact on the crossed one, so rounding stalls no ray."""
     if crossed:
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
     if reach == 0:
@@ -198,7 +199,7 @@ def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-
 
 @inline
 def _march_absorption(depth):  # type: ignore[no-untyped-def]
-    """(1 - exp(-depth)) / depth and exp(-depth), float32; without cancellation and mostly without an exponential."""
+    """Return (1 - exp(-depth)) / depth and exp(-depth), float32, mostly by series: no cancellation."""
     if depth < _HALF:
         mean = _ONE - depth * _C7
         mean = _ONE - depth * _C6 * mean
@@ -213,7 +214,7 @@ def _march_absorption(depth):  # type: ignore[no-untyped-def]
 
 @inline
 def _short_march_transmittance(depth):  # type: ignore[no-untyped-def]
-    """exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
+    """Return exp(-depth) for depths of -0.05 to 0.55, to 3e-6; float32."""
     rest = _ONE - depth * _C6
     rest = _ONE - depth * _C5 * rest
     rest = _ONE - depth * _C4 * rest
@@ -224,13 +225,13 @@ def _short_march_transmittance(depth):  # type: ignore[no-untyped-def]
 
 @inline
 def _march_step_gains(a, b):  # type: ignore[no-untyped-def]
-    """How much of the sources of two Gauss points leaves a step, and its transmittance, float32.
+    """Return weights of the sources of two Gauss points in a step, and its transmittance, float32.
 
     Args:
         a, b: optical depth that each point stands for.
     """
     depth = a + b
-    if depth > _HALF:  # the shortest steps of something all but solid: one point behind the other, never out of range
+    if depth > _HALF:  # shortest steps in an almost opaque medium: the points one after the other, always in range
         p, rest = _march_absorption(a)
         q, last = _march_absorption(b)
         return p, rest * q, rest * last
@@ -242,12 +243,13 @@ def _march_step_gains(a, b):  # type: ignore[no-untyped-def]
     return p * scale, q * scale, rest
 
 
-_FREE = ("nsz", "contract", "reassoc")  # what LLVM may do with the arithmetic of _two_points
+_FREE = ("nsz", "contract", "reassoc")  # fast-math flags of LLVM in _two_points
 
 
 def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
-    """Trilinear values of the four channels at two points of one cell, as vectors of four: LLVM does not find them
-    in scalar code, which takes 1.4 times as long.
+    """Generate code for trilinear values of four channels at two points of a cell, as vectors.
+
+    LLVM does not vectorise the scalar code, which takes 1.4 times as long.
 
     Args:
         flat: float32 array of the interleaved voxels.
@@ -300,11 +302,11 @@ _two_points: Any = intrinsic(_generate_two_march_points)
 
 @kernel
 def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, parts, image):  # type: ignore[no-untyped-def]
-    """Image rows start … stop.
+    """Render image rows start … stop.
 
     Args:
         values, skips: of a :class:`Medium`.
-        pose: (3, 4) float64, camera axes to indices; its lengths are scene units on the camera's side.
+        pose: (3, 4) float64, from camera space (scene units) to indices.
         lens: (4,) float64 fx fy cx cy.
         samples: rays per pixel side. parts: sub-intervals per cell.
         image: (H, W, 4) float32, premultiplied RGBA, written.
@@ -390,7 +392,7 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
 
 @inline
 def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def]
-    """Trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
+    """Return the trilinear value of an (X, Y, Z) array at fractions of cell (i, j, k)."""
     a = v[i, j, k] + z * (v[i, j, k + 1] - v[i, j, k])
     b = v[i, j + 1, k] + z * (v[i, j + 1, k + 1] - v[i, j + 1, k])
     c = v[i + 1, j, k] + z * (v[i + 1, j, k + 1] - v[i + 1, j, k])
@@ -402,7 +404,7 @@ def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def
 
 @kernel
 def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-untyped-def]
-    """Optical depth from the voxels of slices start … stop in one direction to the end of the grid.
+    """Write optical depths from voxels of slices start … stop in one direction to the grid's end.
 
     Args:
         sigma: (X, Y, Z) float32. skips: of a :class:`Medium`.

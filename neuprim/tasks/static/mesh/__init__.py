@@ -1,4 +1,4 @@
-"""The scene ``mesh``: a user's model under the cameras and the light of the solids."""
+"""The scene ``mesh``: a user's mesh file, ray-cast with cameras and light of the scene ``solids``."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from neuprim.tasks.static.mesh.model import MeshFolder, Model, Up, find_model_fi
 from neuprim.tasks.static.mesh.obj_ply_stl import read_obj, read_ply_mesh, read_stl
 from neuprim.tasks.static.mesh.surface import MeshSurface, read_surfaces
 
-# Part of the cache's key: to be raised with every change to how models are read, placed, lit or looked at.
+# Part of the cache key: raise it with every change to how meshes are read, placed, lit or viewed.
 GENERATOR_VERSION = 2
 
 MODEL_READERS: dict[str, Callable[[MeshFolder], Model]] = {".glb": read_gltf, ".gltf": read_gltf, ".obj": read_obj}
 MODEL_READERS |= {".ply": read_ply_mesh, ".stl": read_stl}
 
 
-# the daylight of the solids, as bright as white in the sun can be shown
+# the daylight of the solids, dimmed so that white in the sun stays within the display range
 _COLOURS = (DAYLIGHT.sun, DAYLIGHT.sky, DAYLIGHT.ground)
 LIGHT = Daylight(DAYLIGHT.direction, *((0.8 * r, 0.8 * g, 0.8 * b) for r, g, b in _COLOURS))
 
@@ -61,7 +61,7 @@ def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
     known = JsonReader.open(folder / "transforms_train.json")
     facts = {name: known.values[name] for name in ("rendered_from", "scene_from_file")}
     world = World(torch.tensor(facts["scene_from_file"], dtype=torch.float64)).validate(f"{folder}: scene_from_file")
-    dataset = load_blender({"path": str(folder)}, replace(context, world=None))  # the images are of the scene itself
+    dataset = load_blender({"path": str(folder)}, replace(context, world=None))  # its poses are in scene coordinates
     return replace(dataset, name=facts["rendered_from"], data_source="generated", world=world, extra=facts)
 
 
@@ -91,7 +91,7 @@ def generate_mesh_images(
 def unlit_mesh_radiance(
     scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Unlit colours of N rays: (N, 3) linear RGB, zero where nothing is hit, and (N,) bool of hits."""
+    """Return (N, 3) unlit linear RGB of N rays, zero where nothing is hit, and an (N,) bool hit mask."""
     hits = scene.intersect(origins, directions)
     image = np.zeros(directions.shape, dtype=np.float32)
     image[hits.hit] = hits.albedo if hits.emission is None else hits.albedo + hits.emission

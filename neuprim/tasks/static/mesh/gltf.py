@@ -53,7 +53,7 @@ class _GltfPrimitive(NamedTuple):
 
 
 def read_gltf(folder: MeshFolder) -> Model:
-    """Read a .gltf or .glb file; raises DataError if damaged, compressed, or with references that lead nowhere."""
+    """Read a .gltf or .glb file; DataError if it is damaged, compressed, or has invalid references."""
 
     def read() -> Model:
         reader = _GltfReader(GltfDocument(folder))
@@ -66,7 +66,7 @@ def read_gltf(folder: MeshFolder) -> Model:
 
 
 class _GltfReader:
-    """Reads materials and surfaces of one document."""
+    """Reader of the materials and triangles of one document."""
 
     def __init__(self, document: GltfDocument) -> None:
         self.document, self.path = document, document.path
@@ -74,7 +74,7 @@ class _GltfReader:
         self.vertices = self.triangles = self.parts = self.skipped = 0
 
     def read_faces(self, materials: Mapping[str, Material]) -> tuple[list[Faces], int]:
-        """Read all triangles of the scene that is shown, in place, and count their vertices."""
+        """Return all triangles of the default scene, in its coordinates, and their vertex count."""
         nodes = self.document.entries("nodes")
         check_mesh_limits(self.path, {"nodes": (len(nodes), MAX_PARTS)})
         matrices = self._node_matrices(nodes)
@@ -85,7 +85,7 @@ class _GltfReader:
             if "mesh" not in node:
                 continue
             number, places = to_gltf_index(node["mesh"]), [np.eye(4)]
-            if "skin" in node:  # the surface is where its joints are, wherever its node is
+            if "skin" in node:  # joints alone place a skinned mesh, not its node
                 pose = self._joint_matrices(self.document.content["skins"][to_gltf_index(node["skin"])], matrices)
                 primitives = self._read_gltf_mesh(number, node, materials, pose)
             else:
@@ -116,7 +116,7 @@ class _GltfReader:
     def _read_gltf_mesh(
         self, number: int, node: Mapping[str, Any], materials: Mapping[str, Material], pose: NDArray | None = None
     ) -> list[_GltfPrimitive]:
-        """Read the triangles of a node's mesh, with (J, 4, 4) transforms of the joints of a skin."""
+        """Read the triangles of a node's mesh; ``pose`` are (J, 4, 4) joint matrices of a skin."""
         mesh = self.document.content["meshes"][number]
         weights = [finite_gltf_number(w) for w in node.get("weights", mesh.get("weights", []))]
         found = []
@@ -167,7 +167,7 @@ class _GltfReader:
         return _GltfPrimitive(name, faces, positions, normals, colour, uv, glow_uv)
 
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
-        """(V, 2) coordinates, v upward, of the set that a texture of a material reads."""
+        """Return (V, 2) coordinates, v upward, of the set that a material's texture uses; None without."""
         material = self.document.content["materials"][int(name)]
         texture = {**_gltf_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
@@ -183,7 +183,7 @@ class _GltfReader:
     def _pose_vertices(
         self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None
     ) -> NDArray[np.float64]:
-        """(V, 3) positions or normals with morph targets added and joints applied."""
+        """Return (V, 3) positions or normals after morph targets and skinning."""
         count = len(values)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if weight and name in target:
@@ -198,7 +198,7 @@ class _GltfReader:
         )
         joints = joints.astype(np.int64)
         shares = shares / np.maximum(shares.sum(axis=1, keepdims=True), 1e-9)
-        # the last coordinate is 0 for normals, which do not move
+        # w is 0 for normals, which are not translated
         homogeneous = np.concatenate([values, np.full((count, 1), name == "POSITION")], axis=1)
         moved = np.zeros((count, 3))
         for first in range(0, count, _ROWS):
@@ -209,7 +209,7 @@ class _GltfReader:
         return moved
 
     def _place_primitive(self, primitive: _GltfPrimitive, matrix: NDArray[np.float64]) -> Faces:
-        """Move a primitive to its place in the scene."""
+        """Transform a primitive by the (4, 4) ``matrix`` to scene coordinates."""
         faces = primitive.faces
         with np.errstate(all="ignore"):
             positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -220,7 +220,7 @@ class _GltfReader:
         return Faces(positions[faces], primitive.material, *of_corners)
 
     def _node_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
-        """(4, 4) scene from node, of the nodes of the scene that is shown."""
+        """Return node -> (4, 4) scene-from-node matrix, for the nodes of the default scene."""
         children = [[to_gltf_index(child) for child in node.get("children", [])] for node in nodes]
         scenes = self.document.entries("scenes")
         if scenes:
@@ -241,7 +241,7 @@ class _GltfReader:
         return found
 
     def _instance_matrices(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """The transforms of a node's mesh: one, or one for each instance."""
+        """Return the (4, 4) transforms of a node's mesh: one, or one per instance."""
         instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
         if instancing is None:
             return [matrix]
@@ -259,7 +259,7 @@ class _GltfReader:
         return [matrix @ _node_matrix(place, "an instance") for place in places]
 
     def _joint_matrices(self, skin: Mapping[str, Any], matrices: Mapping[int, NDArray]) -> NDArray[np.float64]:
-        """(J, 4, 4) from the place where a vertex was bound to each joint to where the joint is."""
+        """Return (J, 4, 4) skinning matrices: joint transforms times inverse bind matrices."""
         joints = [to_gltf_index(joint) for joint in skin["joints"]]
         outside = [joint for joint in joints if joint not in matrices]
         if outside:
@@ -288,7 +288,7 @@ class _GltfReader:
         return replace(found, blend=mode == "BLEND", glow=glow, unlit=unlit)
 
     def _textured_material(self, factor: Sequence[float], texture_info: Mapping[str, Any] | None) -> Material:
-        """A colour factor with the texture that it multiplies."""
+        """Return a material of a colour factor and the texture that it multiplies, if any."""
         colour = (factor[0], factor[1], factor[2])
         if texture_info is None:
             return Material(colour)
@@ -306,7 +306,7 @@ class _GltfReader:
         return Material(colour, self._read_gltf_image(to_gltf_index(source)), wrap, transform)
 
     def _read_gltf_image(self, index: int) -> str | None:
-        """Read an image and return its key in :attr:`images`; None where it is missing and that is allowed."""
+        """Read an image, return its key in :attr:`images`; None if missing, with ``skip_missing``."""
         name = f"image {index}"
         if name not in self.images:
             image = self.document.content["images"][index]
@@ -321,7 +321,10 @@ class _GltfReader:
 
 
 def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Base colour and its texture in either notation; where a material has both, specular-glossiness wins."""
+    """Return base colour and texture in ``pbrMetallicRoughness`` keys.
+
+    If a material has both notations, specular-glossiness wins.
+    """
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:
         return material.get("pbrMetallicRoughness", {})
@@ -330,7 +333,7 @@ def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    """(4, 4) parent from node, of a matrix or of translation, rotation and scale."""
+    """Return the (4, 4) parent-from-node matrix of a matrix or of translation, rotation and scale."""
     matrix = np.eye(4)
     lengths = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
     numbers = {key: [finite_gltf_number(x) for x in place[key]] for key in lengths if key in place}
@@ -349,7 +352,7 @@ def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
 
 
 def _index_triangles(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
-    """(F, 3) triangles of a list, strip or fan of vertices."""
+    """Return (F, 3) vertex indices of a triangle list, strip or fan."""
     if mode == _TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
     count = max(len(index) - 2, 0)
@@ -361,7 +364,7 @@ def _index_triangles(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
 
 
 def _texture_transform(transform: Mapping[str, Any]) -> tuple[tuple[float, ...], ...]:
-    """(2, 3) of KHR_texture_transform: scale, then rotation, then offset."""
+    """Return the (2, 3) matrix of KHR_texture_transform: scale, then rotation, then offset."""
     (x, y), (u, v) = transform.get("offset", (0.0, 0.0)), transform.get("scale", (1.0, 1.0))
     c, s = math.cos(transform.get("rotation", 0.0)), math.sin(transform.get("rotation", 0.0))
     rows = ((c * u, s * v, x), (-s * u, c * v, y))

@@ -1,4 +1,4 @@
-"""The JSON of a glTF file and its binary data; every index and size is checked against the bytes that are there."""
+"""JSON and binary data of a glTF file; indices and sizes are checked against the available bytes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ _READ = set(
     "EXT_mesh_gpu_instancing EXT_texture_webp KHR_materials_emissive_strength KHR_materials_pbrSpecularGlossiness "
     "KHR_materials_unlit KHR_mesh_quantization KHR_texture_transform".split()
 )
-# of KHR_materials_variants the default is drawn, of MSFT_lod the finest
+# KHR_materials_variants: the default is drawn; MSFT_lod: the finest level
 _HARMLESS = set(
     "EXT_instance_features EXT_lights_ies EXT_lights_image_based EXT_mesh_features EXT_structural_metadata "
     "KHR_animation_pointer KHR_audio_emitter KHR_lights_punctual KHR_materials_variants KHR_xmp_json_ld "
@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 
 def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
-    """Call a function and turn what damaged documents raise into DataError."""
+    """Call a function; convert the exceptions that damaged documents cause to DataError."""
     try:
         return function()
     except _DAMAGE as error:
@@ -69,12 +69,12 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 class GltfDocument:
-    """A document whose version and extensions are checked, and its arrays."""
+    """A glTF document with checked version and extensions, and its arrays."""
 
     def __init__(self, folder: MeshFolder) -> None:
         data = folder.read_model()
         text, binary = _split_glb(data) if folder.file.suffix.lower() == ".glb" else (data, None)
-        document = load_json(text.decode("utf-8-sig"), infinite=True)  # refused later, with the name of the value
+        document = load_json(text.decode("utf-8-sig"), infinite=True)  # non-finite numbers are refused where used
         if not isinstance(document, dict):
             raise ValueError(f"top level is a {type(document).__name__}, no object")
         version = str(document["asset"]["version"])
@@ -85,7 +85,7 @@ class GltfDocument:
         self._buffers = [self._read_buffer(i, entry, binary) for i, entry in enumerate(self.entries("buffers"))]
 
     def entries(self, key: str) -> list[Any]:
-        """Return a list of the document; empty where it is missing."""
+        """Return the document's top-level list ``key``; empty if it is missing."""
         return self.content.get(key, [])
 
     def _check_extensions(self) -> None:
@@ -128,8 +128,10 @@ class GltfDocument:
         return data[start : start + size], to_gltf_index(view.get("byteStride", 0))
 
     def array(self, index: int, kinds: Sequence[str], length: int | None = None) -> NDArray:
-        """Return (N, C) values of an accessor of one of the types ``kinds``; normalized integers as floats 0..1 or
-        -1..1."""
+        """Return (N, C) values of an accessor, whose type must be in ``kinds``.
+
+        Normalized integers become floats 0..1 or -1..1.
+        """
         accessor = self.content["accessors"][to_gltf_index(index)]
         where, count, kind = f"accessors[{index}]", to_gltf_index(accessor["count"]), accessor["type"]
         if kind not in kinds:
@@ -155,7 +157,7 @@ class GltfDocument:
 
 
 def parse_gltf_uri(uri: Any) -> str:
-    """Return a data URI as it is, and the name of a file unquoted."""
+    """Return a data URI unchanged, or a file name with percent-encoding decoded."""
     if not isinstance(uri, str) or not uri or "\0" in uri:
         raise ValueError("a uri is no text")
     return uri if uri.startswith("data:") else unquote(uri)

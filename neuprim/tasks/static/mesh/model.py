@@ -1,6 +1,7 @@
-"""A mesh file with its materials, read together with the files it names: under size limits, from its folder only.
+"""Reading a mesh file and the files it refers to: under size limits, from its folder only.
 
-Polygons become triangles that cover the same surface: fans, else ears; those that cross themselves are refused.
+Polygons are triangulated by fans, or else by ear clipping, which keeps the surface; polygons that cross themselves are
+refused.
 """
 
 from __future__ import annotations
@@ -37,15 +38,15 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
 @dataclass(frozen=True)
 class Material:
-    """Colour of a part of the surface."""
+    """Surface material: colour, texture, opacity and emission."""
 
     colour: tuple[float, float, float] | None = (
-        None  # linear RGB factor of texture and vertices; None: none in the file
+        None  # linear RGB factor on texture and vertex colours; None if the file has none
     )
     texture: str | None = None  # key of the image in Model.images
     wrap: tuple[str, str] = ("repeat", "repeat")  # outside 0..1 along u and v: "repeat", "clamp" or "mirror"
-    transform: tuple[tuple[float, ...], ...] | None = None  # (2, 3), of coordinates whose v points down
-    opacity: float = 1.0  # factor of the alpha of texture and vertices
+    transform: tuple[tuple[float, ...], ...] | None = None  # (2, 3), for texture coordinates whose v points down
+    opacity: float = 1.0  # factor on the alpha of texture and vertices
     cutoff: float | None = None  # alpha below which there is a hole; None where alpha is ignored
     blend: bool = False  # whether the file asks for translucency, which is not drawn
     glow: Material | None = None  # emitted light: its colour, texture, wrap and transform
@@ -95,7 +96,7 @@ def find_model_file(path: Path) -> Path:
 
 
 class MeshFolder:
-    """Reads a mesh file and the files below its folder, up to a total size, and hashes all that it reads."""
+    """Reader of a mesh file and files below its folder, up to a total size; hashes all it reads."""
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
         self.file, self.skip_missing = file, skip_missing
@@ -114,14 +115,14 @@ class MeshFolder:
         return data
 
     def read_required(self, reference: str, what: str) -> bytes:
-        """Read a needed file; raises DataError for one that leaves the model's folder, is missing or too large."""
+        """Read a required file; DataError if outside the model's folder, missing or too large."""
         found, fault = self._resolve_reference(reference, what)
         if found is None:
             raise DataError(fault)
         return found
 
     def read_optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """Read the first existing spelling of a name; None, with a warning, if ``skip_missing`` allows it."""
+        """Read the first existing of ``references``; else raise, or warn and return None (``skip_missing``)."""
         faults = []
         for reference in references:
             found, fault = self._resolve_reference(reference, what)
@@ -135,7 +136,7 @@ class MeshFolder:
         return None
 
     def _resolve_reference(self, reference: str, what: str) -> tuple[bytes | None, str]:
-        """Return the bytes, or None and the reason why the reference is refused."""
+        """Return the referenced bytes, or None and the reason why the reference is refused."""
         shown = reference if len(reference) <= 80 else reference[:77] + "..."
         if reference.startswith("data:"):
             return self._decode_data_uri(reference, what), ""
@@ -189,7 +190,7 @@ def check_mesh_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None
 
 
 def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
-    """Raise DataError if ``faces`` (any shape) refers to a row of ``positions`` (V, 3) that is missing or infinite."""
+    """Raise DataError if ``faces``, of any shape, index missing or non-finite ``positions`` (V, 3)."""
     if not faces.size:
         return
     low, high = int(faces.min()), int(faces.max())
@@ -203,19 +204,19 @@ def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np
 
 # ---------------------------------------------------------------- polygons
 
-_FANS = 8  # corners that fans of all polygons are tried from, before ears of one are looked for
-_MOST_TESTS = 500_000  # of ears, in a model: about 20 seconds
-_COSTLY = 500  # corners of a polygon that make a test as long again
-_FLAT = 1e-10  # twice an area, over the square of the polygon's size, that counts as none
+_FANS = 8  # corners tried as the centre of a fan, before ear clipping
+_MOST_TESTS = 500_000  # ear tests per model: about 20 seconds
+_COSTLY = 500  # per so many remaining corners, an ear test counts as one test more
+_FLAT = 1e-10  # twice an area over the squared extent of the polygon, up to which the area counts as zero
 
 
 def triangulate_polygons(
     path: Path, corners: NDArray[np.float64], sizes: NDArray[np.integer]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Triangles of polygons: (T, 3) rows of ``corners``, and (T,) which polygon each is of, ascending.
+    """Triangulate polygons; return (T, 3) rows of ``corners`` and (T,) ascending polygon indices.
 
-    ``corners`` (C, 3) are finite, those of all polygons one after the other, and each of the (P,) ``sizes`` says how
-    many a polygon has. Raises DataError for polygons that cross themselves.
+    ``corners`` (C, 3) are the finite corners of all polygons, concatenated; ``sizes`` (P,) is the number of corners of
+    each polygon. Raises DataError for polygons that cross themselves.
     """
     first = np.cumsum(sizes) - sizes
     found, owners, crossed = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)], []
@@ -230,7 +231,7 @@ def triangulate_polygons(
         points = corners[index] - corners[index[:, :1]]
         with np.errstate(all="ignore"):
             extent = np.abs(points).max(axis=(1, 2), keepdims=True)
-            points = np.nan_to_num(points / extent)  # of a point
+            points = np.nan_to_num(points / extent)  # 0 / 0 if all corners coincide
             normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
             length = np.linalg.norm(normal, axis=1, keepdims=True)
             normal = np.where(length > _FLAT, normal / length, 0.0)
@@ -239,10 +240,10 @@ def triangulate_polygons(
             fan = _polygon_triangle_fan(size, start)
             a, b, c = (points[left][:, fan[:, i]] for i in range(3))
             across = np.cross(b - a, c - a)
-            areas = np.einsum("mtc,mc->mt", across, normal[left])  # twice; negative where triangles turn the other way
+            areas = np.einsum("mtc,mc->mt", across, normal[left])  # twice the areas; negative if reversed
             line = np.linalg.norm(across, axis=2).max(axis=1) <= _FLAT if start == 0 else np.False_
             good = ((areas >= -_FLAT).all(axis=1) & (length[left, 0] > _FLAT)) | line
-            # triangles without area are no faces of the file
+            # leave out triangles without area, unless the whole polygon is a line
             shown = good[:, None] & ((areas > _FLAT) | np.reshape(line, (-1, 1)))
             found.append(index[left][:, fan][shown])
             owners.append(np.repeat(rows[left], shown.sum(axis=1)))
@@ -270,20 +271,20 @@ def triangulate_polygons(
 
 
 def _polygon_triangle_fan(size: int, start: int) -> NDArray[np.intp]:
-    """(size - 2, 3) corners of the triangles around the corner ``start``."""
+    """Return the (size - 2, 3) corner indices of the triangle fan around the corner ``start``."""
     around = (start + np.arange(1, size)) % size
     return np.stack([np.full(size - 2, start), around[:-1], around[1:]], axis=1)
 
 
 def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
-    """(size, 2) as seen along the normal, counterclockwise."""
+    """Project a polygon along its normal to (size, 2) points, counterclockwise."""
     side = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
     side /= np.linalg.norm(side)
     return np.stack([points @ side, points @ np.cross(normal, side)], axis=1)
 
 
 def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
-    """Cut triangles off a polygon (Meisters 1975): None where that ends too soon; and how many tests are left."""
+    """Clip ears off a polygon (Meisters 1975); return (T, 3) corners, None on failure, and tests left."""
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0
     while len(left) >= 3:
@@ -310,7 +311,7 @@ def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64
         if ear or abs(area) <= _FLAT:
             del left[i]
             strict, failed = True, 0
-            place = i + 1  # not where it was cut, which makes slivers
+            place = i + 1  # continue behind the cut; cutting there again makes slivers
         else:
             place, failed = i + 1, failed + 1
     return np.array(found, np.int64).reshape(-1, 3), tests

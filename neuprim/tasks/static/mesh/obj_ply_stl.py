@@ -1,6 +1,6 @@
-"""OBJ with material libraries (.mtl), PLY with colours or a texture, and STL, which may have colours.
+"""Readers of OBJ with material libraries (.mtl), PLY with colours or a texture, and STL.
 
-Colours and textures are sRGB. What headers announce is checked before memory is taken for it.
+Colours, which STL files may have, too, and textures are sRGB. Counts in headers are checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -32,18 +32,17 @@ from neuprim.tasks.static.mesh.model import (
     triangulate_polygons,
 )
 
-# options of a texture that are followed by this many numbers, at most, and by one word
+# texture options with at most this many numbers after them, and texture options with one word after them
 _NUMBERS = {"-mm": 2, "-o": 3, "-s": 3, "-t": 3}
 _WORDS = {"-blendu", "-blendv", "-bm", "-boost", "-cc", "-clamp", "-imfchan", "-texres", "-type"}
 
-# fewest and most numbers that are read of a vertex (x y z, then a colour or a weight), its texture coordinates and its
-# normal
+# least and most numbers read per vertex (x y z, then a colour or a weight), texture coordinate and normal
 _WIDTHS = {"v": (3, 8), "vt": (1, 3), "vn": (3, 3)}
-_NONE = -1  # the index of texture coordinates or a normal that a corner does without
+_NONE = -1  # index of missing texture coordinates or normals
 
 
 def read_obj(folder: MeshFolder) -> Model:
-    """Read an .obj file and its material libraries; raises DataError as :class:`MeshFolder`."""
+    """Read an .obj file and its material libraries; DataErrors are those of :class:`MeshFolder`."""
     text = folder.read_model().decode("utf-8", "replace")
     found = {"vertices": (text.count("\nv "), MAX_VERTICES), "faces": (text.count("\nf "), MAX_FACES)}
     check_mesh_limits(folder.file, {**found, "changes of material": (text.count("usemtl "), MAX_PARTS)})
@@ -62,7 +61,7 @@ def read_obj(folder: MeshFolder) -> Model:
 
 
 def _read_obj_faces(path: Path, text: str) -> tuple[list[Faces], int]:
-    """Read all triangles, by material, and count the vertices."""
+    """Return the triangles of each material, and the number of vertices."""
     text = re.sub(r"\\\r?\n", " ", text)
     numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
     indices, sizes, owners = array("q"), array("q"), array("q")
@@ -122,7 +121,7 @@ def _look_up_obj_corners(table: NDArray[np.float64], index: NDArray[np.int64], m
 
 
 def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
-    """(N, 2 or more) NaN where a row has fewer numbers; texture coordinates without v are at 0."""
+    """Return rows of one key as a table (N, 2 or more); missing numbers are NaN, those of ``vt`` 0."""
     width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
     table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
     first = np.cumsum(lengths) - lengths
@@ -133,7 +132,7 @@ def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[n
 
 
 def _obj_vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
-    """(V, 3) colours of vertices, which stand after x y z; None without."""
+    """Return (V, 3) colours 0..1, the numbers after x y z; None unless all vertices have one."""
     if v.shape[1] < 6:
         return None
     found = v[:, 3:6]
@@ -181,7 +180,7 @@ def _read_mtl_library(text: str, folder: MeshFolder, images: dict[str, bytes]) -
 
 
 def _finish_mtl_material(material: Material) -> Material:
-    """Without the colour that a texture stands in the place of, and without emitted light of no strength."""
+    """Set colours to white where a texture replaces them, and drop emission of strength zero."""
     white = (1.0, 1.0, 1.0)
     glow = material.glow
     if glow is not None and glow.texture is not None:
@@ -192,7 +191,7 @@ def _finish_mtl_material(material: Material) -> Material:
 
 
 def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: dict[str, bytes]) -> Material | None:
-    """The texture that a line names, with its place; None where it is missing and that is allowed."""
+    """Read a texture with wrap mode and transform; None if it is missing and ``skip_missing``."""
     image, options = _mtl_texture_file_name(words, rest)
     spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
     if image not in images:
@@ -203,12 +202,12 @@ def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: d
     (su, sv), (ou, ov) = options.get("-s", (1.0, 1.0)), options.get("-o", (0.0, 0.0))
     moved = (su, sv, ou, ov) != (1.0, 1.0, 0.0, 0.0)
     wrap = ("clamp", "clamp") if "-clamp" in options else ("repeat", "repeat")
-    # scale and offset are said for a v that runs up
+    # scale and offset are for a v that points up
     return Material(texture=image, wrap=wrap, transform=((su, 0.0, ou), (0.0, sv, 1 - sv - ov)) if moved else None)
 
 
 def _mtl_texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
-    """A texture's name, which may hold blanks, without the options before it; and those of them that move it."""
+    """Return a texture's file name, maybe with blanks, and the options before it that transform it."""
     place, last = 0, len(words) - 1
     options: dict[str, tuple[float, float]] = {}
     while place < last and words[place] in {*_NUMBERS, *_WORDS}:
@@ -319,7 +318,7 @@ def _read_mesh_faces_of_ply(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
-    """(N, 3) 0..1 of vertices or faces; None without."""
+    """Return (N, 3) colours 0..1 of vertices or faces; None without."""
     if not set(_RGB) <= set(element.names):
         return None
     kind = element.rows.dtype["red"]
@@ -330,7 +329,10 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
 
 
 def read_stl(folder: MeshFolder) -> Model:
-    """Read an .stl file: binary where its length is what byte 80 announces, whatever it starts with, else text."""
+    """Read an .stl file.
+
+    It is binary if its length fits the face count at byte 80, whatever it begins with; else text.
+    """
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
     text = len(data) != 84 + 50 * count or len(data) < 84

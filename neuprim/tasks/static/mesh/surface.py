@@ -1,4 +1,4 @@
-"""The surface that rays meet: triangles with colours, opacity and filtered textures, placed in the unit box."""
+"""Ray-cast mesh: triangles with colours, opacity and filtered textures, placed in the unit box."""
 
 from __future__ import annotations
 
@@ -32,13 +32,13 @@ from neuprim.tasks.static.mesh.model import (
     check_mesh_limits,
 )
 
-GREY = parse_solid_srgb("#b4b4b4")  # of what the file says no colour of
-_FARTHEST_UV = 1e6  # single precision has no fraction left there; coordinates beyond, or no numbers, are taken for 0
+GREY = parse_solid_srgb("#b4b4b4")  # colour of faces without a colour in the file
+_FARTHEST_UV = 1e6  # float32 has steps of 1/16 there; coordinates beyond, and NaN, become 0
 
 
 @dataclass(frozen=True)
 class SurfacePart:
-    """One piece of the surface."""
+    """Triangles of one material, with resolved colours."""
 
     corners: NDArray[np.float64]  # (F, 3, 3) positions in the units and axes of the file, finite
     normals: NDArray[np.float64] | None  # (F, 3, 3) of the file, if any
@@ -75,7 +75,7 @@ def _make_surface_part(model: Model, faces: Faces) -> SurfacePart:
     alpha = np.full(shape[:2], material.opacity, np.float32) if material.opacity < 1 else None
     if own is not None:
         rgb = np.clip(np.nan_to_num(own[..., :3]), 0, 1)
-        # exporters of formats other than glTF write some colour of a material beside those of the vertices
+        # formats other than glTF: vertex colours replace the colour of the material, which exporters write anyway
         colour = rgb * colour if model.linear else srgb_to_linear(torch.from_numpy(rgb)).numpy()
         if own.shape[2] == 4:
             alpha = (np.float32(material.opacity) * np.clip(np.nan_to_num(own[..., 3]), 0, 1)).astype(np.float32)
@@ -92,7 +92,7 @@ def _make_surface_part(model: Model, faces: Faces) -> SurfacePart:
 def _texture_coordinates(
     model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
 ) -> NDArray[np.float32] | None:
-    """(F, 3, 2) coordinates of the corners in the material's texture; None without."""
+    """Return (F, 3, 2) texture coordinates of the corners; None without texture or coordinates."""
     if material.texture is None:
         return None
     if uv is None:
@@ -113,14 +113,14 @@ def _transform_texture_coordinates(uv: NDArray[np.float32], material: Material) 
     return np.stack([down[..., 0], 1 - down[..., 1]], axis=-1)
 
 
-FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")  # what Pillow may decode: others run programs
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TGA", "TIFF")  # formats that Pillow may decode; others run programs
 
 _LINEAR: NDArray[np.float32] = srgb_to_linear(torch.arange(256) / 255.0).numpy()
 _ROWS = 256
 
 
 class MeshTexture:
-    """An image, (H, W, 4) uint8 sRGB with straight alpha, with its copies of half, a quarter, ... of the size."""
+    """A mip-mapped texture, (H, W, 4) uint8 sRGB with straight alpha; levels halve the size."""
 
     def __init__(self, pixels: NDArray[np.uint8], wrap: tuple[str, str] = ("repeat", "repeat")) -> None:
         self.wrap = wrap
@@ -137,7 +137,7 @@ class MeshTexture:
         return self.levels[0][..., 3]
 
     def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
-        """(M, 4) linear RGB and alpha at (M, 2) ``uv``, v upward; a ray covers ``blur`` (M,) texels a side."""
+        """Return (M, 4) linear RGB and alpha at (M, 2) ``uv``, v upward; a ray is ``blur`` (M,) texels wide."""
         level = np.clip(np.round(np.log2(np.maximum(blur, 1.0))), 0, len(self.levels) - 1).astype(np.intp)
         found = np.empty((len(uv), 4), dtype=np.float32)
         for index in np.unique(level):
@@ -168,7 +168,7 @@ def _wrap_mesh_texels(index: NDArray[np.float64], size: int, wrap: str) -> NDArr
 
 
 def _linear_texels(pixels: NDArray) -> NDArray[np.float32]:
-    """(..., 4) float32 linear values of uint8 sRGB ones; floats are linear already."""
+    """Return (..., 4) float32 linear values of uint8 sRGB texels; floats are linear already."""
     if pixels.dtype != np.uint8:
         return pixels.astype(np.float32)
     values = np.empty(pixels.shape, np.float32)
@@ -216,11 +216,11 @@ def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -
         raise DataError(f"{where} cannot be decoded ({reason}); expected {expected}") from None
 
 
-FARTHEST = 1.3  # of any vertex from the origin, in scene units: what the cameras of ``solids`` have in view
-_DIGITS = 6  # after the point, of positions in scene units that count as one
+FARTHEST = 1.3  # largest distance of a vertex from the origin, scene units: the cameras of ``solids`` see it
+_DIGITS = 6  # decimals of positions, scene units; vertices that agree in them are merged
 _LEAST_AREA = 1e-12  # of a face, in square scene units: below that it has no normal in single precision
-_MAX_HOLES = 64  # of holes that a ray passes at most
-_MOST_AROUND = 64  # faces around a vertex that are smoothed over; work and memory grow with their square
+_MAX_HOLES = 64  # most holes that a ray passes
+_MOST_AROUND = 64  # most faces around a vertex with smooth normals; work and memory grow with their square
 
 _Pool = dict[tuple[str, tuple[str, str]], MeshTexture]
 
@@ -228,7 +228,10 @@ _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
-    """(4, 4) transform that turns z up and scales the box into [-1, 1]^3 and into view; None without size."""
+    """Return the (4, 4) transform that turns z up, centres and fits into [-1, 1]^3 and view.
+
+    None if the size is 0 or out of range.
+    """
     turn = _Z_FROM_Y if upward == "y" else np.eye(3)
     lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
     upper = np.max([part.corners.max(axis=(0, 1)) for part in parts], axis=0)
@@ -244,7 +247,7 @@ def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np
 
 
 class MeshSurface(Scene):
-    """The parts of a model, ready for ray queries; neighbouring rays are ``spacing`` apart at distance 1."""
+    """Ray-castable parts of a model; neighbouring rays are ``spacing`` apart at distance 1."""
 
     def __init__(
         self, model: Model, parts: Sequence[SurfacePart], upward: Up, spacing: float, engine: Engine = "auto"
@@ -256,7 +259,7 @@ class MeshSurface(Scene):
         self.scene_from_file = matrix
         points = np.concatenate([(part.corners @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3) for part in parts])
         first, same = trimesh.grouping.unique_rows(points, digits=_DIGITS)
-        points, faces = points[first], same.reshape(-1, 3)  # vertices at which faces touch are one
+        points, faces = points[first], same.reshape(-1, 3)  # merge the vertices of touching faces
         corners = points[faces]
         across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         double = np.linalg.norm(across, axis=1)
@@ -287,7 +290,7 @@ class MeshSurface(Scene):
         self._holes = bool((self._cutoff > 0).any())
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """As of any scene; normals are those of the visible side."""
+        """Intersect as :meth:`Scene.intersect`; normals point to the visible side."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         side = np.where(shading_dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
@@ -298,7 +301,7 @@ class MeshSurface(Scene):
         return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo, emission=emission)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """As of any scene; holes let light through."""
+        """Test occlusion as :meth:`Scene.occluded`; holes in textures let light through."""
         if not self._holes:
             return super().occluded(points, directions, distance)
         d = np.ascontiguousarray(directions, dtype=np.float32)
@@ -326,7 +329,7 @@ class MeshSurface(Scene):
         return triangle, u, v, distance
 
     def _is_hole(self, triangle: NDArray, u: NDArray, v: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        """(M,) whether the texture has a hole there."""
+        """Return (M,) bool: whether alpha at a hit is below the material's cutoff."""
         weight = np.stack([1 - u - v, u, v], axis=1, dtype=np.float32)
         cutoff = self._cutoff[triangle]
         able = np.flatnonzero(cutoff > 0)
@@ -336,7 +339,10 @@ class MeshSurface(Scene):
 
 
 class _MeshColourLayer:
-    """Colours of the faces ``kept`` (F,): corner values times textures; ``area`` (F,) is twice a face's, in rays."""
+    """Colours of the faces ``kept`` (F,): corner values times textures.
+
+    ``area`` (F,) is twice the area of a face in units of the squared distance of rays.
+    """
 
     def __init__(
         self, model: Model, parts: Sequence[SurfacePart], kept: NDArray[np.bool_], area: NDArray, pool: _Pool
@@ -357,14 +363,14 @@ class _MeshColourLayer:
         self._colour = np.concatenate([rgb, alpha[..., None]], axis=-1).astype(np.float32)
         no_uv = [np.zeros((len(p.colour), 3, 2), np.float32) if p.uv is None else p.uv for p in parts]
         self._uv = np.concatenate(no_uv)[kept]
-        # texels per scene unit: the square root of the area in the texture over that in space, of every face
+        # texels along a ray's width at distance 1: root of a face's area in texels over its area in rays
         sides = self._uv[:, 1:] - self._uv[:, :1]
         inside = np.abs(sides[:, 0, 0] * sides[:, 1, 1] - sides[:, 0, 1] * sides[:, 1, 0])
         texels = np.array([texture.texels for texture in self._textures] + [0], np.float64)
         self._blur = np.sqrt(inside * texels[self._texture] / area[kept]).astype(np.float32)
 
     def sample_colours(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
-        """(M, 4) linear RGB and alpha."""
+        """Return (M, 4) linear RGB and alpha at (M,) triangles with (M, 3) barycentric weights."""
         found: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
         texture = self._texture[triangle]
         for index in np.unique(texture[texture >= 0]):
@@ -375,7 +381,7 @@ class _MeshColourLayer:
 
 
 def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
-    """(F,) faces that are completely transparent."""
+    """Return (F,) bool: whether alpha is below the cutoff at all corners of a face."""
     if part.alpha is None or part.material.cutoff is None:
         return np.zeros(len(part.colour), dtype=np.bool_)
     clear: NDArray[np.bool_] = part.alpha.max(axis=1) < part.material.cutoff
@@ -397,7 +403,7 @@ def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool:
 
 
 def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
-    """Give faces their own vertices where too many touch to be smoothed over."""
+    """Give faces their own vertices where too many share one for smooth normals."""
     around = np.bincount(faces.ravel(), minlength=len(points))
     crowded = around[faces] > _MOST_AROUND
     alone = faces[crowded]
@@ -409,7 +415,10 @@ def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.in
 def _smooth_normals(
     given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh
 ) -> NDArray[np.float64]:
-    """(F, 3, 3) unit normals: the file's, turned to the side of their face; else from the angles between faces."""
+    """Return (F, 3, 3) unit normals: the file's, flipped to the face's side, else smoothed ones.
+
+    The latter are :func:`solid_corner_normals`.
+    """
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)
         unit = given / length

@@ -232,7 +232,7 @@ def _parse_port(text: str) -> int:
 
 VIEW_COMMAND = Command(
     "view",
-    "look at a run in the browser: turn it, play it, move its light, edit a camera path",
+    "look at a run in the browser: turn it, play it, move its light",
     _view_command,
     _add_view_arguments,
     opens_run=True,

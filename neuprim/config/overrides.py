@@ -26,13 +26,11 @@ class Assignment:
     Attributes:
         key: dotted.
         text: what was typed.
-        whole: whether a mapping replaces the old value, instead of single entries of it.
     """
 
     key: str
     value: Any
     text: str
-    whole: bool = False
 
 
 @dataclass(frozen=True)

@@ -58,6 +58,8 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     rate = "frames per second of an animation (default: it lasts about four seconds)"
     parser.add_argument("--fps", type=parse_rate, metavar="F", help=rate)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
+    numbers = "frames of the .vdb files by number, instead of --time: 1001-1048x2,1060; images are named NAME.1001.exr"
+    parser.add_argument("--frame", metavar="NUMBERS", help=numbers)
     parser.add_argument("--frames", type=parse_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
     parser.add_argument("--force", action="store_true", help="replace existing pictures of the run's report")
     group = parser.add_argument_group("environment light, for tasks with a light")
@@ -81,7 +83,7 @@ def _render_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.runs.render_images import RenderRequest, render_run
 
-    names = ("size", "format", "out", "frames", "conditions", "fps", "space", "layers", "datatype")
+    names = ("size", "format", "out", "frame", "frames", "conditions", "fps", "space", "layers", "datatype")
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
         camera, environment=environment, overrides=arguments.overrides, overwrite=arguments.force, **given

@@ -68,6 +68,27 @@ def split_conditions(words: Sequence[str], specs: Sequence[ConditionSpec]) -> tu
     return found, rest
 
 
+# ---------------------------------------------------------------- frame numbers
+
+_FRAME_RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?:x(\d+))?)?")
+
+
+def parse_frame_numbers(text: str) -> list[int]:
+    """Return the frame numbers of ``--frame``: numbers and ranges FIRST-LAST or FIRST-LASTxSTEP, separated by commas.
+
+    Raises:
+        ConfigError: anything else, or more than 100,000 frames.
+    """
+    numbers: list[int] = []
+    for part in text.split(","):
+        found = _FRAME_RANGE.fullmatch(part.strip())
+        first, last, step = (int(x) for x in (found[1], found[2] or found[1], found[3] or 1)) if found else (0, -1, 1)
+        if last < first or step < 1 or len(numbers) + (last - first) // step >= _MOST:
+            raise ConfigError(f"--frame {text}: expected numbers and ranges such as 1001-1048x2,1060")
+        numbers += range(first, last + 1, step)
+    return numbers
+
+
 # ---------------------------------------------------------------- values
 
 

@@ -13,7 +13,7 @@ from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import read_stored_channels
-from neuprim.core.conditions import condition_flag, count_condition_frames, read_conditions
+from neuprim.core.conditions import condition_flag, count_condition_frames, parse_frame_numbers, read_conditions
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
@@ -53,6 +53,8 @@ class RenderRequest:
             differ in a condition become a WebP animation and others PNGs.
         out: file or folder to write; None for a folder in the run's ``frames``.
         frames: number of views of an orbit.
+        frame: numbers of source frames to render, e.g. "1001-1048x2", for volumes; they replace the condition "time"
+            and appear in file names.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
         fps: frames per second; None for those of the cameras' file, or for about four seconds, at 5 to 30.
         environment: environment map that replaces the task's light.
@@ -69,6 +71,7 @@ class RenderRequest:
     format: str | None = None
     out: Path | None = None
     frames: int = 60
+    frame: str | None = None
     conditions: Mapping[str, str] = field(default_factory=dict)
     fps: float | None = None
     environment: EnvironmentFile | None = None
@@ -129,7 +132,10 @@ class _RunRenderSession:
         self.lights = () if request.environment is None else self._load_lights(request.environment)
         self.views, self.fps = self._load_views()
         with run.plugins.attribute_errors():
-            self.views, animated = set_run_view_conditions(self.views, self.task, request.conditions, notify)
+            numbers, conditions = self._choose_frames()
+            self.views, animated = set_run_view_conditions(self.views, self.task, conditions, notify)
+            if numbers:
+                self.views = _name_views_by_frame(self.views, numbers, self._camera_name())
             model = self.render_config.prepare_model(run.model)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
         suffix = "" if request.out is None else request.out.suffix.lower().removeprefix(".")
@@ -201,6 +207,26 @@ class _RunRenderSession:
             views = [replace(view, conditions={**view.conditions, **self.lights[0]}) for view in views]
         return views, fps
 
+    def _camera_name(self) -> str:
+        return _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])[0]
+
+    def _choose_frames(self) -> tuple[list[int], Mapping[str, str]]:
+        """Return the frame numbers of ``--frame`` and the conditions with their times."""
+        text, conditions = self.request.frame, self.request.conditions
+        if text is None:
+            return [], conditions
+        numbers, facts = parse_frame_numbers(text), self.run.header.get("data")
+        if not isinstance(facts, dict) or "frames" not in facts:
+            raise ConfigError(f"--frame {text}: this model has no numbered frames; expected one of .vdb files")
+        if "time" in conditions:
+            raise ConfigError("--frame and --time: give one of them")
+        data = JsonReader(facts, "the model's header: data")
+        first, last = (int(x) for x in data.array("frames", (2,), "2 numbers").tolist())
+        if min(numbers) < first or max(numbers) > last:
+            raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
+        times = ",".join(repr((number - first) / max(last - first, 1)) for number in numbers)
+        return numbers, {**conditions, "time": times}
+
     def choose_targets(self) -> list[Path]:
         """Return the files to write, one per view or one for an animation."""
         out, suffix = self.request.out, f".{self.format}"
@@ -212,8 +238,8 @@ class _RunRenderSession:
             )
         if single and out is not None:
             return [out]
+        name = self._camera_name()
         # "renders" holds the report's pictures
-        (name,) = _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])
         folder = self.run.directory / "frames" / name if out is None else out
         if self.animate:
             return [folder.with_suffix(suffix)]
@@ -324,6 +350,12 @@ def set_run_view_conditions(
                     f"give {condition_flag(spec.name)}"
                 )
     return animated, frames > 1
+
+
+def _name_views_by_frame(views: Sequence[View], numbers: Sequence[int], name: str) -> list[View]:
+    """Name views ``NAME.1001`` after the frames that they show, as compositing programs expect it of a sequence."""
+    shown = (numbers[i * len(numbers) // len(views)] for i in range(len(views)))
+    return [replace(view, name=f"{name}.{number:04d}") for view, number in zip(views, shown, strict=True)]
 
 
 def _view_file_names(names: Sequence[str]) -> list[str]:

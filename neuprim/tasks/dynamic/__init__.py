@@ -75,12 +75,14 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
     return density, TimeHarmonics(*settings, **model["colour"])
 
 
-def _light_facts(dataset: Dataset) -> Mapping[str, Any]:
+def _dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
+    recording = vdb_recording_of(dataset)
+    frames = {} if recording is None else {"frames": list(recording.capture.clock)}
     lights = [dataset.train.view(i).conditions.get("light") for i in range(len(dataset.train))]
     known = [light for light in lights if light is not None]
     if not known:
-        return {}
-    return {"lights": summarize_lights(torch.stack(known), dataset.center, "irradiance", dataset.exposure)}
+        return frames
+    return {**frames, "lights": summarize_lights(torch.stack(known), dataset.center, "irradiance", dataset.exposure)}
 
 
 def _has_lights(scene: Mapping[str, Any]) -> bool:
@@ -242,7 +244,7 @@ TASK = TaskSpec(
         "ScatteringHarmonics": ScatteringHarmonics,
     },
     environment=light_smoke_by_environment,
-    facts=_light_facts,
+    facts=_dataset_facts,
     uses=("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_weight"),
     mask=matter_mask,
     diagnose=compare_with_vdb_recording,

@@ -144,3 +144,29 @@ def test_a_preview_renders_four_cameras_and_learns_from_voxels(files: Path, tmp_
     assert compose([*words, "scene.cameras=6"]).scene["cameras"] == 6
     with pytest.raises(ConfigError, match=r"preset=preview: sets scene\.cameras, which scene=multiview does not have"):
         compose(["task=dynamic", "scene=multiview", f"scene.path='{tmp_path}'", "preset=preview"])
+
+
+def test_frames_are_chosen_by_number_and_name_their_files(finished: Path, tmp_path: Path) -> None:
+    words = ["render", str(finished), "--camera", "orbit", "--size", "16x16", "--frames", "3"]
+    out = tmp_path / "shot"
+    assert main([*words, "--frame", "2-4x2,3", "--format", "exr", "--layers", "beauty", "--out", str(out)]) == 0
+    assert sorted(file.name for file in out.iterdir()) == [f"orbit.{number:04d}.exr" for number in (2, 3, 4)]
+    assert main([*words, "--frame", "1-4", "--out", str(tmp_path / "film.webp")]) == 0
+    with Image.open(tmp_path / "film.webp") as film:
+        assert getattr(film, "n_frames", 1) == 4
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--frame", "1-5"], "--frame 1-5: the sequence has frames 1 to 4"),
+        (["--frame", "4-1"], "--frame 4-1: expected numbers and ranges such as 1001-1048x2,1060"),
+        (["--frame", "1-4x0"], "expected numbers and ranges"),
+        (["--frame", "a"], "expected numbers and ranges"),
+        (["--frame", "0-999999999"], "expected numbers and ranges"),
+        (["--frame", "1", "--time", "0"], "--frame and --time: give one of them"),
+    ],
+)
+def test_impossible_frames(finished: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["render", str(finished), "--camera", "orbit", *words]) == 2
+    assert message in capsys.readouterr().err

@@ -167,7 +167,9 @@ def _parse_with_hydra(overrides: Sequence[str]) -> list[Any]:
     parser = OverridesParser.create()
     found = []
     for text in overrides:
-        key, equals, _ = text.partition("=")
+        key, equals, value = text.partition("=")
+        if "#" in value and not re.search(r"[,='\"\[\]{}()]", value):  # fire.####.vdb means nothing in the grammar
+            text = f"{key}='{value}'"
         if not equals or not re.fullmatch(r"\+{0,2}[\w@/-]+(\.[\w@/-]+)*", key.strip()) or "\n" in text:
             if text.startswith("~"):
                 raise ConfigError(f"{text}: settings cannot be deleted; KEY=null unsets one")

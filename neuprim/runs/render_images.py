@@ -133,6 +133,8 @@ class _RunRenderSession:
         self.views, self.fps = self._load_views()
         with run.plugins.attribute_errors():
             numbers, conditions = self._choose_frames()
+            if 1 < len(numbers) < len(self.views):  # one image per frame
+                self.views = [self.views[i * len(self.views) // len(numbers)] for i in range(len(numbers))]
             self.views, animated = set_run_view_conditions(self.views, self.task, conditions, notify)
             if numbers:
                 self.views = _name_views_by_frame(self.views, numbers, self._camera_name())

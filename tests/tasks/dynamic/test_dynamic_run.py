@@ -147,7 +147,7 @@ def test_a_preview_renders_four_cameras_and_learns_from_voxels(files: Path, tmp_
 
 
 def test_frames_are_chosen_by_number_and_name_their_files(finished: Path, tmp_path: Path) -> None:
-    words = ["render", str(finished), "--camera", "orbit", "--size", "16x16", "--frames", "3"]
+    words = ["render", str(finished), "--camera", "orbit", "--size", "16x16"]
     out = tmp_path / "shot"
     assert main([*words, "--frame", "2-4x2,3", "--format", "exr", "--layers", "beauty", "--out", str(out)]) == 0
     assert sorted(file.name for file in out.iterdir()) == [f"orbit.{number:04d}.exr" for number in (2, 3, 4)]

@@ -348,40 +348,47 @@ class VdbSequence:
         return len(self.frames)
 
 
-def list_vdb_files(folder: Path, prefix: str | None = None) -> VdbSequence:
-    """Return the .vdb files of a folder, ordered by the last number in each name.
+_FRAME_PATTERN = re.compile(r"%[0-9]*d|#+|@+|\*")
+
+
+def list_vdb_files(path: Path) -> VdbSequence:
+    """Return the .vdb files of a sequence, ordered by the last number in each name.
 
     Args:
-        prefix: name before the number, for a folder with several sequences.
+        path: a folder with one sequence, one of its files, or its name with ``%04d``, ``####``, ``@`` or ``*`` instead
+            of the number.
 
     Raises:
-        DataError: no file, a name without a number, several prefixes, or one number twice.
+        DataError: no file, a name without a number, several sequences, or one number twice.
     """
-    folder = Path(folder)
-    expected = "expected a folder with .vdb files"
+    folder, chosen = Path(path), None
+    expected = "expected a folder with .vdb files, one of its files, or a name such as fire.####.vdb"
     try:
         if not folder.is_dir():
-            raise DataError(f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; {expected}")
+            chosen = _split_frame_number(_FRAME_PATTERN.sub("0", folder.name, count=1))
+            if folder.suffix.lower() != ".vdb" or chosen is None or not folder.parent.is_dir():
+                raise DataError(f"{folder}: {'is a file' if folder.exists() else 'no such folder'}; {expected}")
+            folder = folder.parent
         paths = sorted(p for p in folder.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
     except OSError as error:  # no permission, a name that is too long
         raise DataError(f"{folder}: cannot be read ({error.strerror or error}); {expected}") from error
     found: dict[str, list[VdbFrame]] = {}
     odd: list[str] = []
-    for path in paths:
-        match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", path.stem, re.DOTALL)
-        if match is None or len(match[2]) > 18:
-            odd.append(path.name)
-        else:
-            found.setdefault(match[1] + "*" * bool(match[3]) + match[3], []).append(VdbFrame(int(match[2]), path))
-    if prefix is not None:
-        found, odd = {k: v for k, v in found.items() if k == prefix}, []
+    for file in paths:
+        split = _split_frame_number(file.name)
+        if split is None:
+            odd.append(file.name)
+        elif chosen is None or split[0] == chosen[0]:
+            found.setdefault(split[0], []).append(VdbFrame(split[1], file))
+    if chosen is not None:
+        odd = []
     if not found and not odd:
-        raise DataError(f"{folder}: no .vdb file{'' if prefix is None else f' named {prefix}NUMBER.vdb'}")
+        raise DataError(f"{path}: no .vdb file")
     if odd:
         raise DataError(f"{folder / odd[0]}: no frame number in the name; expected names like fire_12.vdb")
     if len(found) > 1:
         names = ", ".join(repr(name) for name in sorted(found))
-        raise DataError(f"{folder}: files of several sequences: {names}; expected one prefix per folder")
+        raise DataError(f"{folder}: files of several sequences: {names}; name one of them, such as one of its files")
     frames = sorted(next(iter(found.values())), key=lambda frame: frame.number)
     gaps: list[tuple[int, int]] = []
     for before, after in itertools.pairwise(frames):
@@ -390,3 +397,11 @@ def list_vdb_files(folder: Path, prefix: str | None = None) -> VdbSequence:
         if after.number > before.number + 1:
             gaps.append((before.number + 1, after.number - 1))
     return VdbSequence(folder, tuple(frames), tuple(gaps))
+
+
+def _split_frame_number(name: str) -> tuple[str, int] | None:
+    """Return the sequence of a .vdb file, its name with ``*`` after the prefix, and its number; None without number."""
+    match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", Path(name).stem, re.DOTALL)
+    if match is None or len(match[2]) > 18:
+        return None
+    return match[1] + "*" * bool(match[3]) + match[3], int(match[2])

@@ -100,7 +100,7 @@ class VdbSceneSettings:
         memory: MiB of decoded images and voxels in memory; others are read again when needed.
     """
 
-    vdb: Annotated[Path, nonempty_text("a folder of .vdb files")] | None = None
+    vdb: Annotated[Path, nonempty_text("a folder of .vdb files, or one of them")] | None = None
     simulation: str | None = None
     resolution: Resolution = 64
     timesteps: Annotated[int, Range(2, MAX_TIMESTEPS)] | None = None
@@ -233,7 +233,7 @@ def _prepare_vdb_scene(
     options = validate_settings(VdbSceneSettings, settings, "scene")
     options.resolve_optics()  # report typing errors before anything is simulated
     if options.vdb is not None:
-        folder, name = options.vdb, options.vdb.name
+        folder, name = options.vdb, (options.vdb if options.vdb.is_dir() else options.vdb.parent).name
     else:
         assert options.simulation is not None, "settings were checked"
         run = (options.simulation, options.timesteps, options.resolution, context.seed)

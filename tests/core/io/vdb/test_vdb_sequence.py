@@ -33,12 +33,14 @@ def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
     refused(lambda: list_vdb_files(tmp_path), "no .vdb file")
     frame(tmp_path / "a_1.vdb", 1)
     frame(tmp_path / "b_1.vdb", 1)
-    refused(lambda: list_vdb_files(tmp_path), "'a_', 'b_'", "prefix")
-    refused(lambda: list_vdb_files(tmp_path / "a_1.vdb"), "a_1.vdb", "is a file")
-    assert list_vdb_files(tmp_path, "b_").frames[0].path.name == "b_1.vdb"
-    refused(lambda: list_vdb_files(tmp_path, "c_"), "c_NUMBER.vdb")
+    refused(lambda: list_vdb_files(tmp_path), "'a_', 'b_'", "name one of them")
+    for name in ("b_1.vdb", "b_7.vdb", "b_%04d.vdb", "b_####.vdb", "b_@.vdb", "b_*.vdb"):
+        assert [frame.path.name for frame in list_vdb_files(tmp_path / name).frames] == ["b_1.vdb"]
+    refused(lambda: list_vdb_files(tmp_path / "c_#.vdb"), "c_#.vdb: no .vdb file")
+    (tmp_path / "notes.txt").touch()
+    refused(lambda: list_vdb_files(tmp_path / "notes.txt"), "notes.txt", "is a file")
     frame(tmp_path / "b_01.vdb", 1)
-    refused(lambda: list_vdb_files(tmp_path, "b_"), "frame 1", "b_01.vdb")
+    refused(lambda: list_vdb_files(tmp_path / "b_#.vdb"), "frame 1", "b_01.vdb")
     frame(tmp_path / "smoke.vdb", 1)
     refused(lambda: list_vdb_files(tmp_path), "smoke.vdb", "no frame number")
 

@@ -6,7 +6,7 @@ import argparse
 import json
 import math
 import sys
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -244,22 +244,30 @@ VIEW_COMMAND = Command(
 # ---------------------------------------------------------------- vdb info
 
 
+_NO_SEQUENCE = "not one sequence"
+
+
 def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("info",), metavar="info", help="list the grids")
     parser.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
+    parser.add_argument("--frames", action="store_true", help="list every frame of a folder")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def _vdb_info_command(arguments: argparse.Namespace) -> int:
-    """Print a report on a file, or on every file of a folder."""
+    """Print a report on a file, or one table of the grids in a folder."""
     files, notes = _find_vdb_command_files(arguments.path)
     if arguments.json:
         record = {"files": [_describe_vdb_command_file(file) for file in files], "notes": notes}
         print(json.dumps(record, indent=1, allow_nan=False))
         return 0
     console = plain_console()
-    for file in files:
-        _print_vdb_file(console, _describe_vdb_command_file(file))
+    one_sequence = len(files) > 1 and not any(note.startswith(_NO_SEQUENCE) for note in notes)
+    if one_sequence and not arguments.frames:
+        _print_vdb_sequence(console, [_describe_vdb_command_file(file) for file in files])
+    else:
+        for file in files:
+            _print_vdb_file(console, _describe_vdb_command_file(file))
     for note in notes:
         console.print(note)
     return 0
@@ -277,7 +285,7 @@ def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
         files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
         if not files:
             raise
-        return files, [f"not one sequence: {error}"]
+        return files, [f"{_NO_SEQUENCE}: {error}"]
     missing = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in frames.gaps)
     numbers = f"{frames.frames[0].number} to {frames.frames[-1].number}"
     note = f"{len(frames)} frames, {numbers}; missing: {missing or 'none'}"
@@ -360,6 +368,42 @@ def _print_vdb_file(console: Console, file: dict[str, Any]) -> None:
         if grid.get("non_finite"):
             texts.append(f"{grid['non_finite']} active values are NaN or infinite")
         console.print(_printable(f"  {grid['name']}: {'; '.join(texts)}"))
+
+
+def _print_vdb_sequence(console: Console, files: Sequence[dict[str, Any]]) -> None:
+    """Print a row per grid of a sequence: what all frames together hold."""
+    from rich import box
+    from rich.table import Table
+    from rich.text import Text
+
+    table = Table(box=box.SIMPLE_HEAD, padding=(0, 1, 0, 0))
+    for title in ("grid", "type", "frames", "voxel size", "voxel bounds", "active voxels", "values"):
+        table.add_column(title)
+    grids: dict[str, list[dict[str, Any]]] = {}
+    for file in files:
+        for grid in file["grids"]:
+            grids.setdefault(grid["name"], []).append(grid)
+    notes = []
+    for name, found in grids.items():
+        bounds = [grid["bounds"] for grid in found if grid.get("bounds")]
+        edges = [(min(b[0][a] for b in bounds), max(b[1][a] for b in bounds)) for a in range(3)] if bounds else []
+        active, spans = [grid.get("active_voxels", 0) for grid in found], [g["range"] for g in found if g.get("range")]
+        cells = (
+            " or ".join(sorted({f"{grid['type']}{' as half' * grid['half']}, {grid['class']}" for grid in found})),
+            f"{len(found)}",
+            " or ".join(sorted({" ".join(f"{v:.4g}" for v in grid["voxel_size"] or ()) for grid in found})),
+            " ".join(f"{low}:{high}" for low, high in edges) or "empty",
+            f"{min(active):,} to {max(active):,}",
+            f"{min(span[0] for span in spans):.4g} to {max(span[1] for span in spans):.4g}" if spans else "none",
+        )
+        table.add_row(*(Text(_printable(cell)) for cell in (name, *cells)))
+        notes += sorted({f"{name}: {grid['reason']}" for grid in found if grid["reason"]})
+        if broken := sum(grid.get("non_finite", 0) for grid in found):
+            notes.append(f"{name}: {broken:,} active values are NaN or infinite")
+    console.print(table)
+    for note in notes:
+        console.print(_printable(note))
+    console.print(f"{sum(Path(file['path']).stat().st_size for file in files) / 1e6:.1f} MB; --frames lists each file")
 
 
 def _printable(text: str) -> str:

@@ -64,6 +64,23 @@ def test_info_as_json(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert last["bounds"] is None and last["active_voxels"] == 0
 
 
+def test_info_of_a_sequence_is_one_table(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    frame(tmp_path / "a_2.vdb", 4, 0.5)
+    frame(tmp_path / "a_3.vdb", 0)
+    frame(tmp_path / "a_4.vdb", 2, value=float("inf"))
+    assert main(["vdb", "info", str(tmp_path)]) == 0
+    out = capsys.readouterr().out
+    assert len(out.splitlines()) < 10 and "3 frames, 2 to 4; missing: none" in out
+    assert "0 to 64" in out and "0:4 0:4 0:4" in out and "0.5 0.5 0.5 or 1 1 1" in out
+    assert "8 active values are NaN or infinite" in out
+    assert main(["vdb", "info", str(tmp_path), "--frames"]) == 0
+    out = capsys.readouterr().out
+    assert all(f"a_{number}.vdb" in out for number in (2, 3, 4))
+
+
 def test_info_shows_what_is_not_read_and_why(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     one_grid(tmp_path / "b.vdb", b"noise", b"", name="points\x1b[31m", kind="Tree_ptdataidx32_5_4_3_Mask")
     leaf = one_leaf(np.ones(512, bool), b"\0" + bytes(2048), bytes(4))

@@ -25,13 +25,13 @@ _REQUIRED = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2", "colors")
 
 @dataclass(frozen=True)
 class Rasterized:
-    """Images of one model from C cameras.
+    """Result of :func:`rasterize`: images of one model from C cameras.
 
     Attributes:
-        rgb: (C, H, W, channels) composited over the backgrounds.
+        rgb: (C, H, W, channels) colours, composited over the backgrounds.
         alpha: (C, H, W) accumulated opacity 1 - T.
-        depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where nothing is hit; None unless
-            the settings ask for it.
+        depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where a ray hits no primitive;
+            None unless ``rasterize`` got ``depth=True``.
         stats: statistics of each camera's image, see :class:`~neuprim.core.render.output.RenderStats`.
     """
 
@@ -43,10 +43,10 @@ class Rasterized:
     def request_contributions(self, error: Tensor) -> tuple[Contributions, ...]:
         """Return, for each camera, how much every primitive contributes to the image and to an error.
 
-        The backward pass fills the result; call this before ``backward()``.
+        Call this method before ``backward()``, which fills the result.
 
         Args:
-            error: (C, H, W) any measure of error at each pixel; no gradient reaches it.
+            error: (C, H, W) error of each pixel, in any measure; receives no gradient.
         """
         _check_tensor("request_contributions: error", error)
         if error.shape != self.alpha.shape:
@@ -68,7 +68,7 @@ def rasterize(
 ) -> Rasterized:
     """Render N primitives from C pinhole cameras; differentiable.
 
-    Inside its ellipsoid, of semi-axes ``s = exp(log_scales)``, a primitive has the density (1 / scene unit)
+    A primitive is an ellipsoid with semi-axes ``s = exp(log_scales)``. Its density inside (1 / scene unit) is
 
         sigma(x) = g (1 - |y|^2)^p f((x - mu) / m) / m,   m = max(s),   y = diag(1 / s) R^T (x - mu),
         g = exp(log_gain),   f(u) = sum_k w2_k cos(omega0 (W1_k . u + b1_k)) + b2
@@ -83,26 +83,26 @@ def rasterize(
     ``Ks`` with ``backend="reference"``.
 
     Args:
-        primitives: tensors by name, of one dtype (float32 or float64, which images have too) and on one device:
+        primitives: tensors by name, on one device and of one dtype (float32 or float64), which is also the images':
             ``means`` (N, 3) centres, ``log_scales`` (N, 3) natural logarithms of the semi-axes, scene units;
             ``quats`` (N, 4) wxyz, any non-zero norm; ``W1`` (N, K, 3) frequencies, ``b1`` (N, K) phases, both before
             the factor omega0, ``w2`` (N, K) amplitudes, ``b2`` (N, 1) or (N,) offsets, K = 0 to 256; ``colors``
-            (N, channels), or (C, N, channels) where they depend on the camera; and optionally ``log_gain`` (N, 1) or
-            (N,), which beyond +-20 counts as that and has no gradient.
+            (N, channels), or (C, N, channels) for colours that depend on the camera; and optionally ``log_gain``
+            (N, 1) or (N,), clamped to +-20, without gradient beyond.
         viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward). float64 is best.
         Ks: (C, 3, 3) intrinsics in pixels, ``[[fx, 0, cx], [0, fy, cy], [0, 0, 1]]``; pixel centres lie at +0.5.
         size: (width, height) of every image in pixels.
-        omega0: factor on the whole phase.
-        edge: p; 0 is the hard edge of the paper's primitive, 1 and 2 are soft (:mod:`neuprim.core.model.edge`).
+        omega0: factor on the phase W1_k . u + b1_k of every cosine.
+        edge: exponent p; 0 is the paper's hard edge, 1 and 2 are soft (:mod:`neuprim.core.model.edge`).
         backgrounds: (channels,) or (C, channels); None is black.
         **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``, ...
 
     Raises:
         DataError: a tensor of the wrong type, dtype, device or shape; a camera that is not finite, rigid and free of
             skew. The message names the argument, what was found and what was expected.
-        ConfigError: an unknown setting, or an impossible value.
+        ConfigError: a setting is unknown, or its value is impossible.
         NonFiniteError: a primitive tensor or background holds NaN or infinity, or a quaternion is zero.
-        BackendUnavailable: ``Ks`` requires a gradient, which a backend that may be chosen does not compute.
+        BackendUnavailable: ``Ks`` requires a gradient, but ``backend`` allows a backend that does not compute it.
     """
     render_settings = _render_settings(settings)
     geometry, density, palettes = _check_primitives(primitives, len(viewmats), omega0, edge)
@@ -156,7 +156,7 @@ def _check_tensor(name: str, value: Any) -> None:
 def _check_primitives(
     t: Mapping[str, Tensor], views: int, omega0: float, edge: int
 ) -> tuple[Geometry, Cosine, list[Tensor]]:
-    """Return geometry, density and one colour tensor per camera. Rendering itself refuses NaN and infinity."""
+    """Return geometry, density and one colour tensor per camera. The renderer, not this function, refuses NaN."""
     for name in t:
         if name not in (*_REQUIRED, "log_gain"):
             raise DataError(f"rasterize: unknown tensor {name!r}{nearest(name, [*_REQUIRED, 'log_gain'])}")

@@ -1,7 +1,7 @@
-"""The ``neuprim`` command: parse, call, print.
+"""The ``neuprim`` command: parse arguments, call the library, print results.
 
-Exit status: 0 done, 1 no backend works (``doctor``), 2 the input's fault (one line on standard error), 130 interrupted.
-A bug in neuprim keeps its traceback. ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of
+Exit status: 0 success, 1 no backend works (``doctor``), 2 wrong input (one line on standard error), 130 interrupted.
+A bug in neuprim shows its traceback. ``NEUPRIM_TRACEBACK=1`` shows the traceback of every error, for authors of
 plugins.
 """
 
@@ -35,7 +35,7 @@ COMMANDS = {name: _FOUND[name] for name in _ORDER}
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run one command and return its exit status."""
+    """Run the command that ``argv`` names and return its exit status."""
     words = list(sys.argv[1:] if argv is None else argv)
     try:
         with warnings_as_lines():

@@ -1,6 +1,6 @@
-"""Shared parts of the commands of ``neuprim``: description, parser, values of flags, and plain text output.
+"""Shared code of the ``neuprim`` commands: the class :class:`Command`, parsers of flag values, and plain text output.
 
-The modules ``*_commands.py`` define the commands, each as a :class:`Command`; :data:`neuprim.cli.COMMANDS` lists them.
+The modules ``*_commands.py`` define the commands; :data:`neuprim.cli.COMMANDS` lists them.
 Modules that load torch are imported inside the function that runs the command, so that help stays fast.
 """
 
@@ -35,7 +35,7 @@ how the run is drawn; `neuprim tradeoff RUN_DIR` measures cost and gain of each
 
 
 class Parser(argparse.ArgumentParser):
-    """An argument parser that reports a wrong command line as one line."""
+    """An argument parser that reports a wrong command line as one line of text."""
 
     def __init__(self, **options: Any) -> None:
         super().__init__(allow_abbrev=False, formatter_class=argparse.RawDescriptionHelpFormatter, **options)
@@ -46,7 +46,7 @@ class Parser(argparse.ArgumentParser):
 
 @dataclass(frozen=True)
 class Command:
-    """One command of the command line.
+    """One command of the command line, e.g. ``neuprim render``.
 
     Attributes:
         name: what users type after ``neuprim``.
@@ -54,11 +54,11 @@ class Command:
         call: runs the command with the parsed arguments and returns the exit status.
         add_arguments: adds the command's own arguments to its parser.
         epilog: text below the arguments in ``neuprim NAME --help``, or a function that makes it from the typed words.
-        settings: what ``KEY=VALUE`` sets, for the help; empty where a command has no settings. They may be anywhere on
-            the line, and become ``arguments.overrides``.
-        take_rest: gets the arguments, the words that argparse did not know and the parser; stores those that the
-            command accepts and returns the others, which are refused.
-        opens_run: whether the first argument is an existing run directory, ``RUN_DIR``; adds it and ``--trust``.
+        settings: for the help: what ``KEY=VALUE`` sets; empty if a command has no settings. Settings may be anywhere on
+            the command line, and become ``arguments.overrides``.
+        take_rest: function (arguments, words that argparse does not know, parser) that stores words which the command
+            accepts, and returns the others, which are refused.
+        opens_run: whether the command takes an existing run directory; if so, ``RUN_DIR`` and ``--trust`` are added.
     """
 
     name: str
@@ -71,10 +71,10 @@ class Command:
     opens_run: bool = False
 
     def parse(self, words: Sequence[str]) -> argparse.Namespace:
-        """Return the arguments of the command, from the words after its name.
+        """Parse the words after the command's name.
 
         Raises:
-            ConfigError: an argument is missing, unknown or has an impossible value, or there is no such run directory.
+            ConfigError: an argument is missing, unknown or has an invalid value, or the run directory does not exist.
         """
         parser = self.build_parser(words)
         overrides, others = split_settings(words, parser) if self.settings else ([], list(words))
@@ -88,7 +88,7 @@ class Command:
         return arguments
 
     def build_parser(self, words: Sequence[str] = ()) -> Parser:
-        """Return the parser of the words after the command's name."""
+        """Return a parser for the words after the command's name; the help text may depend on ``words``."""
         epilog = self.epilog if isinstance(self.epilog, str) else self.epilog(words)
         parser = Parser(prog=f"neuprim {self.name}", description=self.summary, epilog=epilog)
         if self.opens_run:
@@ -102,7 +102,9 @@ class Command:
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
-    """Add ``--trust``, which lets a stored configuration reach outside its run (:mod:`neuprim.config.stored_run`)."""
+    """Add ``--trust``, with which a stored configuration may name addresses and folders outside its run
+    (:mod:`neuprim.config.stored_run`).
+    """
     text = "allow what a stored config.yaml names: network addresses, and folders outside of the run to write to"
     parser.add_argument(FLAG, action="store_true", help=text)
 
@@ -119,10 +121,10 @@ def check_run_dir_argument(path: Path) -> None:
 
 
 def split_settings(words: Sequence[str], parser: argparse.ArgumentParser) -> tuple[list[str], list[str]]:
-    """Split words into settings, ``KEY=VALUE``, and others: flags with their values, and a run directory that exists.
+    """Split words into settings ``KEY=VALUE`` and the rest: flags with their values, and an existing run directory.
 
     Raises:
-        ConfigError: ``output_dir=DIR``, which is no setting of a command but its flag ``--out DIR``.
+        ConfigError: a word is ``output_dir=DIR``; commands take the flag ``--out DIR`` instead.
     """
     settings: list[str] = []
     others: list[str] = []
@@ -145,7 +147,7 @@ def take_condition_arguments(
 ) -> list[str]:
     """Set ``arguments.conditions``, name -> text, from the flags that the run's task defines.
 
-    ``arguments.run`` is the run, opened if there are flags, else its directory.
+    Other words are refused. ``arguments.run`` becomes the loaded run, or its directory if ``rest`` is empty.
     """
     arguments.conditions, arguments.run = {}, arguments.run_dir
     if not rest:
@@ -174,10 +176,10 @@ def refuse_argument(word: str, parser: argparse.ArgumentParser, task: TaskSpec |
 
 
 def plain_console(stderr: bool = False, **options: Any) -> Console:
-    """Return a console that prints text as it is: no markup, emoji or guessed colours, lines as long as their text.
+    """Return a rich console that prints text unchanged: no markup, emoji, automatic colours or line wrapping.
 
-    rich reads ``[name]`` as markup and ``:name:`` as an emoji. Names, paths and commands come from outside: ``pip
-    install 'neuprim[video]'`` would lose its extra.
+    rich reads ``[name]`` as markup and ``:name:`` as an emoji. Without this, ``pip install 'neuprim[video]'`` would be
+    printed without its extra.
     """
     from rich.console import Console
 
@@ -185,7 +187,7 @@ def plain_console(stderr: bool = False, **options: Any) -> Console:
 
 
 def print_columns(rows: Sequence[Sequence[str]]) -> None:
-    """Print a table on standard output: the first column to the left, numbers to the right."""
+    """Print rows as a table on standard output: the first column left-aligned, numbers right-aligned."""
     widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
     for first, *others in rows:
         cells = [f"{cell:>{width}}" for cell, width in zip(others, widths[1:], strict=True)]
@@ -193,7 +195,7 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
 
 
 def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
-    """Return text for the user: the state of an interrupted run, and the command that continues it."""
+    """Return text for the user that says what an interrupted run has saved, and the command that continues it."""
     begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
     state = "has the run up to here" if begun else "has no checkpoint yet"
     return f"; {directory} {state}; to go on:\n  {typed.resume_command(directory)}"
@@ -203,7 +205,7 @@ def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
 
 
 def parse_size_argument(text: str) -> tuple[int, int]:
-    """Read 640x480 as (640, 480) pixels."""
+    """Parse 640x480 as (640, 480) pixels."""
     match = re.fullmatch(r"([1-9]\d{0,5})[xX]([1-9]\d{0,5})", text)
     if not match:
         raise argparse.ArgumentTypeError(f"{text!r}: expected WIDTHxHEIGHT, for example 640x480")
@@ -211,27 +213,27 @@ def parse_size_argument(text: str) -> tuple[int, int]:
 
 
 def parse_count(text: str) -> int:
-    """Read a positive whole number."""
+    """Parse a positive whole number."""
     return int(parse_number(text, 1, 9_999_999, "a positive count", whole=True))
 
 
 def parse_whole(text: str) -> int:
-    """Read a whole number, from 0."""
+    """Parse a whole number, 0 or more."""
     return int(parse_number(text, 0, 999_999_999, "a whole number, from 0", whole=True))
 
 
 def parse_rate(text: str) -> float:
-    """Read frames per second."""
+    """Parse a number of frames per second."""
     return parse_number(text, 0.1, 240.0, "0.1 to 240 frames per second")
 
 
 def parse_decibels(text: str) -> float:
-    """Read 0.1 or 0.1dB."""
+    """Parse a number of decibels, written 0.1 or 0.1dB."""
     return parse_number(re.sub(r" ?dB$", "", text, flags=re.IGNORECASE), 1e-9, 100.0, "decibels above 0, as 0.1dB")
 
 
 def parse_seconds(text: str) -> float:
-    """Read 30, 90s, 5m or 1h as seconds, 0 or more."""
+    """Parse a duration, written 30, 90s, 5m or 1h; return seconds, 0 or more."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)(s|m|h|)", text)
     if match is None:
         raise argparse.ArgumentTypeError(f"{text!r}: expected a time, for example 30s or 5m")
@@ -239,12 +241,12 @@ def parse_seconds(text: str) -> float:
 
 
 def parse_numbers(text: str) -> list[float]:
-    """Read finite numbers separated by commas."""
+    """Parse finite numbers separated by commas."""
     return [parse_number(part, -math.inf, math.inf, "numbers separated by commas") for part in text.split(",")]
 
 
 def parse_number(text: str, low: float, high: float, expected: str, whole: bool = False) -> float:
-    """Read a finite number from ``low`` to ``high``; a whole one has digits alone."""
+    """Parse a finite number from ``low`` to ``high``; with ``whole`` only digits. Errors say what was ``expected``."""
     try:
         value = float(text)
     except ValueError:

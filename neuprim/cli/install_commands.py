@@ -1,4 +1,4 @@
-"""``neuprim tasks``, ``new-task`` and ``doctor``: what is installed, and whether it works."""
+"""``neuprim tasks``, ``new-task`` and ``doctor``: list what is installed, start a plugin, check the installation."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _OTHER_PLUGINS: tuple[tuple[str, PluginGroup[Any]], ...] = (
 
 
 def list_printed_plugins() -> list[str]:
-    """Return the lines of ``neuprim tasks``: names as users type them; a broken plugin is a line with its error."""
+    """Return the lines of ``neuprim tasks``: plugin names as users type them; for a broken plugin its error."""
     lines: list[str] = []
     scenes = SCENES.survey()
     for task in TASKS.survey():
@@ -137,7 +137,7 @@ Rows = list[tuple[str, str]]
 
 
 def print_doctor_report() -> int:
-    """Print what is installed and what works; return 0, or 1 if no backend works."""
+    """Print installed packages and working backends; return exit status 0, or 1 if no backend works."""
     from neuprim.core.compute.kernels import cache_directory as kernel_cache
     from neuprim.core.io.files import cache_directory
     from neuprim.core.render import backends
@@ -195,7 +195,7 @@ def _list_doctor_packages() -> Rows:
 
 
 def _describe_package(name: str, needed: list[tuple[Requirement, str]]) -> str:
-    """Return the version of a package, and what to install where it is missing or too old."""
+    """Return the version of an installed package, or what to install if the package is missing or too old."""
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
@@ -226,7 +226,7 @@ def _list_doctor_devices() -> Rows:
 
 
 def _probe_doctor_backend(name: str) -> str | None:
-    """Return why a backend cannot render an image here; None if it can."""
+    """Return why a backend cannot render a test image on this machine; None if it can."""
     from neuprim.core.render import probe_backend
 
     try:

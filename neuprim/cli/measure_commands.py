@@ -1,4 +1,4 @@
-"""``neuprim eval``, ``bench`` and ``tradeoff``: measure runs."""
+"""``neuprim eval``, ``bench`` and ``tradeoff``: measure quality and speed of runs."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def _eval_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_metric(metrics: Mapping[str, Any], name: str) -> float | None:
-    """Return a metric of metrics.json, which stores infinity as null; None if it was not measured."""
+    """Return a metric of ``metrics.json``, where null means infinity; None if the metric was not measured."""
     value: float | None = math.inf if metrics.get(f"{name}_infinite") else metrics.get(name)
     return value
 
@@ -111,7 +111,7 @@ def _add_bench_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _bench_command(args: argparse.Namespace) -> int:
-    """Print the paper's tables, or run and print the protocol of their rows."""
+    """Print the paper's tables, or run their rows and print the comparison with the paper."""
     from neuprim.cli.progress import run_command_here
     from neuprim.config.command_settings import take_budget_override
     from neuprim.config.overrides import CommandLine
@@ -137,7 +137,7 @@ def _bench_command(args: argparse.Namespace) -> int:
 
 
 def parse_table_numbers(text: str) -> set[int]:
-    """Return the numbers of the tables that ``3-5,7`` names; raises ConfigError for others than 3 to 7."""
+    """Parse table numbers such as ``3-5,7``; raise ConfigError for tables other than 3 to 7."""
     found: set[int] = set()
     for part in text.split(","):
         match = re.fullmatch(r"([3-7])(?:-([3-7]))?", part.strip())
@@ -184,7 +184,7 @@ def _describe_bench_result(one: PlannedRun, metrics: Mapping[str, Any]) -> Itera
 
 
 def _describe_paper_averages(results: Sequence[tuple[PlannedRun, Mapping[str, Any]]]) -> Iterator[str]:
-    """Yield lines with the means of each row, over scenes and seeds that have both our and the paper's number."""
+    """Yield lines with each row's mean over the scenes and seeds for which both our and the paper's number exist."""
     from neuprim.runs.paper import compare_run_with_paper
 
     rows: dict[tuple[str, str], list[tuple[PlannedRun, Mapping[str, Any]]]] = {}
@@ -320,7 +320,7 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
 
 
 def _list_front_rows(record: TradeoffRecord, numbers: Sequence[int]) -> list[Sequence[str]]:
-    """Return table rows of the reference and a front, numbered as the printed commands."""
+    """Return table rows for the reference and the points of a Pareto front, numbered like the printed commands."""
     trained = bool(record.points[0].run_dir)
     names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "bytes", *(["ms/step"] if trained else [])]
     first = ("centre" if trained else "ref.", *_format_printed_point(record.points[0]))

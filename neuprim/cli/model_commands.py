@@ -1,4 +1,4 @@
-"""``neuprim export``, ``import``, ``compress`` and ``prune``: write a run's model in another form."""
+"""``neuprim export``, ``import``, ``compress`` and ``prune``: convert a run's model, or make it smaller."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def _export_command(arguments: argparse.Namespace) -> int:
 
 
 def _export_help(words: Sequence[str]) -> str:
-    """Return the text below the arguments: all formats, from package metadata, or the options of ``--format NAME``."""
+    """Return the help text below the arguments: all export formats, or the options of ``--format NAME`` if typed."""
     if not {"-h", "--help"} & set(words):
         return ""
     found = re.search(r"--format[= ]([^-\s]\S*)", " ".join(words))
@@ -91,7 +91,7 @@ def _format_option_default(value: Any) -> str:
 
 
 def print_export_report(report: ExportReport, as_json: bool) -> None:
-    """Print what an export wrote, for people or for programs."""
+    """Print which files an export wrote, as text or as JSON."""
     if as_json:
         errors = {name: value if math.isfinite(value) else None for name, value in report.errors.items()}
         files, notes = [str(path) for path in report.files], list(report.notes)
@@ -172,7 +172,7 @@ def _compress_command(args: argparse.Namespace) -> int:
 
 
 def _print_compression(made: Compression) -> None:
-    """Print file, bytes of every parameter, and what was lost."""
+    """Print the result of a compression: the file, the bytes of every parameter, and the loss of quality."""
     print(made.file)
     sizes = [(p.name, p.bits, p.before, p.after) for p in made.parameters]
     sizes.append(("all, and the header", "", made.before, made.after))

@@ -1,4 +1,4 @@
-"""Show the progress of commands: a bar on a terminal, otherwise a line now and then; and run a scene with it."""
+"""Show the progress of commands, as a bar on a terminal or as occasional lines; and train a run while showing it."""
 
 from __future__ import annotations
 
@@ -45,10 +45,10 @@ class _ProgressBar:
 
 
 class RunProgress(_ProgressBar):
-    """Progress display of one run: a context manager around it, which the run calls with its events.
+    """Progress display of one run: a context manager, and a listener that is called with the run's events.
 
     Args:
-        search: whether many short trainings follow each other; without a terminal only notes are shown then.
+        search: whether the run is a search with many short trainings. Without a terminal it only shows notes.
     """
 
     def __init__(self, title: str, console: Console | None = None, search: bool = False) -> None:
@@ -60,7 +60,7 @@ class RunProgress(_ProgressBar):
         self._held_out = ""
 
     def __call__(self, event: Event) -> None:
-        """Show one event."""
+        """Show one event of the run."""
         if isinstance(event, Note):
             self._print(event.text)
         elif self._quiet:
@@ -106,7 +106,7 @@ class RunProgress(_ProgressBar):
 
 
 def _format_time_left(seconds: float, fraction: float) -> str:
-    """Return ", about 40 s left" if the rest goes on as the done ``fraction``; empty before a hundredth is done."""
+    """Return ", about 40 s left", estimated from the done ``fraction`` and its time; empty below 1 % done."""
     if not 0.01 <= fraction < 1.0:
         return ""
     left = seconds * (1.0 - fraction) / fraction
@@ -114,18 +114,18 @@ def _format_time_left(seconds: float, fraction: float) -> str:
 
 
 class DrawProgress(_ProgressBar):
-    """Context manager that shows the progress while images are rendered; the bar disappears afterwards."""
+    """Context manager that shows a progress bar while images are rendered, and removes it afterwards."""
 
     def __init__(self, console: Console | None = None) -> None:
         super().__init__(console, (TextColumn("eta"), TimeRemainingColumn()), True)
         self._started = time.monotonic()
 
     def print_note(self, text: str) -> None:
-        """Print a line that stays."""
+        """Print a line that stays on the screen."""
         self.console.print(f"neuprim: {text}")
 
     def show(self, text: str, fraction: float) -> None:
-        """Show text and finished fraction, 0..1; without a terminal, print them every 30 seconds."""
+        """Show text and the done fraction, 0..1; without a terminal, print them every 30 seconds."""
         self.bar.update(self.task, description=text, completed=fraction)
         if not self.live and fraction < 1.0 and time.monotonic() > self._started + 30.0:
             self._started = time.monotonic()
@@ -133,7 +133,7 @@ class DrawProgress(_ProgressBar):
 
 
 def print_notes(event: Event) -> None:
-    """Print notes on standard output, for commands whose notes are their result."""
+    """Print an event if it is a note, for commands whose result is their notes."""
     if isinstance(event, Note):
         print(event.text)
 
@@ -141,11 +141,11 @@ def print_notes(event: Event) -> None:
 # ---------------------------------------------------------------- several jobs
 
 _LINE_INTERVAL = 0.25
-"""Share of a training between two printed lines, if there is no terminal."""
+"""Fraction of a training between two printed lines, if there is no terminal."""
 
 
 class RunLaunchProgress:
-    """Progress display of several runs, called with their statuses: a table on a terminal, else a line now and then."""
+    """Progress display of several runs, called with their statuses: a table on a terminal, else occasional lines."""
 
     def __init__(self, configs: Sequence[RunConfig]) -> None:
         self.console = plain_console(stderr=True)
@@ -164,7 +164,7 @@ class RunLaunchProgress:
         self._display.stop()
 
     def __call__(self, number: int, status: JobStatus) -> None:
-        """Show a run's status."""
+        """Show the status of run ``number``."""
         before, self._statuses[number] = self._statuses[number], status
         if not self.live:
             self._print_line(number, status)
@@ -186,7 +186,7 @@ class RunLaunchProgress:
         self.console.print(f"{self._directories[number].name}: {' '.join(filter(None, cells))}")
 
     def _print_change(self, number: int, before: JobStatus, status: JobStatus) -> None:
-        """Print started and finished runs on standard output."""
+        """Print on standard output that a run has started or ended."""
         directory, many = self._directories[number], len(self._directories)
         if many > 1 and before.state == "waiting" and status.state == "starting" and not status.attempt:
             print(f"[{number + 1}/{many}] {directory}", flush=True)
@@ -231,10 +231,10 @@ def run_command_here(
 ) -> Path:
     """Run one configuration in this process and return its directory.
 
-    The text of a KeyboardInterrupt has the run's directory and the command that continues it.
+    After Ctrl-C, the message of the KeyboardInterrupt has the run's directory and the command that continues the run.
 
     Args:
-        launcher: where the chunks of a scene are fitted, if it is fitted in chunks; None: in this process.
+        launcher: where to train the chunks, if the scene is trained in chunks; None: in this process.
     """
     from neuprim.runs.run import run
 
@@ -248,7 +248,7 @@ def run_command_here(
 
 
 def print_run_summary(run_dir: Path) -> None:
-    """Print what a finished run reached, where its report is, and a command to go on with."""
+    """Print the quality of a finished run, the path of its report, and a next command to try."""
     from neuprim.runs.run import summarize_run
 
     print(summarize_run(run_dir))

@@ -1,4 +1,4 @@
-"""``neuprim run`` and ``truth``: fit a scene, a sweep of scenes, by several processes, or until a target is reached."""
+"""``neuprim run`` and ``truth``: train a run, a sweep of runs, with several processes, or until a target is reached."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ examples:
 
 
 def _run_help(words: Sequence[str]) -> str:
-    """Return the text below the arguments, with the installed tasks."""
+    """Return the help text below the arguments, which lists the installed tasks."""
     if not {"-h", "--help"} & set(words):
         return ""
     from neuprim.plugins.registry import TASKS, list_scene_names
@@ -81,7 +81,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _refuse_bare_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Refuse words other than KEY=VALUE, with the settings that they probably mean; return ``rest`` if it has flags."""
+    """Refuse words other than KEY=VALUE and suggest settings that they may mean. Return ``rest`` if it has flags."""
     if not rest or any(word.startswith("-") for word in rest):
         return rest
     from neuprim.plugins.registry import TASKS, list_scene_names
@@ -152,7 +152,7 @@ def _run_command(args: argparse.Namespace) -> int:
 def _run_command_with_target(
     config: RunConfig, target: SearchTarget, budget: float, launcher: LauncherSettings, typed: CommandLine
 ) -> int:
-    """Search for a model that reaches a target; print what was achieved."""
+    """Search for a model that reaches a target, print the result, and return the exit status."""
     from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.search.target import run_target
 
@@ -169,7 +169,7 @@ def _run_command_with_target(
 
 
 def _list_printed_target_lines(record: TargetRecord) -> list[str]:
-    """Return lines for the user: predicted and achieved values, and why the search ended."""
+    """Return the printed result of a search: predicted and achieved values, and why the search ended."""
     from neuprim.search.size_forecast import format_target_forecast
     from neuprim.search.target_record import TARGET_FILE
 
@@ -204,7 +204,7 @@ def run_command_with_launcher(
 
     Args:
         overrides: overrides of the sweep.
-        typed: the whole command line, for the command that continues.
+        typed: the whole command line, from which the command that continues after Ctrl-C is made.
     """
     from neuprim.cli.progress import RunLaunchProgress, print_run_summary
     from neuprim.runs.ground_truth import render_ground_truth_of_runs
@@ -228,8 +228,8 @@ def run_command_with_launcher(
 def _report_launched_runs(
     configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
 ) -> int:
-    """Print failures, and raise KeyboardInterrupt with the command that continues; return the exit status: 2 for bad
-    input, 1 for a bug."""
+    """Print failed runs; return the exit status: 2 for bad input, 1 for a bug, else 0. After Ctrl-C, raise
+    KeyboardInterrupt with the command that continues."""
     status, left = 0, []
     for config, result in zip(configs, results, strict=True):
         if result is None or result.state == "interrupted":
@@ -306,13 +306,13 @@ TRUTH_COMMAND = Command(
 
 
 def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> int:
-    """Fit one scene as one of several ranks; returns the exit status.
+    """Train one run as one of several ranks; return the exit status.
 
-    An error is printed once, in one line, by the first rank that fails.
+    Only the first rank that fails prints its error, in one line.
 
     Args:
         words: the overrides.
-        more: whether the user asked for anything other than one run.
+        more: whether the user asked for more than one plain run, e.g. a sweep; this is refused.
     """
     from neuprim.core.compute.threads import limit_process_threads, machine_cores
     from neuprim.core.train.process_group import ProcessGroup
@@ -354,7 +354,7 @@ def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> in
 
 
 def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -> RunConfig:
-    """Compose the configuration; all ranks take the output directory of rank 0, which writes there."""
+    """Compose a rank's configuration. All ranks use the output directory that rank 0 chooses and writes to."""
     from neuprim.config import compose
     from neuprim.config.command_settings import take_launcher_overrides, take_target_overrides, take_viewer_overrides
 
@@ -377,10 +377,10 @@ def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -
 
 
 def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
-    """Use GPU i for the i-th rank of a machine.
+    """Make the i-th rank of a machine use the machine's GPU i.
 
     Raises:
-        BackendUnavailable: there are GPUs, but fewer than ranks.
+        BackendUnavailable: the machine has GPUs, but fewer than ranks.
     """
     import torch
 
@@ -398,7 +398,7 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
 
 
 def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: ProcessGroup) -> None:
-    """Train the run; rank 0 shows the progress."""
+    """Train the run as one rank; rank 0 shows the progress."""
     from neuprim.cli.progress import RunProgress, print_run_summary
     from neuprim.config.overrides import CommandLine
     from neuprim.runs.fit import ignore_run_event

@@ -1,4 +1,4 @@
-"""``neuprim render``, ``inspect``, ``view`` and ``vdb info``: look at runs and at volumes."""
+"""``neuprim render``, ``inspect``, ``view`` and ``vdb info``: render and show runs, and describe OpenVDB files."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def _add_view_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _view_command(args: argparse.Namespace) -> int:
-    """Show the run until Ctrl-C."""
+    """Show the run in the browser until Ctrl-C."""
     from neuprim.cli.progress import DrawProgress, warn_of_open_host
     from neuprim.config.command_settings import LOOPBACK, ViewerSettings
     from neuprim.viewer.view import view_run
@@ -274,7 +274,7 @@ def _vdb_info_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return files, frames in their order, and notes on the folder."""
+    """Return the OpenVDB files at ``path``, frames in their order, and notes on the folder."""
     if not path.is_dir():
         return [path], []
     from neuprim.core.io.vdb import list_vdb_files
@@ -293,7 +293,9 @@ def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
 
 
 def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
-    """Return JSON-ready values: lengths in world units, bounds in voxel indices (upper ones excluded)."""
+    """Return the contents of an OpenVDB file as JSON-ready values: lengths in world units, bounds in voxel indices
+    (upper ones excluded).
+    """
     from neuprim.core.io.vdb import read_grids, read_header
 
     header = read_header(path)
@@ -308,7 +310,9 @@ def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
 
 
 def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
-    """Return JSON-ready values of a grid; one that cannot be decoded has a ``reason`` and no values from voxels."""
+    """Return a description of one OpenVDB grid as JSON-ready values. A grid that cannot be decoded has a ``reason``,
+    and no values computed from voxels.
+    """
     entry: dict[str, Any] = {
         "name": header.name,
         "class": header.kind,
@@ -339,7 +343,7 @@ def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
 
 
 def _vdb_command_to_json(value: Any) -> Any:
-    """Convert a value to what JSON can hold: no bytes, tuples or NaN."""
+    """Convert a value to JSON types: replace bytes, tuples and NaN."""
     if isinstance(value, Mapping):
         return {name: _vdb_command_to_json(item) for name, item in value.items()}
     if isinstance(value, tuple | list):
@@ -407,7 +411,7 @@ def _print_vdb_sequence(console: Console, files: Sequence[dict[str, Any]]) -> No
 
 
 def _printable(text: str) -> str:
-    """Replace control characters in names of files; a terminal must not act on them."""
+    """Replace control characters in a file name, so that the terminal does not interpret them."""
     return "".join(c if c.isprintable() or c == "\n" else "�" for c in text)
 
 

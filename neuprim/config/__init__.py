@@ -1,4 +1,5 @@
-"""Configuration of runs: ``key=value`` overrides and YAML files of tasks become one validated :class:`RunConfig`."""
+"""Configuration of runs: combine ``key=value`` overrides and YAML files of tasks into one validated
+:class:`RunConfig`."""
 
 from neuprim.config.compose import compose, compose_all, preset_settings
 from neuprim.config.overrides import expand_sweep_overrides

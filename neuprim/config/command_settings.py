@@ -1,4 +1,4 @@
-"""Settings that are not part of a run's configuration: launcher, live viewer, and target with budget."""
+"""Settings of commands that are not stored in a run's configuration: launcher, live viewer, and search target."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class LauncherSettings:
         validate_fields(self, "launcher")
 
     def given_settings(self) -> dict[str, Any]:
-        """Return the settings that differ from the defaults, and the name."""
+        """Return the name of the launcher, and the settings that differ from the defaults."""
         values, default = dataclasses.asdict(self), dataclasses.asdict(LauncherSettings())
         return {name: value for name, value in values.items() if name == "name" or value != default[name]}
 
@@ -89,12 +89,12 @@ class SearchTarget:
     fps: Annotated[float, Range(above=0, says="a positive number of frames per second")] | None = None
 
     def given_settings(self) -> dict[str, float]:
-        """Return the targets and limits that are set, by name."""
+        """Return setting -> value of the targets and limits that are set."""
         return {name: value for name, value in dataclasses.asdict(self).items() if value is not None}
 
     @property
     def quality(self) -> dict[str, float]:
-        """The targets of quality that are set, by name."""
+        """Quality measure -> target value, for "psnr" and "ssim" if they are set."""
         return {name: value for name, value in self.given_settings().items() if name in ("psnr", "ssim")}
 
     def __str__(self) -> str:
@@ -102,7 +102,7 @@ class SearchTarget:
 
 
 def take_launcher_overrides(overrides: Sequence[str]) -> tuple[LauncherSettings, list[str]]:
-    """Return the launcher that overrides ask for, with settings that it uses, and the other overrides."""
+    """Split overrides into launcher settings and other overrides. Refuse settings that the launcher does not use."""
     name, settings, others = take_settings(overrides, "launcher", LauncherSettings)
     if name is not None:
         if name not in LAUNCHERS:
@@ -120,7 +120,9 @@ def take_launcher_overrides(overrides: Sequence[str]) -> tuple[LauncherSettings,
 
 
 def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
-    """Return the viewer that is asked for, None for none, and the other overrides; a host or port asks for one, too."""
+    """Split overrides into viewer settings and the other overrides. The settings are None without a viewer; a host or
+    port alone also asks for a viewer.
+    """
     shown, settings, others = take_settings(overrides, "viewer", ViewerSettings)
     if shown is None:
         shown = len(others) < len(overrides)
@@ -128,7 +130,7 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
 
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
-    """Return the target and its budget in seconds, None where neither is asked for, and the other overrides."""
+    """Split overrides into (target, budget in seconds), None if neither is given, and the other overrides."""
     budget, rest = take_budget_override(overrides)
     whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
@@ -145,18 +147,18 @@ def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget,
 
 
 def take_budget_override(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Return the text of ``budget=TIME``, None where it is not given, and the other overrides."""
+    """Split overrides into the text of ``budget=TIME``, None without it, and the other overrides."""
     budget, _, others = take_settings(overrides, "budget", _Budget)
     return (None if budget is None else str(budget)), others
 
 
 @dataclass(frozen=True)
 class _Budget:
-    """The group of ``budget=10m``, which has no settings of its own."""
+    """Empty settings group of ``budget=10m``."""
 
 
 def parse_duration_setting(text: str, asked: str) -> float:
-    """Return the seconds of a time such as 90s, 5m or 1h; ``asked`` is what the user typed, for the message."""
+    """Convert a duration such as 90s, 5m or 1h to seconds. Errors name ``asked``, the override as typed."""
     match = re.fullmatch(r"(\d+(?:\.\d+)?)([smh])", text)
     if match is None or float(match[1]) == 0:
         raise ConfigError(f"{asked}: expected a time such as 90s, 5m or 1h")

@@ -1,8 +1,8 @@
 """Compose a :class:`RunConfig` from the overrides of ``neuprim run``.
 
-Values win in this order: what the user typed, the level of effort, a stored run's settings, the preset, the defaults of
-the settings dataclasses. Hydra reads the overrides; OmegaConf merges them with the YAML files and resolves ``${...}``;
-the settings dataclasses say which keys exist.
+A setting's value comes from the first of these that has it: overrides, the level of effort, a stored run, the preset,
+the defaults of the settings dataclasses. Hydra parses the overrides. OmegaConf merges them with the YAML files and
+resolves ``${...}``. The settings dataclasses define which keys exist.
 """
 
 from __future__ import annotations
@@ -93,7 +93,7 @@ _REQUIRED = "???"
 
 @dataclass(frozen=True)
 class _Selection:
-    """Task, scene, preset and level of a configuration, loaded, and the default name of its directory."""
+    """Task, scene, preset and level of effort of a configuration, loaded, and the default name of its run directory."""
 
     task_info: PluginInfo
     spec: TaskSpec
@@ -107,7 +107,7 @@ class _Selection:
 
 @dataclass(frozen=True)
 class _BaseConfig:
-    """Settings before those of the user, with ``${...}`` not resolved, and names of the scene's settings of paths."""
+    """Settings without the user's overrides, ``${...}`` unresolved, and names of the scene settings that are paths."""
 
     tree: dict[str, Any]
     paths: list[str]
@@ -118,11 +118,11 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 
     Args:
         overrides: ``key=value`` in Hydra's grammar, as after ``neuprim run``.
-        check_output: refuse an ``output_dir`` that already holds files, unless ``resume=true``.
-        stored: an earlier run whose settings replace the defaults; the new run has its own directory.
+        check_output: whether to refuse an ``output_dir`` that already holds files, unless ``resume=true``.
+        stored: an earlier run whose settings replace the defaults. The new run has its own directory.
 
     Raises:
-        ConfigError: one line that names the key, what was found and what was expected.
+        ConfigError: a key or value is wrong. The message is one line: the key, what was found and what was expected.
     """
     assignments = parse_overrides(overrides)
     typed = {a.key: a.value for a in assignments}
@@ -158,7 +158,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 def compose_all(
     overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
 ) -> list[RunConfig]:
-    """Return the configurations of a sweep, each in its own folder of one directory; see :func:`compose`."""
+    """Return the configurations of all runs of a sweep, each with its own folder in one directory (:func:`compose`)."""
     swept = set(swept_override_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]
@@ -190,17 +190,19 @@ def compose_all(
 
 
 def _uses_own_stored_config(directory: Path, own: Sequence[str], recorded: bool) -> bool:
-    """Return whether a sweep's run resumes its own configuration; the sweep's record refuses other overrides later."""
+    """Return whether a sweep's run resumes with the configuration in its directory. Other overrides are refused later,
+    when they are compared with the sweep's record.
+    """
     if not (directory / "config.yaml").is_file():
         return False
     return not recorded or drop_output_overrides(RunConfig.from_yaml(directory).overrides) == list(own)
 
 
 def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None = None) -> RunSettings:
-    """Return the settings of a preset, or of a level of effort over it; the task need not be registered.
+    """Return the settings of a preset, changed by a level of effort if one is given. The task need not be registered.
 
     Raises:
-        ConfigError: its files lack something, cannot be read, or hold an impossible value.
+        ConfigError: a YAML file of the task is incomplete, cannot be read, or has an invalid value.
     """
     check_config_groups(spec)
     base = _read_base(spec, scene, spec.config_package, preset, {})
@@ -210,7 +212,7 @@ def preset_settings(spec: TaskSpec, preset: str, scene: str, level: Level | None
 
 
 def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
-    """Return what the user typed for a choice such as ``task``; None if nothing."""
+    """Return the value typed for the choice ``key``, e.g. ``task`` or ``preset``; None if there is none."""
     given = [a for a in assignments if a.key == key]
     if not given or given[-1].value is None:
         return None
@@ -222,7 +224,7 @@ def _read_choice(assignments: Sequence[Assignment], key: str) -> str | None:
 
 
 def _select_task_scene_and_preset(choices: Mapping[str, str | None]) -> _Selection:
-    """Load the task, and find its scene, preset and level."""
+    """Load the chosen task, and find its chosen scene, preset and level of effort."""
     task_name = choices["task"] or DEFAULT_TASK
     info, spec = TASKS.load_with_info(task_name)
     check_config_groups(spec)
@@ -245,9 +247,9 @@ def _compose_run_config(
     check_output: bool,
     new_launch: bool = False,
 ) -> tuple[RunConfig, list[str]]:
-    """Return a valid configuration on top of ``earlier`` runs, and names of the scene's settings of paths.
+    """Return a validated configuration, and the names of the scene settings that are paths.
 
-    ``overrides`` of the configuration are not set yet.
+    Settings of ``earlier`` runs replace the defaults. The field ``overrides`` of the configuration is not set yet.
     """
     spec, scene = chosen.spec, chosen.scene
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
@@ -299,7 +301,9 @@ def _compose_run_config(
 
 
 def _merge_overrides(earlier: RunConfig, overrides: Sequence[str]) -> list[str]:
-    """Return all overrides typed for a run so far; a later one replaces an earlier one of the same key."""
+    """Return all overrides typed for a run so far, in earlier commands and now. A later value of a key replaces an
+    earlier one.
+    """
     again = {key_of(text) for text in overrides}
     return [*(text for text in drop_output_overrides(earlier.overrides) if key_of(text) not in again), *overrides]
 
@@ -308,7 +312,7 @@ def _merge_overrides(earlier: RunConfig, overrides: Sequence[str]) -> list[str]:
 
 
 def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: dict[str, Any]) -> _BaseConfig:
-    """Merge defaults, preset and scene, whose file is in ``package``."""
+    """Merge defaults, preset and scene settings; ``package`` has the YAML file of the scene."""
     from omegaconf import OmegaConf
 
     scene_node, preset_node = (
@@ -345,7 +349,7 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
 def _resolve_config(
     base: _BaseConfig, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
 ) -> dict[str, Any]:
-    """Return the resolved configuration; values of ``earlier`` runs replace those of the base."""
+    """Return the resolved configuration as nested values. Settings of ``earlier`` runs replace those of ``base``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -379,7 +383,7 @@ def _resolve_config(
 
 
 def _find_typed_value(values: Sequence[Assignment], group: str, name: str) -> Any:
-    """Return what was typed last for a setting of a group, alone or within the group."""
+    """Return the last value typed for a group's setting ``name``, as ``group.name=VALUE`` or in ``group={...}``."""
     found = None
     for a in values:
         if a.key == f"{group}.{name}":
@@ -397,7 +401,9 @@ def _validate_settings(tree: Mapping[str, Any]) -> RunSettings:
 
 
 def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths: Sequence[str]) -> dict[str, Any]:
-    """Return a scene's settings, each as the type of its default; a null or required default accepts anything."""
+    """Return a scene's settings, each converted to the type of its default. A setting whose default is null or required
+    accepts any value.
+    """
     result: dict[str, Any] = {}
     for key, value in node.items():
         where, default = f"scene.{key}", declared[key]
@@ -413,13 +419,13 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
 
 
 def _flatten_config_settings(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
-    """Return flat dotted values, with the settings in their own types, so that 1 and 1.0 are the same rate."""
+    """Return dotted key -> value, with the types of the settings classes, so that 1 and 1.0 are the same rate."""
     values = {**dataclasses.asdict(settings), "scene": tree["scene"], "task": tree["task"]}
     return flatten({key: value for key, value in values.items() if key not in ("output_dir", "resume")})
 
 
 def _find_non_default_config(default: Mapping[str, Any], actual: Mapping[str, Any]) -> dict[str, tuple[Any, Any]]:
-    """Return key -> (default, value) of the flat settings that differ."""
+    """Return key -> (default, value) for flat settings whose value differs from the default."""
     before = {key: None if value == _REQUIRED else value for key, value in default.items()}
     pairs = {key: (before.get(key), actual.get(key)) for key in {**default, **actual}}
     return {key: pair for key, pair in pairs.items() if pair[0] != pair[1]}

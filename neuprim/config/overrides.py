@@ -1,4 +1,4 @@
-"""Overrides, the ``key=value`` arguments of a command, in Hydra's grammar: read, expand to a sweep, quote."""
+"""Overrides, the ``key=value`` arguments of a command in Hydra's grammar: parse, expand to a sweep, and quote them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ MAX_RUNS = 10_000
 
 @dataclass(frozen=True)
 class Assignment:
-    """One ``key=value``.
+    """One parsed override ``key=value``.
 
     Attributes:
-        key: dotted.
-        text: what was typed.
+        key: dotted key, e.g. ``train.iterations``.
+        text: the override as typed.
     """
 
     key: str
@@ -35,13 +35,13 @@ class Assignment:
 
 @dataclass(frozen=True)
 class CommandLine:
-    """The arguments of ``neuprim run``: overrides, and the file of ``--config``."""
+    """The arguments of ``neuprim run``: overrides, and the file given with ``--config``."""
 
     overrides: Sequence[str]
     file: Path | None = None
 
     def resume_command(self, directory: Path) -> str:
-        """Return the command that continues the run in ``directory``, or the sweep that it is a part of."""
+        """Return the command line that continues the run in ``directory``, or the sweep that the run belongs to."""
         sweep = bool(swept_override_keys(self.overrides))
         overrides = drop_output_overrides(self.overrides)
         if not overrides and self.file is None and not (directory / "config.yaml").is_file():
@@ -52,7 +52,7 @@ class CommandLine:
 
 
 def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
-    """Parse assignments of one value each; a leading ``+`` or ``++`` is ignored, as keys are checked by name."""
+    """Parse overrides of one value each. A leading ``+`` or ``++`` is ignored, because keys are checked by name."""
     found = []
     for override, text in zip(_parse_with_hydra(overrides), overrides, strict=True):
         if override.is_sweep_override():
@@ -67,10 +67,10 @@ def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
 
 
 def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[Any, T, list[str]]:
-    """Take the settings of one group out of overrides.
+    """Split overrides into the settings of one group and the other overrides.
 
     Returns:
-        The value of ``group=VALUE``, None where it is not given; the settings, from ``group.name=VALUE`` and
+        The value of ``group=VALUE``, None if absent; the settings, made from ``group.name=VALUE`` and
         ``group.name.key=VALUE``; and the other overrides.
     """
     own = [text for text in overrides if key_of(text).partition(".")[0] == group]
@@ -88,7 +88,9 @@ def take_settings(overrides: Sequence[str], group: str, cls: type[T]) -> tuple[A
 
 
 def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:
-    """Return every combination of the values separated by commas, or given by ``range(...)`` or ``choice(...)``.
+    """Return the overrides of every run of a sweep: all combinations of the values of keys with several values.
+
+    Several values are written with commas, ``range(...)`` or ``choice(...)``.
 
     The last key varies fastest: ``["a=1,2", "b=3"]`` gives ``[["a=1", "b=3"], ["a=2", "b=3"]]``.
     """
@@ -118,7 +120,7 @@ def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:
 
 
 def sweep_override_names(overrides: Sequence[str], combinations: Sequence[Sequence[str]]) -> list[str]:
-    """Return a directory name for each combination, made of the swept keys and their values; all different."""
+    """Return a unique directory name for each run of a sweep, made of the swept keys and their values."""
     swept = [i for i, override in enumerate(_parse_with_hydra(overrides)) if override.is_sweep_override()]
     names: list[str] = []
     for combination in combinations:
@@ -130,7 +132,7 @@ def sweep_override_names(overrides: Sequence[str], combinations: Sequence[Sequen
 
 
 def quote_override(key: str, value: Any) -> str:
-    """Return ``key=value`` as :func:`parse_overrides` reads it back; text that would be read otherwise is quoted."""
+    """Return ``key=value`` so that :func:`parse_overrides` restores the value. Text is quoted where necessary."""
     if value is None:
         return f"{key}=null"
     if not isinstance(value, str):
@@ -150,12 +152,12 @@ def key_of(override: str) -> str:
 
 
 def drop_output_overrides(overrides: Iterable[str]) -> list[str]:
-    """Return the overrides without ``output_dir`` and ``resume``."""
+    """Return the overrides except ``output_dir`` and ``resume``."""
     return [text for text in overrides if key_of(text) not in NOT_SWEPT]
 
 
 def swept_override_keys(overrides: Iterable[str]) -> list[str]:
-    """Return the keys that have several values."""
+    """Return the keys for which overrides give several values."""
     return [override.key_or_group for override in _parse_with_hydra(list(overrides)) if override.is_sweep_override()]
 
 
@@ -183,7 +185,7 @@ def _parse_with_hydra(overrides: Sequence[str]) -> list[Any]:
 
 
 def _quote_override_for_shell(text: str) -> str:
-    """Return how to type an assignment so that both the shell and the grammar take its value literally."""
+    """Return an override quoted so that both the shell and Hydra's grammar take its value literally."""
     key, _, value = text.partition("=")
     value = value.strip("'\"")
     return f"\"{key}='{value}'\""

@@ -1,4 +1,4 @@
-"""The typed configuration of one run, its form on disk, and the task and scene of the packages that made it."""
+"""The typed configuration of one run, its YAML form, and the task and scene plugins that it names."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from neuprim.core.task import TaskSpec
 
 _MAX_BYTES = 1_000_000
-"""A configuration has a few kilobytes; anything larger is another file."""
+"""Largest size of a configuration file. A real one has a few kilobytes."""
 
 
 @dataclass
@@ -59,14 +59,14 @@ class RunConfig:
     """All settings of a run, validated.
 
     Attributes:
-        scene: settings of the scene, as its loader takes them.
+        scene: settings of the scene, as the scene's loader takes them.
         options: settings of the task and its loss (``task.options``).
-        unused: names of the shared settings that nothing in this run reads; ``config.yaml`` does not show them.
+        unused: names of the shared settings that nothing in this run reads; ``config.yaml`` omits them.
         output_dir: directory of the run; it need not exist yet.
         seed: seed of every random number of the run.
         resume: whether to continue from the checkpoint in ``output_dir``, if there is one.
         overrides: overrides that the user typed.
-        non_default: dotted key -> (value without any override, value of this run), where they differ.
+        non_default: dotted key -> (value without overrides, value of this run), for settings where the two differ.
         source: file that the configuration was read from; None for a new one.
         made_by: packages and versions of task, scene and loss.
     """
@@ -90,7 +90,7 @@ class RunConfig:
     source: Path | None = field(default=None, compare=False)
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain nested values by the keys of the command line."""
+        """Return the configuration as plain nested values, with the keys of the command line."""
         tree: dict[str, Any] = {
             "task": {"name": self.task, "options": self.options},
             "scene": {"name": self.scene_name, **self.scene},
@@ -112,7 +112,7 @@ class RunConfig:
         return tree
 
     def override(self, values: Mapping[str, Any]) -> RunConfig:
-        """Return the configuration with other settings, by dotted key; updates ``non_default``."""
+        """Return a copy with new values for settings, given by dotted key; ``non_default`` is updated."""
         tree = self.to_dict()
         for key, value in values.items():
             *path, name = key.split(".")
@@ -124,19 +124,19 @@ class RunConfig:
         return dataclasses.replace(RunConfig.from_dict(tree), source=self.source)
 
     def to_yaml(self) -> str:
-        """Return the resolved configuration as YAML, which :meth:`from_yaml` reads back unchanged."""
+        """Return the resolved configuration as YAML text; :meth:`from_yaml` restores it unchanged."""
         return yaml.dump(self.to_dict(), Dumper=_PlainDumper, sort_keys=False, allow_unicode=True, width=120)
 
     @classmethod
     def from_yaml(cls, path: str | Path) -> RunConfig:
-        """Return the configuration in a run's ``config.yaml``; no code in it is executed.
+        """Read the configuration from a run's ``config.yaml``; no code in the file is executed.
 
         Args:
             path: the file or the run directory.
 
         Raises:
             CheckpointError: there is no such file, or it is not a run's configuration.
-            ConfigError: a setting in it does not exist or has an impossible value.
+            ConfigError: a setting in the file does not exist or has an invalid value.
         """
         file = Path(path)
         if file.is_dir():
@@ -151,10 +151,10 @@ class RunConfig:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> RunConfig:
-        """Return the configuration from the values of :meth:`to_dict`.
+        """Return the configuration with the values that :meth:`to_dict` returned.
 
         Raises:
-            ConfigError: a setting in it does not exist or has an impossible value.
+            ConfigError: a setting in ``data`` does not exist or has an invalid value.
         """
         stored_keys = flatten(data)
         unused = tuple(name for name in OPTIONAL if name not in stored_keys)
@@ -189,7 +189,7 @@ class RunConfig:
 
 @dataclass
 class _StoredTask:
-    """The group ``task`` of a file."""
+    """The entries under ``task`` in ``config.yaml``."""
 
     name: str
     options: dict[str, Any] = field(default_factory=dict)
@@ -208,7 +208,7 @@ class _StoredConfig(RunSettings):
 
 
 class _PlainDumper(yaml.SafeDumper):
-    """Writes a value that occurs twice twice, instead of as an anchor and an alias."""
+    """YAML dumper that never uses anchors and aliases: a value that occurs twice is written twice."""
 
     def ignore_aliases(self, data: Any) -> bool:
         return True
@@ -234,7 +234,7 @@ def _read_config_yaml(file: Path) -> Mapping[str, Any]:
 
 
 def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
-    """Return dotted names and values of nested settings."""
+    """Return dotted key -> value of nested settings; ``where`` is the key of ``node``."""
     found: dict[str, Any] = {}
     for key, value in node.items():
         name = join_setting_key(where, str(key))
@@ -247,43 +247,44 @@ def flatten(node: Mapping[str, Any], where: str = "") -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Job:
-    """A configuration with its task, which is loaded once and passed on together with it."""
+    """A run's configuration with its loaded task, so that the task is loaded only once."""
 
     config: RunConfig
     task: TaskSpec
 
     @classmethod
     def of(cls, config: RunConfig) -> Job:
-        """Load the task of a configuration, with the conditions of its scene. Raises as :func:`load_config_task`."""
+        """Load a configuration's task, with the conditions of its scene. Raises the errors of
+        :func:`load_config_task`."""
         task = load_config_task(config, config.source)
         conditions = tuple(spec for spec in task.conditions if spec.of_scene(config.scene))
         return cls(config, task if conditions == task.conditions else replace(task, conditions=conditions))
 
     @property
     def scene(self) -> FoundScene:
-        """The scene, of the task or of another package."""
+        """The run's scene, from the task's package or another."""
         return find_config_scene(self.config, self.task, self.config.source)
 
     @property
     def plugins(self) -> RunPlugins:
-        """The plugins of the run, whose names appear in errors of their code."""
+        """The plugins of the run, to name them in errors of their code."""
         return find_config_plugins(self.config)
 
 
 def load_config_task(config: RunConfig, file: Path | None = None) -> TaskSpec:
-    """Load the task of a run's configuration from the package that made the run; warn of another version of it.
+    """Load a run's task from the package that made the run; warn if another version of the package is installed.
 
     Raises:
-        ConfigError: the package is not installed; names it and ``file``, where the configuration was read from.
+        ConfigError: the package is not installed. The message names ``file``, the source of the configuration.
         PluginError: the task is broken.
     """
     return load_recorded_plugin(TASKS, config.made_by.task, file)[1]
 
 
 def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = None) -> FoundScene:
-    """Find the scene of a run's configuration, the task's own or of the package that made the run.
+    """Find a run's scene: one of the task's own, or one of the package that made the run.
 
-    Raises as :func:`load_config_task`.
+    Raises the errors of :func:`load_config_task`.
     """
     if config.made_by.scene is None:
         own = [scene for scene in task.scenes if scene.name == config.scene_name]
@@ -293,7 +294,7 @@ def find_config_scene(config: RunConfig, task: TaskSpec, file: Path | None = Non
 
 
 def current_config_provenance(config: RunConfig, task: TaskSpec) -> Provenance:
-    """Return the provenance of a run that starts or resumes now: the same packages, in their installed versions."""
+    """Return the provenance of a run that starts or resumes now: its packages, in the installed versions."""
     task_info = TASKS.find(config.made_by.task.qualified_name)
     loss = None if config.train.loss is None else LOSSES.find(config.train.loss)
     return Provenance.of_installed(task_info, find_config_scene(config, task), loss)

@@ -1,4 +1,4 @@
-"""Checks that a settings dataclass cannot make: keys of a scene, options of a task and loss, unused shared settings."""
+"""Check settings that a settings dataclass cannot check: scene keys, task and loss options, unused shared settings."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def check_config_key(assignment: Assignment, scene: Mapping[str, Any], scene_nam
     """Raise ConfigError for a key that names no setting; the error suggests the nearest settings.
 
     Args:
-        scene: the scene's settings, whose names are valid keys.
+        scene: the scene's settings; ``scene.NAME`` is a valid key for each name.
     """
     key = assignment.key
     head, *rest = key.split(".")
@@ -64,7 +64,7 @@ def _setting_names(cls: type, where: str = "") -> Iterator[str]:
 
 
 def _is_setting(path: list[str]) -> bool:
-    """Return whether a path of field names leads from :class:`RunSettings` to a setting or into a free dictionary."""
+    """Return whether field names, starting at :class:`RunSettings`, lead to a setting or into a free dictionary."""
     hint: Any = RunSettings
     for part in path:
         if get_origin(hint) is dict or hint is Any:
@@ -79,7 +79,7 @@ def _is_setting(path: list[str]) -> bool:
 
 
 def task_and_loss_options(spec: TaskSpec, loss: LossExtension | None) -> Mapping[str, Option]:
-    """Return the options that may stand under ``task.options``: the task's own and those of the loss chosen."""
+    """Return the options that are valid under ``task.options``: those of the task and those of the chosen loss."""
     if loss is None:
         return spec.options
     for name in sorted(spec.options.keys() & loss.options.keys()):
@@ -93,7 +93,7 @@ def task_and_loss_options(spec: TaskSpec, loss: LossExtension | None) -> Mapping
 def complete_task_options(
     declared: Mapping[str, Option], given: Any, owner: str, where: str = "task.options"
 ) -> dict[str, Any]:
-    """Return every declared option, as given or its default; ``owner`` and ``where`` are for messages."""
+    """Return a value for every declared option, given or default. Errors name ``owner`` and ``where``."""
     if not isinstance(given, Mapping):
         raise ConfigError(f"{where}={format_setting_value(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:
@@ -111,13 +111,13 @@ def complete_task_options(
 
 
 def unused_settings(spec: TaskSpec, loss: LossExtension | None) -> tuple[str, ...]:
-    """Return the optional shared settings that neither the task nor the loss of a run reads."""
+    """Return the names of optional shared settings that neither the run's task nor its loss reads."""
     train = spec.uses if loss is None else loss.uses
     return tuple(name for name in OPTIONAL if name not in (spec.uses if name.startswith("model.") else train))
 
 
 def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | None) -> None:
-    """Raise ConfigError for a shared setting that neither the task nor the loss reads, with those that are used."""
+    """Raise ConfigError if neither task nor loss reads a shared setting in ``names``; suggest settings they read."""
     unused = unused_settings(spec, loss)
     for name in names:
         if name in unused:
@@ -130,7 +130,8 @@ def refuse_unused(names: Iterable[str], spec: TaskSpec, loss: LossExtension | No
 
 def check_config_parameter_names(spec: TaskSpec, settings: RunSettings) -> None:
     """Raise ConfigError for names under ``model.init``, ``train.rates`` and ``train.rate_units`` that no field of the
-    task has, if it lists its fields. Names that only the model lacks are refused when it is made."""
+    task has. Does nothing if the task does not list its fields. Names that only the chosen fields lack are refused
+    later."""
     if not spec.fields:
         return
     init = {"scale", "points", "surroundings", *(name for cls in spec.fields.values() for name in cls.init_settings)}

@@ -2,9 +2,8 @@
 
 ``neuprim run --config FILE`` and ``resume=true`` start from the settings of an earlier run.
 
-A stored configuration is untrusted text. Files that it names are read from this machine, as by any run of the user.
-An address of another machine, or a folder outside of the run to write to, is used only if the user typed it or passed
-``--trust``.
+A stored configuration is untrusted. neuprim reads the files that it names. neuprim contacts an address in it, or
+writes to a folder outside the run directory, only if the user typed that setting or passed ``--trust``.
 """
 
 from __future__ import annotations
@@ -27,29 +26,29 @@ from neuprim.plugins.registry import BUILT_IN, TASKS, split_plugin_name
 ROOT = Path("outputs")
 DEFAULT_TASK = "static"
 Choices = Mapping[str, str | None]
-"""Key (task, scene, preset, effort) -> what the user typed, None if nothing."""
+"""Key (task, scene, preset, effort) -> what the user typed; None if nothing."""
 
 _FREE = ("memory", "chunks")
-"""Settings of scenes that a resumed run may change: what is decoded at once, and the chunks (they have a record)."""
+"""Scene settings that a resumed run may change: memory for decoding, and the chunks, which have a record."""
 
 _SEARCH, _SWEEP = "target.json", "sweep.json"
-"""Records in directories of more than one run; these resume with the overrides of the search or sweep."""
+"""Records in directories of a search and a sweep, which resume with their own overrides."""
 
 
 def read_stored_config(path: Path) -> RunConfig:
-    """Return the configuration of an earlier run, from its ``config.yaml`` or its directory."""
+    """Read the configuration of an earlier run from ``path``, its ``config.yaml`` or its directory."""
     if not path.exists():
         raise ConfigError(f"--config {path}: no such file; expected RUN_DIR/config.yaml of an earlier run")
     return RunConfig.from_yaml(path)
 
 
 def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> dict[str, str | None]:
-    """Return task, scene, preset and level: what was typed, else what the stored run had.
+    """Return task, scene, preset and level of effort: the typed choice, else that of the stored run.
 
-    With ``--config`` the user may type another scene, and with ``resume=true`` (``resumed``) a level.
+    With ``--config`` the user may type another scene. With ``resume=true`` (``resumed``) the user may type a level.
 
     Raises:
-        ConfigError: a choice that contradicts the stored run.
+        ConfigError: a typed choice contradicts the stored run.
     """
     own = _stored_choices_of(stored)
     for key in ("task", "scene", "preset") if resumed else ("task", "preset", "effort"):
@@ -67,9 +66,10 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
 
 
 def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
-    """Return key -> settings of a stored run, which replace the key's whole value; ``$`` is hidden from OmegaConf.
+    """Return key -> value of a stored run's settings, with ``$`` replaced so that OmegaConf resolves no ``${...}``.
 
-    A file is data: only overrides and packages may contain references ``${...}`` (:func:`restore_config_references`).
+    Each value replaces the key's whole value. Only overrides and packages may use references ``${...}``; a stored file
+    may not. :func:`restore_config_references` restores ``$``.
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
@@ -80,7 +80,7 @@ def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
 
 
 def restore_config_references(value: Any) -> Any:
-    """Undo what :func:`stored_settings` does to ``$``. No YAML text has the character 0."""
+    """Restore the ``$`` that :func:`stored_settings` replaced by the character 0, which no YAML text has."""
     return _replace_config_text(value, "$\0", "$")
 
 
@@ -116,13 +116,14 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
 
     Args:
         typed: key -> value of the overrides.
-        has_file: whether ``--config`` gives settings.
+        has_file: whether the user passed ``--config``.
 
     Raises:
-        ConfigError: only the directory was typed, and no run is there; or a folder in it is a link out of it.
-        CheckpointError, ConfigError: its ``config.yaml`` is damaged. Where settings were typed, unknown ones in the
-            file are a warning.
-        UnknownPlugin: the directory depends on a task that is not installed.
+        ConfigError: no settings were typed and the directory holds no run, or a folder in the directory is a link to
+            a place outside.
+        CheckpointError, ConfigError: the run's ``config.yaml`` is damaged. If settings were typed, an invalid setting
+            in the file is only a warning.
+        UnknownPlugin: the directory's default name needs a task that is not installed.
     """
     if typed.get("resume") is not True:
         return None
@@ -153,7 +154,7 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
 def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]) -> None:
     """Raise ConfigError if a resumed run changes its model, scene, task options, seed or loss.
 
-    Budgets, rates, renderers, memory, and the scene's ``paths`` (its settings that say where data lie) may change.
+    Budgets, rates, renderer and memory settings may change, and so may ``paths``, the scene settings for data files.
     """
     free = {f"scene.{name}" for name in (*paths, *_FREE)}
     before, after = _fixed_config_settings(begun), _fixed_config_settings(now)
@@ -182,11 +183,11 @@ def _fixed_config_settings(config: RunConfig) -> dict[str, Any]:
 
 
 def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None = None) -> None:
-    """Raise ConfigError if an untrusted configuration names an address, or a folder to write to outside of its run.
+    """Raise ConfigError if an untrusted configuration names an address, or a folder outside its run to write to.
 
     Args:
-        config: passes if it has no ``source``.
-        typed: dotted keys that the user typed in addition to the file; None if the user cannot type any.
+        config: the configuration; it is trusted if it was not read from a file (no ``source``).
+        typed: dotted keys that the user typed in addition to the file; None if the command takes no settings.
     """
     if config.source is None or trusted():
         return
@@ -215,7 +216,7 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
 
 
 def refuse_untrusted_run_links(run_dir: Path) -> None:
-    """Raise ConfigError for a folder in a run directory that is a link out of it, unless the user trusts it."""
+    """Raise ConfigError if a folder in a run directory is a link to a place outside, unless the user trusts the run."""
     if trusted() or not run_dir.is_dir():
         return
     whole = run_dir.resolve()
@@ -241,7 +242,7 @@ def _list_config_texts(key: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def config_output_name(task: str, scene: str) -> str:
-    """Return the name of a run's directory where users chose none; ``PACKAGE:NAME`` becomes a part of it."""
+    """Return the default name of a run's directory, ``<task>-<scene>``; ``PACKAGE:NAME`` becomes a file name."""
     return "-".join(part for word in (task, scene) for part in split_plugin_name(word) if part)
 
 
@@ -251,8 +252,8 @@ def config_output_directory(asked: str | None, name: str, resume: bool, check: b
     Args:
         asked: the user's ``output_dir``, or None for ``outputs/NAME``, ``outputs/NAME-2``, ...
         name: ``<task>-<scene>``.
-        resume: take the directory as it is; without ``asked``, the one with the highest number.
-        check: whether an ``asked`` directory that holds files is refused (unless ``resume``).
+        resume: use an existing directory; without ``asked``, the existing one with the highest number.
+        check: whether to refuse an ``asked`` directory that holds files (unless ``resume``).
     """
     if asked is None:
         number = max(_config_output_numbers(name), default=0) + (not resume)
@@ -278,7 +279,7 @@ def config_output_directory(asked: str | None, name: str, resume: bool, check: b
 
 
 def _config_output_numbers(name: str) -> list[int]:
-    """Return the numbers of the existing ``NAME`` (1) and ``NAME-n`` under the output root."""
+    """Return the numbers of existing directories in the output root: 1 for ``NAME``, n for ``NAME-n``."""
     if not ROOT.is_dir():
         return []
     pattern = re.compile(re.escape(name) + r"(?:-(\d+))?")

@@ -1,8 +1,8 @@
-"""A task's YAML files: its scenes, presets, defaults and levels of effort.
+"""Read a task's YAML files: its scenes, presets, defaults and levels of effort.
 
-A task's ``config_package`` holds ``task/NAME.yaml``, ``scene/NAME/*.yaml``, ``preset/NAME/*.yaml`` and perhaps
-``effort/NAME.yaml``. Scenes and presets lie under the task's name because several tasks have a scene of the same name.
-A preset or scene may start from others of its folder, as in Hydra: ``defaults: [paper, _self_]``.
+A task's ``config_package`` holds ``task/NAME.yaml``, ``scene/NAME/*.yaml``, ``preset/NAME/*.yaml`` and optionally
+``effort/NAME.yaml``; NAME is the task, because several tasks have a scene of the same name. A preset or scene may
+extend others in its folder, as in Hydra: ``defaults: [paper, _self_]``.
 
 ``effort/NAME.yaml`` has settings for each level of effort, 1 to 9::
 
@@ -38,7 +38,7 @@ PRESET_GROUPS = ("model", "train", "renderer")
 
 @dataclass(frozen=True)
 class TaskChoices:
-    """Content of ``task/NAME.yaml``: default scene and preset, and values of all of the task's own options."""
+    """Content of ``task/NAME.yaml``: default scene and preset of the task, and defaults of the task's own options."""
 
     scene: str
     preset: str
@@ -47,7 +47,7 @@ class TaskChoices:
 
 @dataclass(frozen=True)
 class Level:
-    """A level of effort: the preset that it was measured with, and its settings as overrides."""
+    """A level of effort: the preset that it changes, and its settings as overrides."""
 
     preset: str
     settings: tuple[Assignment, ...]
@@ -81,7 +81,7 @@ def list_task_presets(spec: TaskSpec) -> list[str]:
 
 
 def check_config_groups(spec: TaskSpec) -> None:
-    """Raise ConfigError when the configuration package cannot be used or lacks a file that a run would need."""
+    """Raise ConfigError if a task's configuration package cannot be used, or lacks a file that a run would need."""
     who = f"task {spec.name!r}"
     if not spec.scenes:
         raise ConfigError(f"{who}: its TaskSpec has no scenes")
@@ -93,7 +93,7 @@ def check_config_groups(spec: TaskSpec) -> None:
 
 
 def check_scene_config(spec: TaskSpec, scene: str, package: str) -> None:
-    """Raise ConfigError when the package that adds ``scene`` to a task has no YAML file for it."""
+    """Raise ConfigError if ``package``, which adds ``scene`` to a task, has no YAML file for the scene."""
     _require_config_file(package, f"scene/{spec.name}/{scene}.yaml", f"scene {scene!r} of task {spec.name!r}")
 
 
@@ -103,7 +103,7 @@ def _require_config_file(package: str, place: str, who: str) -> None:
 
 
 def find_config_package(spec: TaskSpec) -> Traversable:
-    """Return the folder of a task's YAML files. Raise ConfigError when its package cannot be opened."""
+    """Return the folder of a task's YAML files. Raise ConfigError if the package that holds it cannot be opened."""
     return _open_config_package(spec.config_package, f"task {spec.name!r}")
 
 
@@ -111,7 +111,7 @@ def read_config_group(spec: TaskSpec, group: str, name: str, package: str | None
     """Return the settings of a scene or preset, merged over its ``defaults``; ``${...}`` is not resolved.
 
     Args:
-        package: package with the file; None for the task's own.
+        package: package that holds the YAML file; None for the task's own.
     """
     root = find_config_package(spec) if package is None else _open_config_package(package, f"scene {name!r}")
     return _read_with_defaults(root, f"{group}/{spec.name}", name, f"task {spec.name!r}: ", ())
@@ -135,7 +135,7 @@ def _read_with_defaults(
 
 
 def read_task_yaml(file: Traversable, who: str) -> dict[str, Any]:
-    """Return a YAML file of a task's package as a mapping; an error begins with ``who``."""
+    """Read a YAML file of a task's package as a mapping; error messages begin with ``who``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
     from yaml import YAMLError
@@ -148,7 +148,7 @@ def read_task_yaml(file: Traversable, who: str) -> dict[str, Any]:
 
 
 def omegaconf_to_plain(node: Any, resolve: bool = True, who: str = "configuration") -> dict[str, Any]:
-    """Return an OmegaConf mapping as plain values; an error begins with ``who``."""
+    """Convert an OmegaConf mapping to plain values; error messages begin with ``who``."""
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -176,7 +176,9 @@ def _open_config_package(name: str, who: str) -> Traversable:
 def choose_config_effort_level(
     spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]
 ) -> Level | None:
-    """Return the level that ``effort=N`` names; raise ConfigError if the user typed another ``preset`` than its own."""
+    """Return the level that ``effort=N`` names, None without it. Raise ConfigError if the user typed a ``preset`` other
+    than the level's.
+    """
     if chosen is None:
         return None
     if chosen not in map(str, LEVELS):
@@ -194,7 +196,7 @@ def choose_config_effort_level(
 
 
 def read_config_effort_levels(spec: TaskSpec, presets: Sequence[str]) -> Mapping[int, Level] | None:
-    """Return a task's levels by their numbers; None where it has none."""
+    """Return number -> level of effort of a task; None if the task has no levels."""
     place = f"effort/{spec.name}.yaml"
     file = find_config_package(spec) / place
     if not file.is_file():

@@ -1,4 +1,4 @@
-"""Checks that any task must pass, for authors of tasks.
+"""Conformance checks for authors of tasks: every task must pass them.
 
     from neuprim.conformance import check_task, checks
 
@@ -8,9 +8,9 @@
     def test_conforms(check):
         check()
 
-Each check builds tiny models on the reference backend from the task's default preset. It uses the task's own
-``example``, or a small synthetic data set with the conditions that the task declares. The docstring of a check says
-what it demands.
+Each check builds tiny models on the reference backend from the task's default preset. The data are the task's
+``example``, or a small synthetic data set with the conditions that the task declares. The docstring of each check
+states the requirement.
 """
 
 from __future__ import annotations
@@ -78,14 +78,14 @@ __all__ = ["CHECKS", "ConformanceError", "check_task", "checks", "named_checks"]
 _NOT_THE_TASKS = ("neuprim.core", "neuprim.config", "neuprim.plugins")
 _LIBRARIES = ("torch", "numpy", "scipy", "numba", "importlib", "omegaconf", "hydra", "yaml")
 _STEPS = 4
-"""Steps before the checkpoint and again after it; the population changes twice in each half."""
+"""Training steps before the checkpoint, and also after it; population control runs twice in each half."""
 
 
 # ---------------------------------------------------------------- what a task declares
 
 
 def check_description_conformance(t: TaskUnderTest) -> None:
-    """The TaskSpec is valid, its scenes, presets, efforts and tunable settings compose, and typos are refused."""
+    """Check that the TaskSpec is valid, scenes, presets, efforts and tunable settings work, and typos are refused."""
     problem = validate_spec(t.task)
     t.require(problem is None, "TaskSpec", problem, "members as documented in neuprim.core.task.TaskSpec")
     t.require(bool(t.task.fields), "TaskSpec.fields", t.task.fields, "every field class by its name")
@@ -136,7 +136,7 @@ def _check_settings(t: TaskUnderTest, model: dict[str, Any], options: dict[str, 
 
 
 def check_fields_conformance(t: TaskUnderTest) -> None:
-    """A field is rebuilt from its class and JSON-able settings with the same parameters; other settings are refused."""
+    """Check that a field rebuilt from its JSON settings has the same parameters, and unknown settings are refused."""
     for kind, field in zip(("density", "colour"), t.build_fields(), strict=True):
         name, settings = type(field).__name__, field.settings()
         listed = (t.task.fields or {}).get(name)
@@ -153,7 +153,7 @@ def check_fields_conformance(t: TaskUnderTest) -> None:
 
 
 def check_parameters_conformance(t: TaskUnderTest) -> None:
-    """Names of parameters are unique; shapes, rates and start values are valid and depend on nothing but the seed."""
+    """Check parameters: unique names, valid shapes and learning rates, start values that depend only on the seed."""
     taken = {s.name for s in GEOMETRY_SPECS}
     for kind, spec in t.parameter_specs():
         where = f"{kind}.parameters: {spec.name!r}"
@@ -178,7 +178,7 @@ def check_parameters_conformance(t: TaskUnderTest) -> None:
 
 
 def check_evaluation_conformance(t: TaskUnderTest) -> None:
-    """Metrics, facts, clips and layers of the task fit its example; its orbit has all conditions."""
+    """Check that the task's metrics, facts, clips and layers work on its example; orbit views have all conditions."""
     task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
     find_channels(task, data).display(data.test.pixels(0).over(data.background))
     before = {name: value.clone() for name, value in model.params.items()}
@@ -204,7 +204,7 @@ def check_evaluation_conformance(t: TaskUnderTest) -> None:
 
 
 def check_loss_conformance(t: TaskUnderTest) -> None:
-    """The loss is one finite number with a finite gradient, least where image and truth agree, also under a mask."""
+    """Check that the loss and its gradient are finite, also under a mask, and the loss is lower for the true image."""
     loss = t.task.loss(loss_settings(t.task, t.settings.train, t.options))
     pixels = t.dataset.train.pixels(0)
     frame = Supervision(t.dataset.train.view(0), pixels.mask, pixels.alpha)
@@ -226,7 +226,7 @@ def check_loss_conformance(t: TaskUnderTest) -> None:
 
 
 def check_channels_conformance(t: TaskUnderTest) -> None:
-    """Colours built for one and for five channels have as many, or ``build`` refuses such data."""
+    """Check data of one and of five channels: ``build`` returns a colour field with as many, or refuses the data."""
     if t.task.example is not None or t.task.channels:
         return  # only the task knows what data of other channels would look like, or there are no others
     declared = {}
@@ -251,7 +251,7 @@ def check_channels_conformance(t: TaskUnderTest) -> None:
 
 
 def check_resume_conformance(t: TaskUnderTest) -> None:
-    """2N steps equal N steps, a checkpoint on disk and N more steps, bit for bit."""
+    """Check resuming: N steps, a checkpoint on disk and N more steps equal 2N steps, bit for bit."""
     whole, first, second = (t.trainer(2 * _STEPS) for _ in range(3))
     for _ in range(_STEPS):
         whole.train_step()
@@ -270,7 +270,7 @@ def check_resume_conformance(t: TaskUnderTest) -> None:
 
 
 def check_save_load_conformance(t: TaskUnderTest) -> None:
-    """A saved model loads with equal bits and images; compressing it a second time changes nothing."""
+    """Check that a saved model loads with equal bits and images, and that compressing it again changes nothing."""
     model = t.perturbed_model(torch.float32)
     canonical = canonical_model(model)
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():
@@ -294,7 +294,7 @@ def check_save_load_conformance(t: TaskUnderTest) -> None:
 
 
 def check_conditions_conformance(t: TaskUnderTest) -> None:
-    """Each condition parses text and refuses nonsense, any value in its range draws, and a missing one is refused."""
+    """Check that conditions parse text, refuse other text, render over their range, and are required for rendering."""
     model = t.perturbed_model(torch.float32)
     view = t.views[0]
     for spec in t.task.conditions:
@@ -350,16 +350,16 @@ CHECKS: dict[str, Callable[[TaskUnderTest], None]] = {
     "save_load": check_save_load_conformance,
     "conditions": check_conditions_conformance,
 }
-"""Every check by name, in reading order."""
+"""All conformance checks by name, in reading order."""
 
 
 def named_checks(
     task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None
 ) -> dict[str, Callable[[], None]]:
-    """Return the checks of a task by name, as functions without arguments that raise :class:`ConformanceError`.
+    """Return the checks of a task by name. Each is a function without arguments that raises :class:`ConformanceError`.
 
     Args:
-        preset: preset with the settings of the models; None is the task's default.
+        preset: name of the preset for the models' settings; None is the task's default preset.
         model: changes to the model settings, e.g. ``{"neurons": 2, "density": {"form": "gaussian"}}``.
     """
     subject = TaskUnderTest(task, preset=preset, model=model)
@@ -400,7 +400,7 @@ def check_task(task: TaskSpec, preset: str | None = None, model: Mapping[str, An
 
 
 def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] | None = None) -> Any:
-    """Return a pytest decorator that runs a test once per check, passed as ``check``; see :func:`named_checks`."""
+    """Return a pytest decorator that runs a test function once per check, with the check as argument ``check``."""
     import pytest
 
     found = named_checks(task, preset, model)
@@ -408,7 +408,7 @@ def checks(task: TaskSpec, preset: str | None = None, model: Mapping[str, Any] |
 
 
 def _find_conformance_failure_line(error: BaseException) -> str:
-    """Return e.g. ``" in Waves.on_split (fields.py, line 12)"``, the innermost line of the task's own code, or ""."""
+    """Return the innermost line of the task's own code, e.g. ``" in Waves.on_split (fields.py, line 12)"``, or ""."""
     for frame, line in reversed(list(traceback.walk_tb(error.__traceback__))):
         module = str(frame.f_globals.get("__name__", ""))
         if not module.startswith(_NOT_THE_TASKS) and module.split(".")[0] not in _LIBRARIES:

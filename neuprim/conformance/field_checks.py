@@ -1,4 +1,4 @@
-"""Checks of fields: integrals, gradients, scaling, splitting and reductions."""
+"""Conformance checks of density and colour fields: integrals, gradients, scaling, splitting and reductions."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ from neuprim.core.train.population import SPLIT_LONG, SPLIT_OTHERS, SPLIT_SHIFT
 _RAYS = 6
 """Rays per primitive."""
 _STEPS = (1e-5, 1e-6)
-"""Steps of the finite differences: a pixel that flips at a silhouette differs only at one of them."""
+"""Step sizes of finite differences. A pixel that changes at a silhouette disturbs only one of them."""
 _MASS_EACH, _MASS_MEAN = 0.25, 0.05
-"""Relative error of the mass of one pair of children, and on average, where splits are not exact."""
+"""Tolerances of the children's mass if ``exact_split`` is False: relative error of one pair, and of the mean."""
 
 
 # ---------------------------------------------------------------- points and rays
@@ -34,7 +34,7 @@ def _active_rows_under_test(active: ActivePrimitives) -> Tensor:
 
 
 def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Tensor, ...]) -> tuple[Tensor, Tensor]:
-    """Integrate along chords by Gauss-Legendre quadrature on eight panels; also return the greatest |sigma|."""
+    """Integrate sigma along chords by Gauss-Legendre quadrature on eight intervals; also return the largest |sigma|."""
     o, d, t0, t1 = ray
     x, w = (torch.from_numpy(q) for q in np.polynomial.legendre.leggauss(16))
     nodes = ((x[None] + 1) / 2 + torch.arange(8)[:, None]).reshape(-1) / 8
@@ -47,7 +47,7 @@ def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Ten
 def conformance_points_inside(
     geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95
 ) -> Tensor:
-    """Draw (M, 3) float64 points, uniform in the ellipsoids of ``rows`` (M,) scaled by ``reach``."""
+    """Draw (M, 3) float64 points, one per entry of ``rows`` (M,), uniform in that ellipsoid scaled by ``reach``."""
     direction = _random_directions(len(rows), generator)
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     local = geometry.scales.double()[rows] * direction * radius
@@ -59,10 +59,10 @@ def _random_directions(count: int, generator: torch.Generator) -> Tensor:
 
 
 def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) -> tuple[Tensor, ...]:
-    """Draw a ray from outside through the ellipsoid of each of ``rows`` (M,).
+    """Draw M random rays; ray i starts outside the ellipsoid ``rows[i]`` and passes through it.
 
     Returns:
-        origins, directions, and both ends of the chord along the ray, float64.
+        origins (M, 3), directions (M, 3), and ray parameters (M,) of both ends of the chord, float64.
     """
     point = conformance_points_inside(geometry, rows, generator)
     d = _random_directions(len(rows), generator)
@@ -78,7 +78,7 @@ def random_chords(geometry: Geometry, rows: Tensor, generator: torch.Generator) 
 
 
 def check_activity_conformance(t: TaskUnderTest) -> None:
-    """Primitives that the density leaves out of a frame absorb nothing in it; active rows are in ascending order."""
+    """Check ``active_rows``: rows are in ascending order, and primitives not listed have no density in the frame."""
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(3)
     params = model.of(model.density)
@@ -97,7 +97,7 @@ def check_activity_conformance(t: TaskUnderTest) -> None:
 
 
 def check_integral_conformance(t: TaskUnderTest) -> None:
-    """Optical depths of the lowered density equal the integral of ``density`` along whole chords and parts of them."""
+    """Check that optical depths of ``density.lower`` equal integrals of ``density.density`` over (partial) chords."""
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(4)
     count = 0
@@ -130,7 +130,7 @@ def check_integral_conformance(t: TaskUnderTest) -> None:
 
 
 class _ShadingUnderTest(ColourField):
-    """A colour field with fixed shading: it has no gradient, so finite differences must not change it."""
+    """Colour field with constant shading. Shading has no gradient, so finite differences must not change it."""
 
     def __init__(self, model: Primitives, conditions: Conditions) -> None:
         self.colour, self.channels = model.colour, model.colour.channels
@@ -151,20 +151,20 @@ class _ShadingUnderTest(ColourField):
 
 
 def _leaf_parameters_under_test(model: Primitives) -> dict[str, Tensor]:
-    """Replace the model's parameters by leaves that collect gradients, and return them."""
+    """Replace the model's parameters by leaf tensors with ``requires_grad``, and return them."""
     model.params = {name: value.detach().clone().requires_grad_() for name, value in model.params.items()}
     return model.params
 
 
 def _conformance_objective(model: Primitives, view: View, seed: int) -> Tensor:
-    """Return a smooth scalar that depends on everything visible."""
+    """Return a smooth scalar of the rendered view: a random weighted sum of colours, plus the squared alphas."""
     out = render(model, view.camera, view.conditions, EXACT)
     weight = torch.rand(out.rgb.shape, generator=torch.Generator().manual_seed(seed), dtype=torch.float64) + 0.5
     return (out.rgb * weight).sum() + out.alpha.square().sum()
 
 
 def check_gradients_conformance(t: TaskUnderTest) -> None:
-    """Every parameter gets a gradient from some view, and gradients agree with finite differences in float64."""
+    """Check that every parameter has a gradient in some view, and that finite differences in float64 confirm it."""
     model = t.perturbed_model()
     params = _leaf_parameters_under_test(model)
     for i, view in enumerate(t.double_views):
@@ -214,7 +214,7 @@ def _compare_with_differences(t: TaskUnderTest, model: Primitives, view: View, n
 
 
 def check_scaling_conformance(t: TaskUnderTest) -> None:
-    """``scale_density`` multiplies the density by its factor, in tensors of its own."""
+    """Check that ``scale_density`` multiplies the density by its factor and returns new tensors."""
     model = t.perturbed_model()
     factor = torch.linspace(0.25, 2.0, model.count, dtype=torch.float64)
     own = model.of(model.density)
@@ -235,7 +235,7 @@ def check_scaling_conformance(t: TaskUnderTest) -> None:
 
 
 def check_split_conformance(t: TaskUnderTest) -> None:
-    """Children continue their parent's density inside themselves, or hold its mass where ``exact_split`` is False."""
+    """Check ``on_split``: children have their parent's density inside them, or its mass if not ``exact_split``."""
     model = t.perturbed_model()
     old, parents, colours = model.geometry, model.of(model.density), model.of(model.colour)
     axis = torch.nn.functional.one_hot(old.log_scales.argmax(-1), 3).double()
@@ -264,9 +264,9 @@ def check_split_conformance(t: TaskUnderTest) -> None:
 def _require_conforming_masses(
     t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]
 ) -> None:
-    """Require pairs of children to keep their parent's integral of |sigma|.
+    """Require that two children together have their parent's integral of |sigma|.
 
-    Where sigma varies, one pair may be off, the mean not.
+    The tolerance is larger for one pair than for the mean over all pairs, since sigma can vary within a primitive.
     """
     view = t.double_views[0]
     ball = 2 * torch.rand(4000, 3, generator=torch.Generator().manual_seed(8), dtype=torch.float64) - 1
@@ -292,7 +292,7 @@ def _require_conforming_masses(
 
 
 def check_reductions_conformance(t: TaskUnderTest) -> None:
-    """Every reduction gives a field of the task that has fewer parameters and renders."""
+    """Check that every reduction of a field returns a field of the task with fewer parameters that can be rendered."""
     model = t.perturbed_model(torch.float32)
     for kind, field in (("density", model.density), ("colour", model.colour)):
         for name, values in field.reductions().items():

@@ -1,4 +1,4 @@
-"""The task under test, and the models, data and trainers that checks build from it."""
+"""The task under test of the conformance checks, with models, data and trainers built from it."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ EXACT = RenderSettings(backend=REFERENCE, alpha_max=0.9999, alpha_min=0.0, trans
 
 
 class ConformanceError(AssertionError):
-    """A task breaks a rule of the interface; the message names task, check, place, and what was found and expected."""
+    """Error: a task violates the interface. The message has task, check and member, and what was found and expected."""
 
 
 class TaskUnderTest:
-    """One task with one choice of settings.
+    """A task with one choice of settings, as conformance checks use it.
 
     Args:
-        check: name of the check, for messages.
-        preset: whose model settings are used; None is the task's default.
-        model: changes to them by name, e.g. ``{"density": {"form": "gaussian"}}``.
+        check: name of the running check, for messages.
+        preset: name of the preset for the model settings; None is the task's default preset.
+        model: changes to these model settings by name, e.g. ``{"density": {"form": "gaussian"}}``.
     """
 
     def __init__(
@@ -51,34 +51,31 @@ class TaskUnderTest:
         self.task, self.check, self.preset, self.changes = task, check, preset, dict(model or {})
 
     def named(self, check: str) -> TaskUnderTest:
-        """Return a copy for another check; settings read from files are shared."""
+        """Return a copy for the check named ``check``; the copy shares the settings that were read from files."""
         other = copy(self)
         other.check = check
         return other
 
     def with_channels(self, channels: int) -> TaskUnderTest:
-        """Return a copy with a synthetic data set of this number of colour channels."""
+        """Return a copy whose data set is synthetic and has ``channels`` colour channels."""
         other = copy(self)
         other.dataset = conformance_dataset(self.task.conditions, channels)
         return other
 
     def require(self, ok: bool, where: str, found: object, expected: object) -> None:
-        """Raise :class:`ConformanceError` unless ``ok``."""
+        """Raise :class:`ConformanceError` unless ``ok``; the message has ``where``, ``found`` and ``expected``."""
         if not ok:
             raise ConformanceError(
                 f"task {self.task.name!r}: {self.check}: {where}: found {found}; expected {expected}"
             )
 
     def require_finite(self, where: str, value: Tensor | None) -> None:
-        """Raise :class:`ConformanceError` for NaN or infinity."""
+        """Raise :class:`ConformanceError` if ``value`` contains NaN or infinity."""
         ok = value is None or bool(torch.isfinite(value).all())
         self.require(ok, where, "NaN or infinity", "finite numbers")
 
     def require_layout(self, where: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-        """Raise :class:`ConformanceError` unless tensors are finite and of the expected layout.
-
-        The layout is names, dtypes and shapes.
-        """
+        """Raise :class:`ConformanceError` unless tensors are finite and have the expected names, dtypes and shapes."""
         self.require(set(found) == set(expected), where, f"tensors {sorted(found)}", sorted(expected))
         for name, value in expected.items():
             a, b = (f"{x.dtype} {tuple(x.shape)}" for x in (found[name], value))
@@ -86,7 +83,7 @@ class TaskUnderTest:
             self.require_finite(f"{where}: {name}", found[name])
 
     def require_close(self, where: str, found: Tensor, expected: Tensor, rows: Tensor) -> None:
-        """Raise :class:`ConformanceError` unless values of ``rows`` agree to 1e-6 of the largest."""
+        """Raise :class:`ConformanceError` unless found and expected values differ by at most 1e-6 of the largest."""
         if len(rows):
             error = (found - expected).abs() / expected.abs().max().clamp_min(1e-30)
             i = int(error.argmax())
@@ -94,13 +91,13 @@ class TaskUnderTest:
             self.require(float(error[i]) <= 1e-6, place, f"{float(found[i]):.6g}", f"{float(expected[i]):.6g}")
 
     def require_equal(self, where: str, found: Mapping[str, Tensor], expected: Mapping[str, Tensor]) -> None:
-        """Raise :class:`ConformanceError` unless tensors of the same names have equal bits."""
+        """Raise :class:`ConformanceError` unless found and expected tensors have the same names and equal bits."""
         for name in expected.keys() | found.keys():
             same = name in found and name in expected and torch.equal(found[name], expected[name])
             self.require(same, f"{where}: {name}", "different values", "equal bits")
 
     def draw(self, where: str, model: Primitives, view: View) -> Tensor:
-        """Render a view, (H, W, C); raise :class:`ConformanceError` unless it is finite."""
+        """Render a view to (H, W, C); raise :class:`ConformanceError` if the image is not finite."""
         try:
             rgb = render(model, view.camera, view.conditions, self.settings.renderer).rgb
         except NonFiniteError as error:
@@ -110,7 +107,7 @@ class TaskUnderTest:
 
     @cached_property
     def settings(self) -> RunSettings:
-        """The preset's settings with a few primitives and the reference backend."""
+        """Settings of the preset, with few primitives and the reference backend."""
         choice = read_task_config(self.task)
         found = preset_settings(self.task, self.preset or choice.preset, choice.scene)
         model = replace(found.model, **{"primitives": PRIMITIVES, **self.changes})
@@ -118,24 +115,24 @@ class TaskUnderTest:
 
     @cached_property
     def options(self) -> dict[str, Any]:
-        """The task's own options at their defaults."""
+        """Default values of the options that the task defines."""
         return read_task_config(self.task).options
 
     @cached_property
     def dataset(self) -> Dataset:
-        """The task's own example, or a synthetic one with the conditions and channels that it declares."""
+        """Example data set of the task, or a synthetic one with the conditions and channels that the task declares."""
         if self.task.example is not None:
             return self.task.example()
         return conformance_dataset(self.task.conditions, len(self.task.channels) or 3)
 
     @property
     def views(self) -> list[View]:
-        """The training views."""
+        """Training views of the data set."""
         return [self.dataset.train.view(i) for i in range(len(self.dataset.train))]
 
     @property
     def double_views(self) -> list[View]:
-        """The training views with camera and conditions in float64."""
+        """Training views of the data set, with camera and conditions in float64."""
         found = []
         for view in self.views:
             conditions = {k: v.double() if v.is_floating_point() else v for k, v in view.conditions.items()}
@@ -144,26 +141,26 @@ class TaskUnderTest:
         return found
 
     def build_fields(self) -> tuple[DensityField, ColourField]:
-        """Build fresh fields."""
+        """Build new density and colour fields."""
         return self.task.build(build_settings(self.task, self.settings.model, self.options), self.dataset)
 
     def parameter_specs(self) -> list[tuple[str, ParameterSpec]]:
-        """List ("density" or "colour", spec) of every parameter other than the geometry's."""
+        """List ("density" or "colour", spec) for every parameter of the two fields."""
         density, colour = self.build_fields()
         return [*(("density", s) for s in density.parameters()), *(("colour", s) for s in colour.parameters())]
 
     def lower_method(self, parameter: str) -> str:
-        """Return e.g. ``"density.lower: "``, the method through which the image depends on a parameter."""
+        """Return the method through which a parameter affects the image, for messages, e.g. ``"density.lower: "``."""
         kind = next((kind for kind, spec in self.parameter_specs() if spec.name == parameter), None)
         return "" if kind is None else f"{kind}.lower: "
 
     def initial_model(self, seed: int = 0) -> Primitives:
-        """Return the initial model of a run."""
+        """Return the initial model of a training run with this seed."""
         density, colour = self.build_fields()
         return initial_model_to_train(density, colour, self.dataset, self.settings.model, seed)
 
     def perturbed_model(self, dtype: torch.dtype = torch.float64) -> Primitives:
-        """Return a model whose parameters differ enough that nothing is zero or equal by chance."""
+        """Return a model with randomly perturbed parameters: none is zero, and no two are equal, by chance."""
         model = self.initial_model()
         generator = torch.Generator().manual_seed(11)
         for name, value in model.params.items():
@@ -175,7 +172,7 @@ class TaskUnderTest:
         return model
 
     def trainer(self, iterations: int) -> Trainer:
-        """Return a trainer of a fresh model whose population changes every second step."""
+        """Return a trainer of a new model, with population control every second step."""
         model, train = self.initial_model(), self.settings.train
         population = PopulationSettings(strategy="relocate", every=2, start=0.0, stop=1.0, fraction=0.2)
         rates = {name: rate for name, rate in train.rates.items() if name in model.params}
@@ -195,7 +192,7 @@ _NEAR_ZERO = 3.0
 
 
 def conformance_range(spec: ConditionSpec) -> tuple[float, float]:
-    """Return the part of a condition's range that checks draw from: at most 3 from zero if the range allows it."""
+    """Return the interval of a condition's range that checks draw from: within -3..3 if the range allows it."""
     low, high = max(spec.range[0], -_NEAR_ZERO), min(spec.range[1], _NEAR_ZERO)
     return (low, high) if low < high else spec.range
 
@@ -203,7 +200,7 @@ def conformance_range(spec: ConditionSpec) -> tuple[float, float]:
 def random_conformance_condition(
     spec: ConditionSpec, generator: torch.Generator, shape: tuple[int, ...] | None = None
 ) -> Tensor:
-    """Draw a float32 value of the condition's shape, uniform in :func:`conformance_range`."""
+    """Draw a float32 value of a condition, uniform in :func:`conformance_range`; default shape ``spec.shape``."""
     low, high = conformance_range(spec)
     return low + (high - low) * torch.rand(spec.shape if shape is None else shape, generator=generator)
 
@@ -225,9 +222,9 @@ class _ConformanceViews(ViewSet):
 
 
 def conformance_dataset(conditions: tuple[ConditionSpec, ...], channels: int = 3) -> Dataset:
-    """Make six training and two test views, 10 x 9 pixels, sRGB, of ellipsoids of constant density on grey.
+    """Make a data set of six training and two test views, 10 x 9 pixels, sRGB: ellipsoids of constant density on grey.
 
-    The conditions have random values, which the images do not depend on.
+    The conditions have random values; the images do not depend on them.
     """
     generator = torch.Generator().manual_seed(7)
     views = []

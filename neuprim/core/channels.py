@@ -30,8 +30,7 @@ class Channels:
     Attributes:
         names: one per channel, in the order of the tensors' last axis.
         color_space: colour space of the data set, "srgb" or "linear".
-        own: the task's display. None: three channels are red, green and blue, one is grey, and of others the first
-            three are shown.
+        own: the task's function for display, :attr:`TaskSpec.display <neuprim.core.task.TaskSpec.display>`, or None.
         task: name of the task, for messages.
     """
 
@@ -59,12 +58,12 @@ class Channels:
 
     @property
     def hides_channels(self) -> bool:
-        """Whether pictures show only some channels, because the task has no display."""
+        """Whether pictures show only some of the channels, because the task has no function for display."""
         return self.own is None and self.count not in (1, 3)
 
     @property
     def display_text(self) -> str:
-        """Text for the user on the channels that pictures show; empty for plain RGB or grey."""
+        """Text that tells users which channels the pictures show, and how; empty for plain RGB or grey."""
         if self.own is not None:
             return f"{self.name_list} through the display of task {self.task!r}"
         if self.names == default_exr_channel_names(self.count) and not self.hides_channels:
@@ -77,7 +76,7 @@ class Channels:
 
     @property
     def name_list(self) -> str:
-        """Names of the channels in one line; of more than 8, the first three and the last."""
+        """Names of the channels in one line; if there are more than 8, only the first three and the last."""
         if self.count <= _LISTED:
             return ", ".join(self.names)
         return f"{', '.join(self.names[:3])}, … {self.names[-1]} ({self.count} channels)"
@@ -89,10 +88,11 @@ class Channels:
     def display(self, image: Tensor) -> Tensor:
         """Convert an image (H, W, C) in the data set's colour space to display-referred sRGB (H, W, 3).
 
-        The task's own display ends in 0..1. Without one, linear values get the sRGB curve, and nothing is clamped at 1.
+        The task's function for display returns values in 0..1. Tasks without one: linear values get the sRGB curve, and
+        values are not clamped at 1.
 
         Raises:
-            ConfigError: the task's display returned something else.
+            ConfigError: the task's function for display returned something else.
         """
         if image.shape[-1] != self.count:
             raise ValueError(f"an image of shape {tuple(image.shape)} for {self.count} channels, {self.name_list}")
@@ -124,7 +124,8 @@ class Channels:
 
 
 def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
-    """Return the channels of a task's data set; raises DataError if their number or the background does not fit."""
+    """Return the channels of a task's data set; raises DataError if the data set has another number of channels than
+    the task, or a background that does not fit the channels."""
     if task.channels and len(task.channels) != dataset.channels:
         named = f"{len(task.channels)}, which task {task.name!r} names: {', '.join(task.channels)}"
         raise DataError(f"{dataset.name}: {dataset.channels} channels; expected {named}")
@@ -140,6 +141,7 @@ def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec,
 
     Args:
         where: the model's run directory, for messages.
+        header: the JSON header of the model file.
         count: channels of the model's colour.
 
     Raises:

@@ -1,8 +1,8 @@
 """Models and checkpoints on disk: safetensors with one JSON header. Nothing in a file is ever executed.
 
 A *model* holds what rendering needs and nothing else; a *checkpoint* holds the exact training state. A model may also
-be a compressed file (:mod:`neuprim.core.compression`). All readers of models accept both; the first bytes tell them
-apart.
+be a compressed file (:mod:`neuprim.core.compression`). All readers of models accept plain and compressed files, and
+recognise them by their first bytes.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     """Return the JSON header of a file of this kind, "model" or "checkpoint"; reads no tensor.
 
     Raises:
-        CheckpointError: missing, truncated, foreign or of another format version.
+        CheckpointError: the file is missing, truncated, of another program or of another format version.
     """
     if is_compressed(path):
         return _check_model_header(path, read_model_header(path), kind)
@@ -103,7 +103,7 @@ def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
 
 
 def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
-    """Return the shapes of all tensors of a file that is not compressed; reads none of them."""
+    """Return tensor name -> shape for a file that is not compressed; reads no tensor."""
     read_header(path, kind)
     with safe_open(str(path), framework="pt") as file:
         return {name: tuple(file.get_slice(name).get_shape()) for name in file.keys()}
@@ -112,7 +112,7 @@ def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
 def read_tensors(
     path: Path, kind: str, rows: Callable[[str, tuple[int, ...]], slice | None] = lambda name, shape: None
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return header and tensors. Memory is bounded by the file's true size: a header that claims more is refused.
+    """Return the JSON header and the tensors of a file; refuses headers that claim more data than the file has.
 
     Args:
         rows: (tensor name, shape) -> rows to read, None for all. Compressed files are read whole.
@@ -137,12 +137,12 @@ def read_tensors(
 
 
 def save_model(path: Path, model: Primitives, task: str, extra: Mapping[str, Any], without_zeros: bool = False) -> None:
-    """Write a model: all that rendering needs. The file is complete or absent.
+    """Write a model file, all that rendering needs. An interrupted write leaves no partial file.
 
     Args:
         task: name of the task.
         extra: JSON-able entries of the header: background, colour space, data source.
-        without_zeros: whether to store the fields' parameters sparsely where that is smaller, for pruned models.
+        without_zeros: whether to store parameters sparsely where that takes less space; for pruned models.
     """
     specs = (*model.density.parameters(), *model.colour.parameters()) if without_zeros else ()
     tensors, sparse = sparse_primitive_parameters(model.params, specs)
@@ -159,11 +159,11 @@ def save_compressed(
     bits: BitTable | Quantizers,
     config: str | None = None,
 ) -> dict[str, StoredSize]:
-    """Write a quantised model file, otherwise as :func:`save_model`; return the stored size of each parameter.
+    """Write a quantised model file; return the stored size of each parameter. Other arguments: :func:`save_model`.
 
     Args:
         bits: bits per parameter, or quantizers fitted to ``model``, which must then be a :func:`canonical_model`.
-        config: text of the run's ``config.yaml``, so that a run directory can be made of the file.
+        config: text of the run's ``config.yaml``, from which a run directory can be restored.
     """
     if isinstance(bits, BitTable):
         model = canonical_model(model)
@@ -179,7 +179,7 @@ def save_compressed(
 
 
 def checkpoint_config(path: Path) -> str | None:
-    """Return the text of the ``config.yaml`` in a compressed model; None where it has none."""
+    """Return the text of the ``config.yaml`` in a compressed model file; None if the file has none."""
     return read_compressed(path)[2]
 
 
@@ -202,7 +202,7 @@ def load_model_checkpoint(path: Path, task: TaskSpec) -> tuple[Primitives, dict[
     """Return the model in ``path`` and its header.
 
     Raises:
-        CheckpointError: the file is damaged or of another task, or its fields or tensors do not fit.
+        CheckpointError: the file is damaged or of another task, or its fields or tensors do not fit the task.
     """
     header = read_header(path, "model")
     if header.get("task") != task.name:

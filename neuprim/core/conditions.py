@@ -1,9 +1,9 @@
-"""Read the conditions of a task from text: one grammar for every command and exporter, and the check of their ranges.
+"""Read the conditions of a task, such as time or light, from command-line text, and check their ranges.
 
-A condition is given as ``--NAME TEXT`` or ``--NAME=TEXT``, with ``-`` or ``_`` inside its name. A condition that is
-one number accepts a number, a list ``A,B,C``, or a range ``FIRST:LAST`` or ``FIRST:LAST:COUNT``; each value is a frame,
-and :attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The task alone parses the
-text of any other condition, such as ``x,y,z`` or ``orbit`` for a light.
+Users write ``--NAME TEXT`` or ``--NAME=TEXT``, with ``-`` or ``_`` inside the name. A condition that is one number
+accepts a number, a list ``A,B,C``, or a range ``FIRST:LAST`` or ``FIRST:LAST:COUNT``. Each value is a frame, and
+:attr:`ConditionSpec.parse <neuprim.core.model.fields.ConditionSpec>` reads one number. The task alone parses the text
+of any other condition, such as ``x,y,z`` or ``orbit`` for a light.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def condition_flag(name: str) -> str:
 
 
 def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
-    """Return the name of the condition that ``word`` spells, with ``-`` or ``_``; None if there is none."""
+    """Return the name of the condition that ``word`` spells, with ``-`` or ``_``; None if no condition matches."""
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
@@ -95,12 +95,13 @@ def parse_frame_numbers(text: str) -> list[int]:
 def read_conditions(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], warn: Warn = _ignore_condition_warning
 ) -> dict[str, list[Tensor]]:
-    """Return name -> values, one per frame, of the conditions that were given, in the task's order.
+    """Parse the texts of conditions; return condition name -> values, one per frame, in the task's order.
 
     An animation without a number of frames, ``0:1`` or ``orbit``, takes the number of the other conditions.
 
     Args:
-        warn: called with one line for each condition beyond its range; strict conditions raise ConfigError instead.
+        texts: condition name -> text, for the conditions that the user gave.
+        warn: called with one line for each condition outside its range; strict conditions raise ConfigError instead.
     """
     given = [spec for spec in specs if spec.name in texts]
     said = {}
@@ -119,7 +120,10 @@ def read_conditions(
 
 
 def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
-    """Return the common number of frames; a single value holds in all frames, the other conditions must agree."""
+    """Return the number of frames that conditions have in common; a single value holds in all frames.
+
+    Raises ConfigError if two conditions have different numbers of frames.
+    """
     counts = {name: len(values) for name, values in found.items() if len(values) > 1}
     if len(set(counts.values())) > 1:
         each = " and ".join(
@@ -130,7 +134,7 @@ def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequenc
 
 
 def _condition_with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
-    """Return the text with ``count`` frames; None if it has a count already, or is a single value or a list."""
+    """Return the text of an animation with ``count`` frames; None if the text has a count, or is no animation."""
     if spec.shape:
         return spec.in_frames(text, count)
     found = _RANGE.fullmatch(text.strip())
@@ -150,7 +154,7 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
 
 
 def _read_condition_number_or_range(spec: ConditionSpec, text: str) -> list[Tensor]:
-    """Read one number or range; expand a range here if the task itself parses only numbers."""
+    """Read one number or range; a range that the task's ``parse`` refuses is expanded here."""
     try:
         return _condition_values_from_text(spec, text)
     except NeuprimError:
@@ -190,12 +194,15 @@ def _condition_values_from_text(spec: ConditionSpec, text: str) -> list[Tensor]:
 
 
 def _format_condition_number(number: float) -> str:
-    """Format a number as a user would: whole numbers without a point, others exactly."""
+    """Format a number as a user would: whole numbers without a point, all other numbers exactly."""
     return repr(number).removesuffix(".0")
 
 
 def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tensor], warn: Warn) -> None:
-    """Check every element; bounds are rounded to the dtype of the values, so that 0.3 lies within 0 to 0.3."""
+    """Check every element of a condition's values against its range.
+
+    Bounds are rounded to the dtype of the values, so that float32 0.3 lies within 0 to 0.3.
+    """
     low, high = spec.range
     shown = f"{condition_flag(spec.name)} {text}"
     for value in values:
@@ -222,7 +229,8 @@ def _first_where(value: Tensor, where: Tensor) -> float:
 def conditions_per_frame(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
 ) -> list[dict[str, Tensor]]:
-    """Return condition name -> value for each frame; all must be given, for one frame unless ``several``."""
+    """Return condition name -> value for each frame; raises ConfigError if a condition of ``specs`` has no text, or if
+    there are several frames and ``several`` is False."""
     for spec in specs:
         if spec.name not in texts:
             what = f"{condition_flag(spec.name)}: required, as the model depends on it ({spec.unit})"
@@ -237,7 +245,7 @@ def conditions_per_frame(
 
 
 def _example_condition_text(spec: ConditionSpec) -> str:
-    """Return an example text within the range, for messages."""
+    """Return an example of a text for a condition, within its range, for messages."""
     low, high = spec.range
     usual = 1.0 if spec.shape else 0.5
     value = usual if low <= usual <= high else (low + high) / 2

@@ -1,16 +1,16 @@
 """Environment maps: a latitude-longitude image of the light from all directions, and a few lights that approximate it.
 
-The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis; to the
-right of it, as seen from inside, directions turn clockwise about up. With up = +z: the middle column is +x, a quarter
-to its right -y, both edges -x, a quarter to its left +y (the convention of Blender's environment textures). Where up is
-another axis, the first horizontal axis is the scene's x, or y if x is up, made perpendicular to it; the second, a
-quarter to the left, is up x first. A rotation turns the light anticlockwise about up as seen from above: by 90 degrees,
-what came from +x comes from +y.
+The top row of the image is up, the bottom row down. The middle column looks along the first horizontal axis. From there
+to the right, directions turn clockwise about up, as seen from above. With up = +z, the middle column is +x, a quarter
+of the image to the right is -y, both edges are -x, and a quarter to the left is +y, as in Blender's environment
+textures. For another up, the first horizontal axis is the scene's x (y if x is up), made perpendicular to up; the
+second, a quarter to the left, is up x first. A rotation turns the light anticlockwise about up as seen from above:
+after 90 degrees, light that came from +x comes from +y.
 
-Directions are chosen by cutting the image into rectangles, each cut the one that most lowers the sum over all
-rectangles of the variance of direction weighted by energy (Viriyothai and Debevec 2009, "Variance minimization light
-probe sampling", in place of the median cut). A rectangle's light carries all of its energy, so the total per colour is
-the image's for any number of lights.
+Directions of lights are chosen by cutting the image into rectangles, one light each. Each cut is the one that most
+lowers the sum over all rectangles of the variance of direction weighted by energy (Viriyothai and Debevec 2009,
+"Variance minimization light probe sampling"; not the median cut). Each light carries the whole energy of its rectangle,
+so the total energy per colour is that of the image for any number of lights.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ class EnvironmentFile:
     samples: int = 64  # number of lights that approximate it
     rotation: float = 0.0  # degrees about the scene's upward direction
     scale: float = 1.0  # multiplies the radiance
-    guesses: bool = True  # whether light from directions without training data counts
+    guesses: bool = True  # whether to use light from directions without training data
 
 
 @dataclass(frozen=True)
 class DirectionalLights:
-    """Distant light from M directions."""
+    """M distant lights, each with parallel rays from one direction."""
 
     directions: Tensor  # (M, 3) float64 unit vectors towards where the light comes from, scene axes
     irradiance: Tensor  # (M, 3) float64 linear RGB on a surface that faces it: radiance times solid angle
@@ -57,14 +57,18 @@ class DirectionalLights:
 
 @dataclass(frozen=True)
 class Illumination:
-    """The frames whose sum is an image under an environment; what ``TaskSpec.environment`` returns."""
+    """Conditions of frames whose images add up to the image under an environment map.
 
-    conditions: tuple[dict[str, Tensor], ...]  # of each frame; they replace the view's conditions of the same names
+    ``TaskSpec.environment`` returns an ``Illumination``.
+    """
+
+    conditions: tuple[dict[str, Tensor], ...]  # per frame; they replace the view's conditions of the same names
     notes: tuple[str, ...] = ()  # one line each, for the user
     guessed: tuple[bool, ...] = ()  # whether the light of a frame has no training data nearby; empty if none has
 
     def frames(self, guesses: bool) -> tuple[dict[str, Tensor], ...]:
-        """Return the conditions of the frames; without ``guesses``, only of light near training data, perhaps none."""
+        """Return the conditions of each frame. Without ``guesses``, leave out frames whose light has no training data
+        nearby; the result may be empty."""
         if guesses or not any(self.guessed):
             return self.conditions
         return tuple(c for c, guess in zip(self.conditions, self.guessed, strict=True) if not guess)
@@ -94,13 +98,14 @@ class Environment:
 
     @property
     def irradiance(self) -> Tensor:
-        """Sum of radiance times solid angle over all directions, (3,) float64; 4 pi for a uniform radiance of 1."""
+        """Sum of radiance times solid angle over all directions, (3,) float64, without cosine: 4 pi for radiance 1."""
         return torch.from_numpy(self._flux.sum((0, 1)))
 
     def directional_lights(self, count: int) -> DirectionalLights:
         """Return at most ``count`` lights (1 to 4096) that together carry all energy of the image.
 
-        There are fewer if fewer cells of the image are bright, and none if it is black. Nothing is random.
+        There are fewer lights if fewer cells of the image are bright, and none if the image is black. The choice is
+        deterministic.
         """
         if not 1 <= count <= MAX_LIGHTS:
             raise ConfigError(f"{count} lights for an environment; expected 1 to {MAX_LIGHTS}")
@@ -117,7 +122,8 @@ class Environment:
         return DirectionalLights(*map(torch.from_numpy, arrays))
 
     def share_beyond(self, directions: Tensor, degrees: float) -> float:
-        """Return the share 0..1 of the luminance that is farther than ``degrees`` from all ``directions`` (D, 3)."""
+        """Return the fraction 0..1 of the luminance from directions more than ``degrees`` off all unit vectors
+        ``directions`` (D, 3)."""
         weight = self._flux @ _LUMINANCE
         total = float(weight.sum())
         if total == 0.0:
@@ -141,7 +147,8 @@ def read_environment(path: Path, up: Tensor | None = None, rotation: float = 0.0
         scale: factor on the radiance.
 
     Raises:
-        DataError: as :func:`neuprim.core.io.images.read_image`, and for another shape than 2:1 or negative values.
+        DataError: :func:`neuprim.core.io.images.read_image` refuses the file, the image is not 2:1, or a value is
+            negative.
     """
     info = image_info(path)
     if info.width != 2 * info.height:
@@ -166,7 +173,7 @@ def _environment_axes(up: Tensor) -> Array:
 
 
 def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
-    """Return two (R, C, 3) sums over blocks of texels: radiance times solid angle, its luminance times direction."""
+    """Return two (R, C, 3) sums over blocks of texels: radiance times solid angle; its luminance times direction."""
     height, width = radiance.shape[:2]
     block = -(-height // _ROWS)
     starts = np.arange(0, width, block)
@@ -228,7 +235,7 @@ def _direction_spread(sums: Array) -> Array:
 def _cut_environment_rectangle(
     table: Array, box: tuple[int, int, int, int], least: float
 ) -> list[tuple[int, int, int, int]]:
-    """Return the two parts of the best cut of ``box``; none if no cut lowers the spread by ``least``."""
+    """Return the two parts after the best cut of a rectangle; empty if no cut lowers the spread by ``least``."""
     r0, r1, c0, c1 = box
     whole = _sum_rectangle(table, box)
     best, parts = float(_direction_spread(whole)) - least, []

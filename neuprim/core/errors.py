@@ -1,8 +1,8 @@
-"""Errors a user can act on, and warnings.
+"""Errors that a user can correct, and warnings.
 
-The command line prints an error as one line and exits with status 2; anything else is a bug and keeps its traceback.
-A warning does not stop a command; it is one line, given once per process. It is a Python warning, so that notebooks and
-programs can filter it; the command line shows it on standard error.
+The command line prints such an error as one line and exits with status 2. Any other exception is a bug and keeps its
+traceback. A warning does not stop a command; each is one line, given once per process. Warnings are Python warnings, so
+that notebooks and programs can filter them; the command line shows them on standard error.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ DISK = (
 
 
 class NeuprimError(Exception):
-    """Base class of all errors that the user can correct; the text is the whole message."""
+    """Base class of all errors that the user can correct; the exception's text is the complete message."""
 
 
 class DataError(NeuprimError):
@@ -38,7 +38,7 @@ class ConfigError(NeuprimError):
 
 
 class CheckpointError(NeuprimError):
-    """A model or checkpoint file is damaged, foreign, or of another version or task."""
+    """A model or checkpoint file is damaged, or belongs to another program, version or task."""
 
 
 class BackendUnavailable(NeuprimError):
@@ -54,7 +54,7 @@ class DeviceMemoryError(NeuprimError):
 
 
 class RankError(NeuprimError):
-    """Another process of the same training ended, failed or differs.
+    """Another process of the same distributed training ended, failed, or differs from this one.
 
     Attributes:
         reported: whether another rank has reported the error.
@@ -75,7 +75,10 @@ def cut_error_text(text: str, most: int = 80) -> str:
 
 
 def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "") -> str:
-    """Return ``"; did you mean 'a' or 'b'?"`` of the closest names with their ``prefix``, or all if none is close."""
+    """Return the end of an error message that suggests the closest of ``choices``, ``"; did you mean 'a' or 'b'?"``.
+
+    Names get ``prefix`` in front. If no name is close, all are listed.
+    """
     options = sorted(set(choices))
     close = difflib.get_close_matches(name[:200], options, n=limit, cutoff=0.5)
     if close:
@@ -93,7 +96,7 @@ _FULL_GPU = (
 
 
 def one_line(error: BaseException) -> str | None:
-    """Return the one-line message of an error that a user can act on; None for a bug, which keeps its traceback."""
+    """Return the one-line message of an error that a user can correct; None for any other error, a bug."""
     if isinstance(error, NeuprimError):
         text = " ".join(str(error).split())
         return text if len(text) <= _HEAD + _TAIL else f"{text[:_HEAD]} ... {text[-_TAIL:]}"
@@ -106,7 +109,7 @@ def one_line(error: BaseException) -> str | None:
 
 
 class NeuprimWarning(UserWarning):
-    """A warning for the user that stops nothing; the text is the whole message."""
+    """A warning for the user, which does not stop the program; the warning's text is the complete message."""
 
 
 _said: set[str] = set()
@@ -121,7 +124,7 @@ def warn_once(text: str) -> None:
 
 @contextmanager
 def warnings_as_lines() -> Iterator[None]:
-    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error; leave others alone."""
+    """Print neuprim's warnings inside the block as ``neuprim: warning: ...`` on standard error; other warnings stay."""
     previous = warnings.showwarning
 
     def show(message: Warning | str, category: type[Warning], *place: Any, **more: Any) -> None:

@@ -36,7 +36,7 @@ class TrainedModel:
     Attributes:
         header: header of ``model.safetensors``: background, colour space, data source, iterations, ...
         dataset: loads the scene again; raises :class:`~neuprim.core.errors.DataError` if its files are gone.
-        volume: opens the voxel files of the scene, None for scenes without; raises as ``dataset``.
+        volume: opens the voxel files of the scene, or returns None for scenes without; raises as ``dataset`` does.
     """
 
     directory: Path  # directory of the run
@@ -50,7 +50,7 @@ class TrainedModel:
 
     @property
     def world(self) -> World:
-        """Transform between scene and world; exports are in coordinates of the world, those of the user's files."""
+        """Transform between scene and world coordinates; exports are in world coordinates, as the user's files are."""
         return World.of(self.header, str(self.directory))
 
     @property
@@ -64,8 +64,9 @@ class ExportJob:
     """One call of ``neuprim export``.
 
     Attributes:
-        out: file to write or folder to create, in a private folder; files next to it count, too. neuprim moves
-            everything to its place afterwards. An exporter need not handle ``--force``, and leaves nothing if it fails.
+        out: path of the file to write or folder to create, inside a temporary folder. If the export succeeds, neuprim
+            moves everything in the temporary folder to its destination. So exporters need not handle ``--force`` or
+            clean up after a failure.
         options: value of every option: the user's, as a number or boolean if it is one, or the default.
         conditions: condition name -> text, already checked; empty unless the exporter takes conditions.
         progress: function to call with (text, fraction 0..1).
@@ -82,7 +83,7 @@ class ExportJob:
 
         Args:
             several: whether more than one frame is allowed.
-            names: conditions that the export depends on; None for all of the task. Others are refused.
+            names: conditions that the export depends on; None: all of the task's. Other conditions are refused.
         """
         specs = [spec for spec in self.run.task.conditions if names is None or spec.name in names]
         for name in self.conditions:
@@ -114,9 +115,9 @@ class ExportReport:
     """Files that an exporter wrote, and what the format lost.
 
     Attributes:
-        files: files in order; each is :attr:`ExportJob.out`, in it, or next to it.
-        lossless: whether importing restores the model exactly.
-        errors: errors of the export against the model by name, e.g. ``{"psnr": 31.2}``; may be empty.
+        files: the files, in order; each is :attr:`ExportJob.out` itself, inside it, or next to it.
+        lossless: whether importing the files restores the model exactly.
+        errors: measured agreement of the export with the model, by name: ``{"psnr": 31.2}``; may be empty.
         notes: lines for the user: conventions, frames, what is left out.
     """
 
@@ -128,7 +129,7 @@ class ExportReport:
 
 @dataclass(frozen=True)
 class StoredModel:
-    """A model as a lossless format stores it; its values are unchecked."""
+    """A model as :attr:`Exporter.read` returns it from a file of a lossless format; its values are unchecked."""
 
     header: Mapping[str, Any]  # header of model.safetensors
     tensors: Mapping[str, np.ndarray]  # name -> (N, ...) float32 array
@@ -143,19 +144,20 @@ class Exporter:
         write: writes :attr:`ExportJob.out`; raises a :class:`~neuprim.core.errors.NeuprimError` for what the format
             cannot hold.
         options: option name -> (default, one line of help); shown by ``neuprim export --format NAME --help``.
-        read: for lossless formats, ``neuprim import``: reads what ``write`` wrote from an untrusted file; raises
-            :class:`~neuprim.core.errors.DataError`. It is chosen by the file's suffix, which is the exporter's name.
+        read: for lossless formats: the function of ``neuprim import``, which reads a file that ``write`` wrote. The
+            file is untrusted; raises :class:`~neuprim.core.errors.DataError`. ``neuprim import`` finds the exporter by
+            the file's suffix, which is the exporter's name.
         default: name of the file or folder in ``RUN_DIR/export``; "" for the exporter's name with the first suffix.
-        suffixes: allowed suffixes of its one file, e.g. ``(".glb", ".ply")``; other names and folders are refused.
-            Empty: any name, also of a folder.
+        suffixes: allowed suffixes, if the format is a single file: ``(".glb", ".ply")``; other names and folders are
+            refused. Empty: the user may give any name of a file or folder.
     """
 
-    api: int  # the API_VERSION it was written for
+    api: int  # the API_VERSION that the exporter was written for
     name: str  # what the user types after --format
     summary: str  # one line for help texts
     write: Callable[[ExportJob], ExportReport]
     options: Mapping[str, tuple[Any, str]] = field(default_factory=dict)
-    conditions: bool = False  # whether it accepts conditions of the task, such as --time 0.5
+    conditions: bool = False  # whether the exporter accepts conditions of the task, such as --time 0.5
     read: Callable[[Path], StoredModel] | None = None
     default: str = ""
     suffixes: tuple[str, ...] = ()
@@ -167,12 +169,12 @@ class Inspector:
 
     Attributes:
         layers: a :class:`~neuprim.inspect.field.InspectionFrame` -> a list of layers of :mod:`neuprim.inspect.layers`,
-            which windows, pictures, films and pages draw; called once per frame and panel.
+            called once per frame and panel. Windows, pictures, films and web pages draw these layers.
         shows: "sigma": the extinction on the frame's grid, with a second panel for the ground truth if there is one;
             "model": the primitives; "primitive": a single one, with its own camera; "both": needs the ground truth.
     """
 
-    api: int  # the API_VERSION it was written for
+    api: int  # the API_VERSION that the inspector was written for
     name: str  # what the user types after --show
     summary: str  # one line for help texts
     layers: Callable[[Any], Sequence[Any]]
@@ -183,7 +185,7 @@ class Inspector:
 class SceneExtension:
     """A scene for a task of another package; entry point ``TASK.SCENE`` of the group ``neuprim.scenes``."""
 
-    api: int  # the API_VERSION it was written for
+    api: int  # the API_VERSION that the scene was written for
     task: str  # name of the task
     scene: SceneSpec  # the scene
     config_package: str  # importable package with scene/TASK/NAME.yaml
@@ -195,12 +197,12 @@ class LossExtension:
 
     Attributes:
         make: (settings under ``train``, with the options of the loss as "options") -> the loss.
-        options: name -> (default, one line of help), typed as ``task.options.NAME``; as
+        options: name -> (default, one line of help), set by users as ``task.options.NAME``; the rules are those of
             :attr:`~neuprim.core.task.TaskSpec.options`.
         uses: the settings of :data:`neuprim.core.train.settings.OPTIONAL` under ``train`` that ``make`` reads.
     """
 
-    api: int  # the API_VERSION it was written for
+    api: int  # the API_VERSION that the loss was written for
     name: str  # what the user types after train.loss=
     summary: str  # one line for neuprim tasks
     make: Callable[[Mapping[str, Any]], Loss]

@@ -22,7 +22,10 @@ _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, fra
 
 
 def typical_light(dataset: Dataset, falloff: bool) -> float:
-    """Return the median intensity of the training views, over squared distance if ``falloff``; 1 if 0 or infinite."""
+    """Return the median light intensity of the training views; 1 if the median is 0 or infinite.
+
+    ``falloff`` divides each intensity by the squared distance of the light to the scene's centre.
+    """
     values = []
     for i in range(len(dataset.train)):
         conditions = dataset.train.view(i).conditions
@@ -33,7 +36,7 @@ def typical_light(dataset: Dataset, falloff: bool) -> float:
 
 
 def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]:
-    """Parse ``--light``: (3,) scene positions of "x,y,z" in world units, or "orbit[:DISTANCE:POLAR:FRAMES]".
+    """Parse ``--light`` to (3,) positions in scene units: "x,y,z" in world units, or "orbit[:DISTANCE:POLAR:FRAMES]".
 
     An orbit circles the upward direction of the scene, +z without a ``world``.
     """
@@ -61,7 +64,8 @@ def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]
 
 
 def light_orbit_in_frames(text: str, count: int) -> str | None:
-    """Return an orbit's text with a number of frames, ``"orbit:4:40:24"``; None unless it is an orbit without one."""
+    """Return the text of an orbit with ``count`` frames, ``"orbit:4:40:24"``; None unless ``text`` is an orbit without
+    a number of frames."""
     parts = text.split(":")
     if parts[0] != "orbit" or len(parts) > 3:
         return None
@@ -69,7 +73,7 @@ def light_orbit_in_frames(text: str, count: int) -> str | None:
 
 
 def parse_light_intensities(text: str) -> list[Tensor]:
-    """Parse ``--light-intensity``: (3,) float32 from "r,g,b" or one number, 0 or more."""
+    """Parse ``--light-intensity`` to (3,) float32: "r,g,b" or one number for all channels, each at least 0."""
     expected = "expected r,g,b or one number, 0 or more"
     found = _parse_light_numbers(
         f"{text},{text},{text}" if "," not in text else text, "light-intensity", expected
@@ -109,7 +113,8 @@ LIGHT_CONDITIONS = (
 
 
 def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: float) -> dict[str, Any]:
-    """Summarise lights (L, 3) for a model's header: mean distance, at most 256 directions, farthest-point sampled."""
+    """Summarise training lights (L, 3) for a model's header: mean distance and at most 256 directions, chosen by
+    farthest-point sampling."""
     offsets = lights.double() - center.double()
     distance = offsets.norm(dim=-1)
     units = offsets / distance.clamp_min(1e-30)[:, None]
@@ -128,13 +133,14 @@ def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: flo
 
 
 def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
-    """Approximate an environment by point lights like those of the training; a black one gives one of intensity 0.
+    """Approximate an environment by at most ``count`` point lights like those of the training.
 
-    Each direction becomes a light at the training lights' mean distance r, of the intensity that gives the centre the
+    Each direction becomes a light at the training lights' mean distance r. Its intensity gives the scene's centre the
     environment's irradiance E: exposure E r^2 with falloff inverse_square (the model draws I/distance^2 over the
-    exposure), exposure E with falloff irradiance (intensities are irradiances then), else exposure E / pi. Away from
-    the centre light differs from parallel light by about 2 offset/r.
-    ``facts``: entry "data" of the model's header; raises DataError if it is damaged.
+    exposure), exposure E with falloff irradiance (intensities are then irradiances), else exposure E / pi. At an offset
+    from the centre, the light differs from parallel light by about 2 offset/r. A black environment gives one light of
+    intensity 0.
+    ``facts``: entry "data" of the model's header; raises DataError if the entry is damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
     center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))

@@ -20,7 +20,7 @@ from neuprim.core.volumes.density_truth import DensityGridSource
 __all__ = ["API_VERSION", "Chunk", "Chunks", "Display", "Illuminate", "Loss", "SceneSpec", "Supervision", "TaskSpec"]
 
 API_VERSION = 1
-"""Version of the plugin interfaces in ``neuprim.core``; a plugin declares the version it was written for."""
+"""Version of the plugin interfaces in ``neuprim.core``; a plugin declares the version that it was written for."""
 
 
 @dataclass(frozen=True)
@@ -30,9 +30,9 @@ class Supervision:
     Attributes:
         view: name, camera and conditions of the view.
         mask: (H, W) bool of the pixels that count, None for all; where it is False, ``rendered`` equals ``truth``.
-        alpha: (H, W) coverage 0..1 of the true image, which is composited over the background of this step; None for
-            an opaque photograph.
-        progress: used fraction of the budget, 0..1.
+        alpha: (H, W) coverage 0..1 of the true image before it was composited over the background of this step; None
+            for an opaque photograph.
+        progress: used fraction of the training budget (steps or seconds), 0..1.
     """
 
     view: View
@@ -59,8 +59,8 @@ class Chunk:
 
     Attributes:
         settings: dotted key -> value of the settings that differ from the whole run: ``{"scene.span": "0:20"}``.
-        primitives: share of the primitives of the whole run; the shares of all chunks add up to 1.
-        steps: share of the steps of the whole run; the shares of all chunks add up to 1.
+        primitives: fraction of the primitives of the whole run; the fractions of all chunks add up to 1.
+        steps: fraction of the steps of the whole run; the fractions of all chunks add up to 1.
     """
 
     name: str  # name of the chunk, valid as the name of a folder
@@ -75,7 +75,7 @@ class Chunks:
 
     Attributes:
         parts: the chunks, two or more.
-        join: function (models of all parts, in their order, on the CPU) -> one model of the whole scene.
+        join: function (models of all chunks, in the order of ``parts``, on the CPU) -> one model of the whole scene.
     """
 
     parts: tuple[Chunk, ...]
@@ -92,7 +92,7 @@ class SceneSpec:
         load: (scene settings, context) -> Dataset; raises :class:`~neuprim.core.errors.DataError` for bad input.
         volume: for scenes of voxel files: (scene settings, context) -> the files; renders nothing.
         truth: for scenes that render their images frame by frame: (scene settings, context,
-            :attr:`~neuprim.core.data.dataset.DatasetImages.known` of another process or None) -> that work.
+            :attr:`~neuprim.core.data.dataset.DatasetImages.known` of another process or None) -> the images to render.
         chunks: for scenes with a setting ``chunks``: (configuration of the run by the keys of the command line,
             context) -> the chunks, or None if one run is better.
     """
@@ -110,46 +110,46 @@ class TaskSpec:
     """A task, built in or third party, registered under the entry-point group ``neuprim.tasks``.
 
     Attributes:
-        api: the :data:`API_VERSION` it was written for.
+        api: the :data:`API_VERSION` that the task was written for.
         name: what the user types after ``task=``.
         config_package: importable package with ``task/NAME.yaml``, ``scene/NAME/*.yaml`` and ``preset/NAME/*.yaml``.
-        build: (model settings, dataset) -> the density field and the colour field. Of the settings in
-            :data:`neuprim.core.train.settings.OPTIONAL` it gets those that ``uses`` lists, and the options of the task
-            as "options".
+        build: (model settings, dataset) -> the density field and the colour field. The model settings have the options
+            of the task as "options", and those settings in :data:`neuprim.core.train.settings.OPTIONAL` that ``uses``
+            lists.
         loss: (settings under ``train``, options of the task as "options") -> the loss; ``train.loss`` may replace it.
-        check: (what ``build`` gets) raises :class:`~neuprim.core.errors.ConfigError` for settings that the task does
-            not have, before any data is loaded.
+        check: (model settings, as for ``build``) raises :class:`~neuprim.core.errors.ConfigError` for settings that the
+            task does not have; called before any data is loaded.
         conditions: the conditions that the fields depend on, such as the time.
         fields: class name -> field class, so that a saved model can be rebuilt from its header.
         example: makes a tiny data set for :mod:`neuprim.conformance`, for tasks whose fields need more than posed
             images and conditions within their ranges. Images of about 10 x 10 pixels are enough.
         environment: how an environment map lights the scene (``neuprim render --environment``); None for tasks without
-            light. Images must be linear in it, and their opacity independent of it.
-        channels: names of the channels of its images, e.g. ``("450nm", "550nm")``; data sets with another number are
-            refused. Empty: R, G, B for three channels, Y for one, else c0, c1, ...
-        display: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, each pixel by itself.
-            None: three channels are red, green and blue, one is grey, and of others the first three are shown.
+            light. Images must be linear in the light, and their opacity independent of the light.
+        channels: names of the channels of the task's images, e.g. ``("450nm", "550nm")``; data sets with another number
+            of channels are refused. Empty: R, G, B for three channels, Y for one, else c0, c1, ...
+        display: (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, pixel by pixel. None:
+            three channels are shown as red, green and blue, one as grey; with other numbers, the first three are shown.
         layers: what ``neuprim render --format exr`` can write besides the layers of every task.
         options: name -> (default, one line of help) of the task's own settings under ``task.options``. Values are
             converted to the default's type, or to a third entry: ``Annotated[float, Range(0, 1)]``,
             ``("soft", "hard")`` (:mod:`neuprim.core.validation`). ``task/NAME.yaml`` may have other defaults.
         uses: the shared settings of :data:`neuprim.core.train.settings.OPTIONAL` that ``build`` (``model.…``) and
-            ``loss`` (``train.…``) read. Setting others is an error.
-        mask: (data set, index of a test view) -> (H, W) bool, the part of the view whose error is reported on its own,
-            or None.
+            ``loss`` (``train.…``) read. A user who sets any other of them gets an error.
+        mask: (data set, index of a test view) -> (H, W) bool, the part of the view whose error is also reported
+            separately, or None.
         metrics: (data set, index of a test view, rendered (H, W, C), truth (H, W, C)) -> further metrics by name, for
             each view and as means in ``metrics.json``. Images are in the data set's colour space over its background.
-            ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of the mean over views weighted by ``pixels_NAME``;
-            ``pixels_NAME`` becomes a sum; all others become plain means over the views that have them.
+            ``mse_NAME`` becomes ``psnr_pooled_NAME``, the PSNR of its mean over views, weighted by ``pixels_NAME``;
+            ``pixels_NAME`` becomes a sum; every other metric becomes a plain mean over the views that have it.
         diagnose: (data set, model) -> further JSON-able numbers for ``metrics.json``, such as errors against the
             ground truth of a volume.
         clips: films to make of test views or of other views of the data set.
         facts: JSON-able values that rendering needs without the data; stored in the model's header under "data",
             with "up" and "center".
         orbit: (data set, number of frames) -> views circling the scene, with every condition of the task.
-        tunable_settings: (what ``build`` gets) -> settings that trade quality for speed or size, with the values worth
-            training: ``{"model.neurons": (0, 2, 4, 8)}``. ``neuprim tradeoff task=NAME`` varies them, the number of
-            primitives and the length of training. Names begin with ``model.`` or ``task.options.``.
+        tunable_settings: (model settings, as for ``build``) -> settings that trade quality for speed or size, with the
+            values to try: ``{"model.neurons": (0, 2, 4, 8)}``. ``neuprim tradeoff task=NAME`` varies these settings,
+            the number of primitives and the length of training. Names begin with ``model.`` or ``task.options.``.
     """
 
     api: int
@@ -180,7 +180,7 @@ class TaskSpec:
     def parameter_names(self) -> set[str]:
         """Return the names of all parameters that the fields of the task can have.
 
-        Fields whose constructor requires settings are left out.
+        Fields whose constructor has required arguments are left out.
         """
         names = set()
         for cls in (self.fields or {}).values():

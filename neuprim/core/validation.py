@@ -1,4 +1,4 @@
-"""Settings, declared once on the fields of a dataclass with types, bounds and choices, and checked by one function.
+"""Check settings against a dataclass whose annotated fields declare their types, bounds and choices.
 
     @dataclass(frozen=True)
     class Waves:
@@ -54,10 +54,10 @@ class Range:
 
     at_least: float | None = None  # lowest value
     at_most: float | None = None  # highest value
-    above: float | None = None  # instead of at_least: a bound that is itself refused
-    below: float | None = None  # instead of at_most: a bound that is itself refused
+    above: float | None = None  # lower bound that is itself refused, instead of at_least
+    below: float | None = None  # upper bound that is itself refused, instead of at_most
     also: tuple[float, ...] = ()  # further values with a meaning of their own, e.g. 0 for "none"
-    says: str = ""  # what messages say is expected, if not only the bounds ("degrees from 1 to 120")
+    says: str = ""  # text of messages for the expected value ("degrees from 1 to 120"); empty: the bounds
 
     def accepts(self, value: Any) -> bool:
         return value in self.also or not (
@@ -85,16 +85,16 @@ class Range:
 
 
 def _format_bound(value: float | None) -> str:
-    """Format a bound for messages; empty for none."""
+    """Format a bound of a number for messages; empty if there is no bound."""
     return "" if value is None or math.isinf(value) else str(value) if isinstance(value, int) else f"{value:g}"
 
 
 @dataclass(frozen=True)
 class Accepts:
-    """Any other requirement on a value: ``Annotated[str, Accepts(str.islower, "lower-case text")]``."""
+    """Requirement on a setting's value, as a function: ``Annotated[str, Accepts(str.islower, "lower-case text")]``."""
 
     test: Callable[[Any], bool]  # test of the converted value
-    says: str  # what messages say is expected
+    says: str  # text of messages for the expected value
 
     def accepts(self, value: Any) -> bool:
         return self.test(value)
@@ -105,13 +105,13 @@ class Accepts:
 
 @dataclass(frozen=True)
 class Unbounded:
-    """Marker of a number for which every finite value has a meaning."""
+    """Annotation of a number without bounds: every finite value is valid."""
 
-    why: str  # the reason
+    why: str  # why the number has no bounds
 
 
 def nonempty_text(says: str) -> Accepts:
-    """Return the requirement of a non-empty text or path without NUL, which no file name can hold."""
+    """Return a requirement that accepts a non-empty text or path without NUL; ``says`` describes it in messages."""
     return Accepts(lambda value: bool(str(value)) and "\0" not in str(value), says)
 
 
@@ -119,7 +119,7 @@ def nonempty_text(says: str) -> Accepts:
 
 
 def validate_settings(cls: type[T], values: object, where: str = "") -> T:
-    """Return an instance of the settings dataclass ``cls``; its types are checked, and values converted.
+    """Return an instance of the settings dataclass ``cls`` with checked and converted ``values``.
 
     Args:
         values: field name -> value, as read from YAML or the command line; missing fields get their defaults.
@@ -148,12 +148,12 @@ def validate_settings(cls: type[T], values: object, where: str = "") -> T:
 
 
 def validate_choices(found: Mapping[str, Any], where: str, offered: Mapping[str, Any]) -> None:
-    """Raise ConfigError for a setting that is not offered, or a value that is not of its type.
+    """Raise ConfigError for a setting that is not in ``offered``, or whose value is not of the type given there.
 
     Args:
-        found: the settings of user and preset.
+        found: setting name -> value, as user and preset set them.
         where: dotted name of the group, for messages.
-        offered: name -> type, as on a settings dataclass, or a tuple of the allowed values.
+        offered: setting name -> annotated type, as on a settings dataclass, or a tuple of the allowed values.
     """
     validate_setting_names(found, offered, where)
     for key, value in found.items():
@@ -188,7 +188,7 @@ def validate_value(value: Any, hint: Any, where: str) -> Any:
 
 
 def infer_type_to_validate(default: Any) -> Any:
-    """Return the type of an option that is declared by its default alone; a default of null accepts anything."""
+    """Return the type of an option from its default value; a default of None accepts anything."""
     if default is None:
         return Any
     if isinstance(default, Mapping):
@@ -233,7 +233,7 @@ def join_setting_key(where: str, name: str) -> str:
 
 
 def format_setting_value(value: object) -> str:
-    """Return a value as users type it, cut if it is long; text that would parse as another type is quoted."""
+    """Return a value as users type it, shortened if long, and quoted if the text would parse as another type."""
     if value is None or isinstance(value, bool):
         return {None: "null", True: "true", False: "false"}[value]
     if not isinstance(value, str):
@@ -297,7 +297,7 @@ def _split_validation_type(hint: Any) -> tuple[Any, tuple[Any, ...]]:
 
 
 def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> Any:
-    """Return the value as the first of the types that accepts it."""
+    """Return the value, converted to the first type of a union that accepts it."""
     if value is None and type(None) in options:
         return None
     refused = []
@@ -350,7 +350,7 @@ def _validate_entries(value: Mapping[Any, Any], args: tuple[Any, ...], where: st
 
 
 def _validate_scalar(value: Any, kind: Any) -> Any:
-    """Return ``value`` as a ``kind``, or None if it is not one."""
+    """Return ``value`` converted to the type ``kind`` without loss, or None if that is impossible."""
     truth = isinstance(value, bool)
     if kind is bool:
         return value if truth else None

@@ -1,1 +1,1 @@
-"""The built-in formats of ``neuprim export``, registered in ``pyproject.toml`` like those of plugins."""
+"""The built-in file formats of ``neuprim export``. ``pyproject.toml`` registers them as entry points, like plugins."""

@@ -1,16 +1,21 @@
-"""``gaussian-ply``: one Gaussian per primitive in the layout of 3D Gaussian splatting, for its viewers; lossy.
+"""Export format ``gaussian-ply``: one Gaussian per primitive in the PLY layout of 3D Gaussian splatting (3DGS); lossy.
 
-Binary little-endian vertices of floats ``x y z nx ny nz f_dc_0..2 f_rest_0..44 opacity scale_0..2 rot_0..3``: centre in
-the coordinates of the run's data (``double x y z`` where float32 would lose more than 1e-4 of the scene's size, as in
-UTM), normals 0, SH coefficients of degree 3 (``f_rest`` channel by channel: 15 of red, 15 of green, 15 of blue), logit
-of the opacity, natural logarithm of the standard deviations, quaternion wxyz. :func:`fit_gaussians` fits them.
-Colours are those of the model in its own colour space; viewers show numbers as sRGB. A grey model is written as three
-equal channels; other channels than red, green and blue are refused. A model that depends on time or light is written
-under one value of each (``time=0.5``, ``light=1,2,3 light_intensity=10,10,10``); colours that are no harmonics are
-fitted by harmonics.
+The vertices are binary, little-endian, and consist of floats:
 
-The error is the PSNR of images of the fitted Gaussians, drawn as the 3DGS rasteriser draws them, against the model's
-own.
+* ``x y z``: centre in the coordinates of the run's data; ``double`` where float32 would lose more than 1e-4 of the
+  scene's size, as in UTM coordinates
+* ``nx ny nz``: 0
+* ``f_dc_0..2 f_rest_0..44``: SH coefficients of degree 3; ``f_rest`` has 15 of red, 15 of green, 15 of blue
+* ``opacity``: logit of the opacity
+* ``scale_0..2``: natural logarithm of the standard deviations
+* ``rot_0..3``: quaternion wxyz
+
+:func:`fit_gaussians` fits the Gaussians. Colours stay in the model's colour space, but viewers show them as sRGB. A
+grey model is written as three equal channels. Models with channels other than red, green and blue are refused. A model
+that depends on time or light is exported for one time and light (``time=0.5``, ``light=1,2,3
+light_intensity=10,10,10``). Colours that are no spherical harmonics are approximated by spherical harmonics.
+
+The reported error is a PSNR: images of the Gaussians, drawn as the 3DGS rasteriser does, against the model's images.
 """
 
 from __future__ import annotations
@@ -114,7 +119,7 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
 
 
 def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: World) -> np.ndarray:
-    """Return the vertices in the world of the user's files; centres are doubles if floats would lose digits."""
+    """Return PLY vertices in the coordinates of the user's data; centres are double where float32 is too coarse."""
     gaussians, colours = gaussians.to_scene(world.inverse), colours.rotate(world.inverse.rotation)
     scales, quats = gaussians.axes()
     opacity = gaussians.opacities.numpy()
@@ -134,7 +139,7 @@ def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: Wo
 def _draw_export_images(
     job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]
 ) -> tuple[list[tuple[View, Tensor]], str]:
-    """Render the model, red, green and blue, from the comparison views; also return their description."""
+    """Render the model's red, green and blue for the PSNR; return (view, image) pairs and the views' description."""
     run = job.run
     views, what = choose_export_views(job, which, conditions)
     background, images = _export_background(job), []
@@ -169,12 +174,13 @@ def _export_background(job: ExportJob) -> Tensor:
 
 @dataclass(frozen=True)
 class Gaussians:
-    """M Gaussians; float64.
+    """M 3D Gaussians, fitted to primitives; float64.
 
     Attributes:
-        means: (M, 3), covariances: (M, 3, 3), scene units.
-        opacities: (M,) alpha at the middle of the footprint, 0..1.
-        rows: (M,) which of the active primitives each stands for.
+        means: (M, 3), scene units.
+        covariances: (M, 3, 3), squared scene units.
+        opacities: (M,) alpha at the centre of the projected Gaussian, 0..1.
+        rows: (M,) for each Gaussian, the index of its primitive among the active ones.
     """
 
     means: Tensor
@@ -183,14 +189,14 @@ class Gaussians:
     rows: Tensor
 
     def to_scene(self, world: World) -> Gaussians:
-        """Return these Gaussians, given in the world of ``world``, in coordinates of its scene."""
+        """Transform these Gaussians from world coordinates to the scene coordinates of ``world``."""
         if world.identity:
             return self
         linear = world.scene_from_world[:3, :3]
         return replace(self, means=world.scene_points(self.means), covariances=linear @ self.covariances @ linear.T)
 
     def axes(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return (M, 3) standard deviations and (M, 4) quaternions wxyz of the axes."""
+        """Return (M, 3) standard deviations along the principal axes, and (M, 4) quaternions wxyz of these axes."""
         values, vectors = np.linalg.eigh(self.covariances.numpy())
         vectors[np.linalg.det(vectors) < 0, :, 0] *= -1
         quats = Rotation.from_matrix(vectors).as_quat()[:, [3, 0, 1, 2]] if len(values) else np.zeros((0, 4))
@@ -198,14 +204,19 @@ class Gaussians:
 
 
 def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gaussians:
-    """Fit one Gaussian to each primitive that absorbs anything.
+    """Fit one Gaussian to each primitive of a model that absorbs light under the given conditions.
 
-    Quadrature on the ellipsoid gives mean and covariance of rho = max(0, sigma). The opacity is the mean over the
-    ellipsoid's three axes of 1 - exp(-tau), tau the integral of rho along the axis' ray through that mean. This is
-    ``size="moments"``. A 3DGS footprint is a bell, opacity x exp(-d^2/2) on the screen, while an opaque primitive is
-    flat with an edge. The other sizes therefore scale the covariance. "footprint": both cover the same area, the mean
-    over the axes of the integral of alpha across the screen. "profile": the bell is closest to alpha, by least squares
-    over the three axes' screens, among bells whose opacity makes up the area.
+    ``size`` chooses the method:
+
+    * "moments": The Gaussian has the mean and the covariance of rho = max(0, sigma), by quadrature in the ellipsoid.
+      Its opacity is 1 - exp(-tau), averaged over the three axes of the ellipsoid. tau is the integral of rho along a
+      line through the mean, parallel to the axis.
+    * "footprint": As "moments", but the covariance is scaled. The Gaussian's projected alpha, opacity x exp(-d^2/2),
+      then has the same integral over the image as the primitive's alpha, on average over views along the three axes.
+    * "profile": The scale of the covariance and the opacity minimise the squared difference of the two alphas over the
+      images along the three axes. For each scale, the opacity preserves the integral of alpha, but is at most 0.99.
+
+    The scale matters because the alpha of an opaque primitive is flat with an edge, unlike a Gaussian.
     """
     model = run.model
     with torch.no_grad():
@@ -266,10 +277,11 @@ def _fit_gaussian_chunk(
 def _fit_gaussian_ply_profile(
     screens: Sequence[tuple[Tensor, ...]], areas: Tensor, bells: Tensor, ticks: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return (n,) factors on the covariance and (n,) opacities of the bells closest to three screens.
+    """Fit size="profile" of :func:`fit_gaussians`: return (n,) factors on the covariance, and (n,) opacities.
 
-    A screen is (alpha, covariance, mean, area). For each factor, the opacity keeps the integral of alpha, at most 0.99.
-    The factor with the least squared error wins; a bell's part outside of the screen is known in closed form.
+    Each of the three ``screens`` is a projection of n primitives along an axis: (alpha, covariance, mean, area). The
+    fit tries every factor, with the opacity that preserves the integral of alpha, at most 0.99. The factor with the
+    least squared error wins. The error includes the Gaussian's part outside of the image, in closed form.
     """
     step = ticks[1] - ticks[0]
     weights = torch.stack([screen[3] for screen in screens])
@@ -294,12 +306,12 @@ def _fit_gaussian_ply_profile(
 def draw_exported_gaussians(
     gaussians: Gaussians, colours: ExportHarmonics, camera: Camera, background: Tensor
 ) -> Tensor:
-    """Draw a (H, W, 3) float32 image as the 3DGS rasteriser does, in float64.
+    """Draw Gaussians as the 3DGS rasteriser does, but in float64; return a (H, W, 3) float32 image.
 
-    Projection by its local affine approximation (EWA), 0.3 square pixels of blur, alpha = min(0.99, opacity
-    exp(-d^2/2)), pairs below 1/255 skipped, front to back by the depth of centres, stop before the transmittance falls
-    below 1e-4; Gaussians nearer than 0.2 are left out. Unlike in 3DGS, a footprint ends where alpha is 1/255, not at
-    the tile around three standard deviations.
+    Gaussians are projected by a local affine approximation (EWA) and blurred by 0.3 square pixels. In a pixel, alpha is
+    min(0.99, opacity exp(-d^2/2)); Gaussians with alpha below 1/255 are skipped. Compositing is front to back by the
+    depth of centres, and stops before the transmittance falls below 1e-4. Gaussians nearer than 0.2 are left out.
+    Unlike in 3DGS, a footprint ends where alpha is 1/255, not at the tile around three standard deviations.
     """
     view = camera.viewmat.double()
     W, t = view[:3, :3], gaussians.means @ view[:3, :3].T + view[:3, 3]

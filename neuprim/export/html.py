@@ -1,10 +1,12 @@
-"""``html``: the model as one web page that draws it with WebGL2; lossy unless ``level`` is 0.
+"""Export format ``html``: one web page that draws the model with WebGL2; lossy unless ``level`` is 0.
 
 The page works in any browser with WebGL2 and needs no network and no server. It draws every primitive over its exact
-silhouette with the closed form of its chord, in float32, front to back in the order of centres: the image of
-``renderer.sort=center`` with one ray a pixel and ``transmittance_min`` at 0. ``level`` is that of ``neuprim compress``,
-1 to 5; 0 keeps every bit. The error is the PSNR of the page's model against the model, on the page's own views, drawn
-by the run's backend. Held-out views need the scene's data.
+silhouette and integrates the density along rays in closed form, in float32. Primitives are composited front to back in
+the order of their centres. The image is that of ``renderer.sort=center`` with one ray per pixel and
+``transmittance_min`` at 0. ``level`` 1 to 5 compresses the model as ``neuprim compress`` does; 0 preserves every bit.
+
+The reported error is a PSNR: images of the compressed model against images of the run's model. The run's backend draws
+both, on the page's views. The page can offer held-out views only if the scene's data can be read.
 """
 
 from __future__ import annotations
@@ -79,7 +81,7 @@ def _write_html_export(job: ExportJob) -> ExportReport:
 
 
 def _load_html_export_views(job: ExportJob, limit: int) -> tuple[list[PageView], list[str]]:
-    """Return held-out views, or the reason why there are none."""
+    """Load at most ``limit`` held-out views for the page; return them, and a note that says why there are none."""
     if limit == 0:
         return [], []
     job.progress("reading the scene", 0.0)
@@ -102,7 +104,7 @@ def _make_html_export_draw(run: TrainedModel) -> DrawView:
 def _measure_html_export_psnr(
     job: ExportJob, stored: Primitives, views: Sequence[PageView], conditions: Mapping[str, Tensor]
 ) -> float:
-    """Return the PSNR over some views of the page, or over an orbit if it has none, dB."""
+    """Return the PSNR in dB of the ``stored`` model against the run's model, over page views or else an orbit."""
     model = job.run.model
     if not views and not model.active(conditions).geometry.count:
         return math.inf  # both images are the background

@@ -1,17 +1,18 @@
-"""``npz`` and ``ply``: every parameter of the model, bit for bit; lossless, ``neuprim import`` reads both back.
+"""Export formats ``npz`` and ``ply``: every parameter of the model, bit for bit. ``neuprim import`` reads both.
 
-Both hold a header of JSON: the model's header (task, field classes and their settings, background, colour space, where
-"world" has ``scene_from_world`` if the parameters are in other coordinates than the run's data), the shapes of the
-parameters and the text of the run's ``config.yaml``, paths to its data included.
+Both formats contain a JSON header. It has three parts: the model's header (task, field classes and their settings,
+background, colour space), the shapes of the parameters, and the text of the run's ``config.yaml``, which includes paths
+to the data. If the parameters are not in the coordinates of the run's data, "world" in the model's header has
+``scene_from_world``.
 
-``npz``: ``numpy.load(FILE, allow_pickle=False)`` gives one float32 array (N, ...) per parameter under its own name, and
-the text ``header``.
+``npz``: ``numpy.load(FILE, allow_pickle=False)`` gives one float32 array (N, ...) per parameter under the parameter's
+name, and the text ``header``.
 
-``ply``: binary little-endian, one vertex per primitive. Properties: ``x y z``, the centres in the coordinates of the
-run's data, ``double`` where these differ from the model's own; then, all ``float`` and in the model's own coordinates,
-every number of every parameter as stored (logarithms of semi-axes, unnormalised quaternions wxyz, SH coefficients),
-named PARAMETER_INDEX with the index counted row by row: ``means_0`` to ``means_2``, ``W1_0`` to ``W1_23``. The header
-is one line ``comment neuprim {...}``.
+``ply``: binary little-endian, one vertex per primitive. The first properties are ``x y z``, the centre in the
+coordinates of the run's data, ``double`` where these differ from the model's coordinates. Then come all parameters as
+stored, ``float``, in the model's coordinates: logarithms of semi-axes, unnormalised quaternions wxyz, SH coefficients.
+Their names are PARAMETER_INDEX, and the index counts row by row: ``means_0`` to ``means_2``, ``W1_0`` to ``W1_23``. The
+header is one line ``comment neuprim {...}``.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def _pack_export_header(job: ExportJob) -> str:
 
 
 def _unpack_export_header(text: str, path: Path) -> tuple[dict[str, Any], dict[str, tuple[int, ...]], str]:
-    """Read model header, parameter shapes and configuration from an untrusted :func:`_pack_export_header` line."""
+    """Parse an untrusted line of :func:`_pack_export_header`: model header, parameter shapes, configuration."""
     try:
         record = load_json(text)
     except (ValueError, RecursionError) as error:
@@ -110,7 +111,7 @@ def _read_npz_export(path: Path) -> StoredModel:
 
 
 def _read_npz_export_array(archive: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, limit: int) -> np.ndarray:
-    """Read one array. A size beyond ``limit`` bytes, packed or not, is refused before memory is allocated."""
+    """Read one array of an .npz file; refuse more than ``limit`` bytes before memory is allocated."""
     if entry.file_size > limit + _ARRAY_HEADER:
         raise DataError(f"{path}: {entry.filename} claims {entry.file_size} bytes; expected at most {limit}")
     with archive.open(entry) as file:

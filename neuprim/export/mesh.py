@@ -1,17 +1,19 @@
-"""``mesh``: the surface where the density passes a level, with vertex colours, as .glb, .ply or .obj; lossy.
+"""Export format ``mesh``: an isosurface of the density with vertex colours, as .glb, .ply or .obj; lossy.
 
-The density is sampled on a lattice of ``grid`` voxels along the longest side, blurred by ``smooth`` voxels (primitives
-end in a step, which would leave stairs), and contoured by VTK's flying edges (Schroeder et al. 2015). The default level
-is that of :func:`find_export_surface_level`. Pieces with less than ``keep`` of the largest piece's area are left out.
+The density is sampled on a grid of ``grid`` voxels along the longest side. It is blurred by ``smooth`` voxels, because
+the hard edges of primitives would leave stairs. VTK's flying edges (Schroeder et al. 2015) extract the isosurface. The
+default level is that of :func:`find_export_surface_level`. Connected components whose area is less than ``keep`` times
+the largest one's are left out.
 
-A vertex has the mean colour of the primitives around it, weighted by their density there, seen from outside along its
-normal. Coordinates are those of the run's data. A .glb is turned from z up to glTF's y up, unless the data are y up
-already; its readers turn it back. Far from the origin, a .glb has the offset in its node, as its vertices are float32,
-and a .ply has ``double x y z``. Colours are sRGB in .ply and .obj and linear in .glb, as glTF wants them.
-They are what the task's display shows, or red, green and blue, or grey. Other channels are refused.
+A vertex has the mean colour of the primitives around it, weighted by their density, seen from outside along its normal.
+The colours are what the task's display shows, or red, green and blue, or grey. Other channels are refused. Colours are
+sRGB in .ply and .obj, and linear in .glb, as glTF requires.
 
-The error is the intersection over union of silhouettes against where the model's alpha passes one half, over views of
-an orbit.
+Coordinates are those of the run's data. A .glb is rotated from z up to glTF's y up, unless the data have y up. Far from
+the origin, a .glb stores the offset in its node, since its vertices are float32, and a .ply has ``double x y z``.
+
+The reported error is the intersection over union of silhouettes over an orbit: the mesh's silhouette against the
+pixels where the model's alpha exceeds one half.
 """
 
 from __future__ import annotations
@@ -120,7 +122,7 @@ def _write_mesh(job: ExportJob) -> ExportReport:
 
 
 def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the extinction on a lattice with an empty border; return it and (4, 4) scene_from_index."""
+    """Sample the model's extinction on a grid with an empty border; return the grid and (4, 4) scene_from_index."""
     low, high = (v.numpy() for v in find_export_box(job, [conditions]))
     step = float((high - low).max()) / count
     shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
@@ -134,14 +136,15 @@ def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int)
 
 
 def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
-    """Find the level whose surface best matches the opaque parts.
+    """Find the extinction whose isosurface best matches the opaque regions of a grid.
 
-    Columns of voxels along all three axes count. A column agrees if its densest voxel passes the level exactly when it
-    is more than half opaque, an optical depth of ln 2. If nothing is half opaque, half of the largest optical depth
-    replaces ln 2.
+    The level maximises the number of matching columns of voxels, along all three axes. A column matches if both or
+    neither of two conditions hold: its largest extinction exceeds the level, and its optical depth exceeds ln 2, i.e.
+    it is more than half opaque. If no column is half opaque, half of the largest optical depth replaces ln 2.
 
     Args:
-        sigma: (X, Y, Z) extinction, 1/scene unit; step: edge of a voxel, scene units.
+        sigma: (X, Y, Z) extinction, 1/scene unit.
+        step: edge of a voxel, scene units.
     """
     depths = np.concatenate([(sigma.sum(a, dtype=np.float64) * step).ravel() for a in range(3)])
     peaks = np.concatenate([sigma.max(a).ravel() for a in range(3)]).astype(np.float64)
@@ -157,7 +160,7 @@ def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
 
 
 def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
-    """Drop pieces of less than ``keep`` of the largest one's area; return the mesh and the number of dropped pieces."""
+    """Drop components below ``keep`` times the largest one's area; return the mesh and the number dropped."""
     import trimesh
 
     if keep <= 0:
@@ -175,7 +178,7 @@ def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 def _exported_vertex_colours(
     job: ExportJob, conditions: Conditions, colours: ExportHarmonics, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Return (V, C) colours of the primitives around each point, weighted by density, or of the nearest primitive."""
+    """Return (V, C) colours at mesh vertices: the density-weighted mean of primitives there, or else the nearest."""
     with torch.no_grad():
         active = job.run.model.active(conditions)
         moved = active.geometry
@@ -228,7 +231,7 @@ def _save_mesh(mesh: Any, colours: Tensor, space: str, path: Path, up: str, worl
 
 
 def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
-    """Export the mesh moved by ``offset`` (3,) float64 without rounding its vertices to float32 of the offset."""
+    """Export the mesh translated by ``offset`` (3,) float64, without the rounding of large float32 coordinates."""
     import trimesh
 
     if suffix == ".glb":

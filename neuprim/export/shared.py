@@ -1,4 +1,4 @@
-"""Helpers of several formats: colours as harmonics, a model's box, and cameras for comparisons."""
+"""Helpers shared by export formats: colours as spherical harmonics, a model's bounding box, comparison views."""
 
 from __future__ import annotations
 
@@ -22,10 +22,13 @@ _VIEWS, _SIZE = 8, 160
 
 
 class ExportHarmonics:
-    """Colours max(0, SH(direction) + 1/2) of the primitives that are active under some conditions.
+    """Colours of M primitives as spherical harmonics of the direction of view: max(0, SH(direction) + 1/2).
+
+    The primitives are those that are active under some conditions.
 
     Attributes:
-        dc: (M, C), rest: (M, 15, C) float64 coefficients in the order and signs of 3D Gaussian splatting.
+        dc: (M, C) float64 coefficients of degree 0, in the convention of 3D Gaussian splatting.
+        rest: (M, 15, C) float64 coefficients of degrees 1 to 3, in the same convention.
         residual: RMS error of the fit over directions and primitives; 0.0 if the model's colours are harmonics.
     """
 
@@ -43,7 +46,7 @@ class ExportHarmonics:
         return (mixed + 0.5).clamp_min(0.0)
 
     def rotate(self, rotation: Tensor | None) -> ExportHarmonics:
-        """Return the same colours on axes rotated by ``rotation`` (3, 3). This is exact, band by band."""
+        """Return these colours after a rotation of the axes by ``rotation`` (3, 3); exact in each SH band."""
         if rotation is None:
             return self
         directions = fibonacci_sphere(_DIRECTIONS)
@@ -52,16 +55,16 @@ class ExportHarmonics:
         return ExportHarmonics(self.dc, rest, self.residual)
 
     def select_channels(self, channels: tuple[int, ...]) -> ExportHarmonics:
-        """Return the harmonics of these channels only, in this order."""
+        """Return the harmonics of the given channels only, in the given order."""
         index = list(channels)
         return ExportHarmonics(self.dc[:, index], self.rest[:, :, index], self.residual)
 
 
 def find_export_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
-    """Find which of the model's channels are red, green and blue; a grey one is all three.
+    """Return the indices of a model's red, green and blue channels; the single channel of a grey model three times.
 
     Raises:
-        ConfigError: there are none; ``hint`` says what else the format would take.
+        ConfigError: the model has no such channels; ``hint`` is inserted into the message.
     """
     channels = run.channels
     if channels.rgb is None:
@@ -72,13 +75,13 @@ def find_export_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, in
 
 
 def fit_export_harmonics(run: TrainedModel, conditions: Conditions) -> ExportHarmonics:
-    """Return a model's colours under some conditions as harmonics.
+    """Return a model's colours under some conditions as spherical harmonics.
 
-    They are exact if the colour field is made of harmonics. Else degree 3 is fitted by least squares to the colours at
-    the primitives' centres, seen from 64 directions far away.
+    The result is exact if the colour field consists of spherical harmonics. Otherwise, degree 3 is fitted by least
+    squares to the colours at the primitives' centres, seen from 64 directions far away.
 
     Raises:
-        ConfigError: the colours have no value per primitive.
+        ConfigError: the colour field does not give one colour per primitive.
     """
     model = run.model
     with torch.no_grad():
@@ -95,7 +98,7 @@ def fit_export_harmonics(run: TrainedModel, conditions: Conditions) -> ExportHar
 
 
 def _export_colours_from_afar(run: TrainedModel, conditions: Conditions, direction: Tensor) -> Tensor:
-    """Return (M, C) float64 colours at the primitives' centres, all seen along one direction."""
+    """Return (M, C) float64 colours at the primitives' centres, all seen from far away along one direction."""
     means = run.model.params["means"].double()
     middle = means.mean(0)
     reach = float((means - middle).norm(dim=-1).max()) + 1.0
@@ -118,7 +121,7 @@ def fibonacci_sphere(count: int) -> Tensor:
 
 
 def choose_export_views(job: ExportJob, which: str, conditions: Conditions) -> tuple[list[View], str]:
-    """Choose at most eight views under the given conditions, and say what they are.
+    """Choose at most eight views to compare an export with its model; return the views and their description.
 
     Args:
         which: "test" cameras of the scene, an "orbit" of the model, or "auto": test cameras for models without
@@ -144,10 +147,10 @@ def choose_export_views(job: ExportJob, which: str, conditions: Conditions) -> t
 
 
 def find_export_box(job: ExportJob, frames: Sequence[Conditions]) -> tuple[Tensor, Tensor]:
-    """Return lower and upper corner (3,) float64 of a box around the ellipsoids of all frames, scene units.
+    """Return lower and upper corner (3,) float64, scene units, of the bounding box of the primitives in all frames.
 
     Raises:
-        ConfigError: no primitive is active in any of them.
+        ConfigError: no primitive is active in any of the frames.
     """
     lows, highs = [], []
     with torch.no_grad():

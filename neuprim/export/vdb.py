@@ -1,13 +1,18 @@
-"""``vdb``: the density as an OpenVDB fog volume, one file per frame for models that change in time; lossy (sampled).
+"""Export format ``vdb``: the density as an OpenVDB fog volume, one file per frame of a dynamic model; lossy (sampled).
 
-Grid ``density`` is the sum over primitives of their density clamped at 0, at the voxels' centres; what is below
-``threshold`` is not stored (background 0, inactive). Where flames add to the extinction of the source's grid, only that
-grid's part is written. A model that was fitted to .vdb files is written on the voxels and in the units of these files,
-with no value above the source frame's largest and nothing outside the box of its active voxels. Other models are
-written in the coordinates of the run's data, on one lattice of cubic voxels with index (0, 0, 0) at the scene's origin.
+Grid ``density`` is the sum of the primitives' densities at the voxels' centres, each clamped at 0 from below. Values
+below ``threshold`` are not stored (background 0, inactive).
 
-Units (metadata ``neuprim_units``): ``source``: sigma divided by the extinction per unit of the file's grid; ``world``:
-extinction per world unit, what a volume shader multiplies with a length; ``scene``: extinction per scene unit, sigma.
+A model that was fitted to .vdb files is written on the voxels and in the units of these source files. Values are
+limited to the largest value of the source frame and to the box of its active voxels. If flames add to the extinction,
+only the part of the source's extinction grid is written. Other models are written in the coordinates of the run's data,
+on cubic voxels with index (0, 0, 0) at the scene's origin.
+
+Units (metadata ``neuprim_units``):
+
+* ``source``: sigma divided by the extinction per unit of the source's grid
+* ``world``: extinction per world unit, which a volume shader multiplies by a length
+* ``scene``: extinction per scene unit, i.e. sigma
 """
 
 from __future__ import annotations
@@ -51,7 +56,7 @@ _MOST_VOXELS = 2**34
 
 @dataclass(frozen=True)
 class _GridFrame:
-    """A frame to write: the number in its file's name, and its index in the scene's files, if it has one."""
+    """A frame to write: the number in its file's name, its conditions, and its index in the source's files, if any."""
 
     number: int
     conditions: Conditions
@@ -110,10 +115,10 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
 
 
 def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) -> Primitives:
-    """Return the model, or its part that comes from the source's grid if other grids absorb, too.
+    """Return the model to export; if flames absorb, too, only the component of the source's extinction grid.
 
     Raises:
-        ConfigError: the model does not know that part.
+        ConfigError: the model has not learned this component.
     """
     model = job.run.model
     if placement is None or placement.exact:
@@ -128,9 +133,9 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
 
 
 def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> VdbGrid:
-    """Clamp a grid to a source frame's extent: no value above its largest, none outside its box.
+    """Clamp a grid to the largest value and to the box of a source frame.
 
-    ``per_unit`` is the value in the grid of a source value of 1.
+    A value of 1 in the source corresponds to ``per_unit`` in the grid.
     """
     offsets = np.stack(np.meshgrid(*(np.arange(8),) * 3, indexing="ij"), -1)
     centres = (grid.origins[:, None, None, None] + offsets) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
@@ -149,7 +154,7 @@ def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> 
 def _find_export_source(
     job: ExportJob,
 ) -> tuple[DensityGridSource | None, DensityGridPlacement | None, list[str]]:
-    """Return the scene's files, the placement in their world, each None if unknown, and notes."""
+    """Return the source's .vdb files, how the scene maps to their world, each None if unknown, and notes."""
     notes: list[str] = []
     source = None
     try:
@@ -168,7 +173,7 @@ def _find_export_source(
 
 
 def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) -> list[_GridFrame]:
-    """List the frames that the user names, else those of the run; a model without conditions has one."""
+    """List the frames to write: those that the user names, or else all of the run; one without conditions."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
@@ -183,7 +188,7 @@ def _export_frame_conditions(placement: DensityGridPlacement, frame: int) -> dic
 
 
 def _export_source_frame(conditions: Conditions, placement: DensityGridPlacement | None) -> int | None:
-    """Return the index of the source's frame with these conditions; None if there is none."""
+    """Return the index of the source's frame with the given conditions; None if no frame has them."""
     if placement is None:
         return None
     for i in range(len(placement.numbers)):
@@ -195,7 +200,7 @@ def _export_source_frame(conditions: Conditions, placement: DensityGridPlacement
 
 
 def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
-    """Name the files: one, or one per frame in a folder."""
+    """Return the paths of the files to write: one file, or one per frame in a folder."""
     suffix = job.out.suffix.lower()
     if suffix == ".vdb":
         if len(frames) > 1:
@@ -212,7 +217,7 @@ def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
 def _export_voxel_transform(
     job: ExportJob, box: np.ndarray, scene_from_world: np.ndarray, origin: np.ndarray
 ) -> np.ndarray:
-    """Return the (4, 4) matrix from index to world of the user's voxels, with the index origin at ``origin`` (3,)."""
+    """Return (4, 4) world_from_index for the options ``grid`` or ``voxel_size``; index 0 is at ``origin`` (3,)."""
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
         raise ConfigError("grid and voxel_size: expected one of them")
@@ -224,7 +229,7 @@ def _export_voxel_transform(
 
 
 class _VdbExportSampler(NamedTuple):
-    """Sampler of a model's extinction x ``factor`` on voxels; values below ``threshold`` are background."""
+    """Sample a model's extinction times ``factor`` on voxels; values below ``threshold`` become background."""
 
     job: ExportJob
     model: Primitives
@@ -234,13 +239,13 @@ class _VdbExportSampler(NamedTuple):
     threshold: float
 
     def sample_grid(self, conditions: Conditions, transform: np.ndarray) -> VdbGrid:
-        """Sample one frame block by block, so that dense memory is that of one block.
+        """Sample one frame as a sparse grid. Only one block at a time is dense in memory.
 
         Args:
             transform: (4, 4) index to world.
 
         Raises:
-            ConfigError: the box of the model has too many voxels.
+            ConfigError: the model's bounding box has too many voxels.
         """
         scene_from_index = self.scene_from_world @ transform
         try:
@@ -268,7 +273,7 @@ class _VdbExportSampler(NamedTuple):
     def _sample_blocks(
         self, conditions: Conditions, scene_from_index: np.ndarray, first: np.ndarray, size: np.ndarray
     ) -> Iterator[VdbGrid]:
-        """Yield sparse grids of blocks of bounded memory, each a multiple of 8 along the first two axes."""
+        """Yield sparse grids of blocks of bounded memory, whose first two sides are multiples of 8 voxels."""
         settings = self.job.run.settings
         rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
         planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))
@@ -288,7 +293,7 @@ class _VdbExportSampler(NamedTuple):
 def _measure_vdb_errors(
     job: ExportJob, source: DensityGridSource, frame: int, conditions: Conditions
 ) -> dict[str, float]:
-    """Compare the model with a frame of the source, on the source's own voxels."""
+    """Return errors of the model's extinction against a frame of the source, on the source's voxels."""
     settings = job.run.settings
     part = {} if source.placement.exact else {"component": source.placement.component}
     found = measure_density_errors(job.run.model, conditions, source, frame, settings.threads, **part)

@@ -1,4 +1,4 @@
-"""Inspection of a density: volumes, isosurfaces, slices, primitives, next to the ground truth."""
+"""Visual inspection of a model's density: volumes, isosurfaces, slices and primitives, next to the ground truth."""
 
 from neuprim.inspect.field import InspectionFrame, parse_inspection_box
 

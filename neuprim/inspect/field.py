@@ -1,4 +1,4 @@
-"""The frames that inspectors show: a model's density on a grid, with the ground truth if there is one."""
+"""Frames for the inspectors: a model's density on a grid, with the ground truth if there is one."""
 
 from __future__ import annotations
 
@@ -30,13 +30,13 @@ _OUTSIDE = 0.002  # part of the absorption that may lie outside a model's box, a
 
 @dataclass(frozen=True)
 class InspectionFrame:
-    """One frame of a model for inspectors; the extinction on its grid is computed at first use.
+    """One frame of a model for inspectors, with the model's extinction on a grid, computed at first use.
 
     Attributes:
-        scene_from_index: (4, 4) transform of the grid, whose axes are those of the scene.
+        scene_from_index: (4, 4) transform from grid index to scene; the axes are parallel to the scene's.
         top: largest extinction shown, 1/scene unit; the same for all frames.
-        gain: factor on the opacity of a volume; the same for all frames.
-        focus: (3,) centre of the matter of all frames, scene units.
+        gain: factor on the opacity of :class:`~neuprim.inspect.layers.Volume`; the same for all frames.
+        focus: (3,) centre of the extinction of all frames, scene units.
         levels: extinctions of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of ``top``.
         primitive: row of the primitive to show alone; None for the one that absorbs most.
         truth: computes (X, Y, Z) float32 ground truth on the grid; None if there is none.
@@ -62,12 +62,12 @@ class InspectionFrame:
     _grids: dict[str, np.ndarray] = field(default_factory=dict)  # shared by the panels of a frame
 
     def of_side(self, side: str) -> InspectionFrame:
-        """Return the frame for the panel of the "model" or the "truth"; both share their grids."""
+        """Return this frame with :attr:`side` "model" or "truth"; both share the computed grids."""
         return replace(self, side=side)
 
     @property
     def step(self) -> float:
-        """Distance of grid points, scene units."""
+        """Distance between neighbouring grid points, scene units."""
         return float(self.scene_from_index[0, 0])
 
     @property
@@ -77,7 +77,7 @@ class InspectionFrame:
 
     @property
     def box(self) -> np.ndarray:
-        """Corners of the box that the cells of the grid fill, (2, 3), scene units."""
+        """Corners of the box that the voxels around the grid points fill, (2, 3), scene units."""
         low = self.origin - self.step / 2
         return np.stack([low, low + self.step * np.array(self.shape)])
 
@@ -88,7 +88,7 @@ class InspectionFrame:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Extinction of the model, each primitive clamped at 0 from below, or of the truth, (X, Y, Z) float32."""
+        """Extinction of the model, each primitive clamped at 0, or of the truth on side "truth"; (X, Y, Z) float32."""
         if self.side not in self._grids:
             if self.side == "model":
                 grid = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
@@ -101,12 +101,12 @@ class InspectionFrame:
 
     @property
     def difference(self) -> np.ndarray:
-        """Extinction of the model minus that of the truth, (X, Y, Z) float32."""
+        """Extinction of the model minus extinction of the ground truth, (X, Y, Z) float32."""
         return self.of_side("model").sigma - self.of_side("truth").sigma
 
     @cached_property
     def active(self) -> ActivePrimitives:
-        """The primitives that are active in this frame, without gradients."""
+        """Primitives that are active in this frame, without gradients."""
         with torch.no_grad():
             return self.model.active(self.conditions)
 
@@ -122,7 +122,7 @@ class InspectionFrame:
 
     @cached_property
     def masses(self) -> np.ndarray:
-        """Total absorption of each active primitive, (M,) float64: extinction times volume."""
+        """Integral of the extinction over each active primitive, (M,) float64; see :func:`measure_absorption`."""
         return measure_absorption(self.active)
 
     @cached_property
@@ -140,7 +140,7 @@ class InspectionFrame:
         """Return the index in :attr:`rows` of the primitive to show alone.
 
         Raises:
-            ConfigError: there is no such primitive, or it is not active in this frame.
+            ConfigError: :attr:`primitive` does not exist or is not active in this frame.
         """
         wanted = self.primitive
         if wanted is None:
@@ -154,7 +154,7 @@ class InspectionFrame:
 
 
 def measure_absorption(active: ActivePrimitives) -> np.ndarray:
-    """Return (M,) float64 clamped extinction times volume of each primitive, from 33 points inside it."""
+    """Return (M,) float64: for each primitive, the mean of max(0, sigma) at 33 points inside, times the volume."""
     i = torch.arange(33)
     radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963
     ring = (1 - height**2).clamp_min(0).sqrt()
@@ -173,7 +173,7 @@ def measure_absorption(active: ActivePrimitives) -> np.ndarray:
 
 
 class GivenConditions(dict[str, Tensor]):
-    """Conditions of a frame; reading a missing one raises a ConfigError that asks for it."""
+    """Conditions of a frame, as a dict. A missing condition raises a ConfigError that asks the user for it."""
 
     def __missing__(self, name: str) -> Tensor:
         raise ConfigError(f"this needs the {name}; give {condition_flag(name)}")
@@ -184,8 +184,8 @@ def read_inspected_conditions(
 ) -> list[Conditions]:
     """Read the conditions of each frame with :func:`~neuprim.core.conditions.read_conditions`.
 
-    A number that is not given is the middle of its range. Other conditions that are not given are left out. Of two
-    animated conditions, the shorter is stretched.
+    ``texts`` maps a condition's name to the user's text. A scalar condition without text gets the middle of its range.
+    Other conditions without text are left out. If two conditions are animated, the shorter animation is stretched.
     """
     given = read_conditions(specs, texts, warn)
     found: dict[str, list[Tensor]] = {}
@@ -202,7 +202,7 @@ def read_inspected_conditions(
 
 
 def describe_inspected_conditions(conditions: Conditions) -> str:
-    """Describe conditions in words, e.g. "time 0.5"."""
+    """Describe the conditions of a frame as text, e.g. "time 0.5"."""
     parts = []
     for name, value in conditions.items():
         numbers = [f"{x:.3g}" for x in value.flatten().tolist()]
@@ -211,7 +211,7 @@ def describe_inspected_conditions(conditions: Conditions) -> str:
 
 
 def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
-    """Return the (2, 3) box of the six numbers of ``--box``; raise ConfigError if it has no volume."""
+    """Convert the six numbers of ``--box`` to a (2, 3) box; raise ConfigError if the box has no volume."""
     if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
         given = ",".join(f"{x:g}" for x in numbers)
         raise ConfigError(f"--box {given}: expected the lower and the upper corner, as -1,-1,-1,1,1,1")
@@ -219,7 +219,7 @@ def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
 
 
 def find_inspection_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
-    """Return a (2, 3) float64 box around nearly all that the model absorbs in some of the frames.
+    """Return a (2, 3) float64 box that contains nearly all of the model's extinction in the given frames.
 
     Raises:
         DataError: the model absorbs nothing.
@@ -250,14 +250,14 @@ def _inspection_box_quantile(values: np.ndarray, weights: np.ndarray, part: floa
 
 
 def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | None]) -> tuple[DensityTruth, str]:
-    """Open the ground truth that the user named, and say in a line what it is.
+    """Open the ground-truth density that the user named; return it and a one-line description.
 
     Args:
-        path: an OpenVDB file or a folder of them, or "scene" for what the run's scene was made from.
-        volume: opens the files of the run's scene; None if it has none.
+        path: an OpenVDB file, a folder of OpenVDB files, or "scene" for the files of the run's scene.
+        volume: opens the files of the run's scene; returns None if the scene has no volumes.
 
     Raises:
-        DataError: no such file, or the scene has no volumes.
+        DataError: ``path`` does not exist, or the scene has no volumes.
     """
     place, scene = Path(path), volume()
     if scene is None:
@@ -272,7 +272,7 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
 def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> list[tuple[Conditions, int]]:
     """Pair each frame with the nearest frame of the ground truth.
 
-    Return (conditions, truth frame) once per truth frame. The conditions are those of the truth frame.
+    Return one pair (conditions, truth frame) per frame of the ground truth, with the conditions of that frame.
     """
     pairs: dict[int, Conditions] = {}
     for conditions in frames:
@@ -286,7 +286,7 @@ def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> 
 
 
 def write_inspection_vdb(path: Path, frame: InspectionFrame, world: World) -> None:
-    """Write the frame's extinction, 1/scene unit, as OpenVDB in the world of its model, one voxel per grid point."""
+    """Write the frame's extinction, 1/scene unit, as an OpenVDB file in ``world``; one voxel per grid point."""
     scalars = {f"neuprim_condition_{name}": float(x) for name, x in frame.conditions.items() if x.numel() == 1}
     metadata = {"neuprim_value": "extinction, 1/scene unit; each primitive clamped at 0 from below", **scalars}
     transform = world.world_from_scene.numpy() @ frame.scene_from_index.numpy()

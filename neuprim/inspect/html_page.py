@@ -1,6 +1,6 @@
-"""Write the layers of all frames as one HTML file, for any browser with WebGL 2 and without a network.
+"""Write the inspection layers of all frames as one HTML file, for browsers with WebGL 2; it needs no network.
 
-Grids are stored in 8 bits; arrays are compressed and stored once each.
+Grids are stored with 8 bits per value. Arrays are compressed. Layers share the arrays they have in common.
 """
 
 from __future__ import annotations
@@ -49,14 +49,14 @@ def write_inspection_page(
     frame: Callable[[int], InspectionFrame],
     inspectors: Sequence[Inspector],
 ) -> None:
-    """Write a page of ``count`` frames on one grid. It opens with the first inspector and offers built-in views, too.
+    """Write an HTML page of ``count`` frames on one grid. It opens with the first inspector; built-in ones are added.
 
     Args:
         name: name of the run.
         up: the scene's upward axis, "x", "y" or "z".
 
     Raises:
-        ConfigError: more frames than one page holds.
+        ConfigError: one page cannot hold so many frames.
     """
     first = frame(0)
     free = [view for view in _ALWAYS if view.shows != "both" or first.truth is not None]
@@ -106,7 +106,7 @@ def _inspection_frame_data(frame: InspectionFrame, views: Sequence[Inspector], u
 
 
 def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarray, str]:
-    """Encode numbers as uint8; return them and the code. Roots spend most steps near 0, where matter is thin.
+    """Encode values as uint8; return the bytes and the code's name. "root" and "signed" resolve values near 0 best.
 
     ========  ==========================  ==================================================
     code      scales                      byte
@@ -130,7 +130,7 @@ def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarra
 
 
 class InspectionFrameArrays:
-    """The arrays of one frame, compressed, in the order in which layers use them."""
+    """Compressed arrays of one frame, in the order in which its layers refer to them."""
 
     def __init__(self) -> None:
         self.arrays: list[str] = []
@@ -138,7 +138,7 @@ class InspectionFrameArrays:
         self._grids: dict[tuple[int, float, float], tuple[np.ndarray, int, str]] = {}
 
     def pack_layers(self, layers: Sequence[Layer]) -> list[dict[str, Any]]:
-        """Return the JSON of valid layers; arrays are given by their index in :attr:`arrays`."""
+        """Convert valid layers to JSON values; each array becomes its index in :attr:`arrays`."""
         return [self._pack(layer) for layer in layers]
 
     def _pack(self, layer: Layer) -> dict[str, Any]:

@@ -1,8 +1,8 @@
-"""Layers, which inspectors return for a frame; windows, pictures, films and pages draw them alike.
+"""Layers: the drawable objects that an inspector returns for a frame.
 
-Positions are in scene units, in the scene's axes. Arrays are numpy arrays of finite numbers. Colours are
-display-referred red, green and blue from 0 to 1. The box of the frame's grid, its title and a bar for every
-:class:`Scale` with a title are drawn around the layers.
+Windows, pictures, videos and HTML pages draw the same layers. Positions are in scene units, on the scene's axes.
+Arrays are numpy arrays of finite numbers. Colours are display-referred red, green and blue from 0 to 1. Each view also
+shows the box of the frame's grid, the frame's title and a colour bar for every :class:`Scale` with a title.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ __all__ += ["Points", "Scale", "Slices", "Text", "Volume"]
 
 @dataclass(frozen=True)
 class Scale:
-    """A colour scale for numbers; numbers beyond an end have the colour of that end.
+    """A colour scale, which maps values to colours; values beyond an end have the colour of that end.
 
     Attributes:
         title: name of the quantity for the colour bar, e.g. "extinction"; no bar if empty.
@@ -41,7 +41,7 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class InspectionGrid:
-    """Numbers on a regular grid along the scene's axes; base class of volumes, slices and isosurfaces."""
+    """Values on a regular grid along the scene's axes; base class of volumes, slices and isosurfaces."""
 
     values: np.ndarray  # (X, Y, Z) numbers
     origin: np.ndarray  # (3,) position of values[0, 0, 0], scene units
@@ -50,31 +50,31 @@ class InspectionGrid:
 
     @property
     def box(self) -> np.ndarray:
-        """Corners of the box that the cells of the grid fill, (2, 3) float64, scene units."""
+        """Corners of the box that the voxels around the grid points fill, (2, 3) float64, scene units."""
         low = np.asarray(self.origin, np.float64) - self.spacing / 2
         return np.stack([low, low + self.spacing * np.array(self.values.shape)])
 
 
 @dataclass(frozen=True, eq=False)
 class Volume(InspectionGrid):
-    """A cloud, with opacity 1 - exp(-|value| depth h) over a length h."""
+    """A volume rendering of a grid; the opacity over a length h is 1 - exp(-|value| depth h)."""
 
     depth: float = 1.0  # optical depth of the value 1 per scene unit; frame.gain for extinction
 
 
 @dataclass(frozen=True, eq=False)
 class Slices(InspectionGrid):
-    """Three planes perpendicular to the axes."""
+    """Slices of a grid: three planes perpendicular to the axes."""
 
     through: np.ndarray | None = None  # (3,) common point of the planes, scene units; None for the centre of the grid
 
 
 @dataclass(frozen=True, eq=False)
 class Isosurfaces(InspectionGrid):
-    """Surfaces of equal value, closed as if values were 0 outside the grid.
+    """Isosurfaces of a grid. They are closed at its border, as if values were 0 outside.
 
     Attributes:
-        levels: values of the surfaces, at least one. Pages show one surface with a slider, from the lowest level on.
+        levels: values of the surfaces, at least one. HTML pages show one surface, with a slider for its level.
     """
 
     levels: tuple[float, ...] = ()
@@ -82,7 +82,7 @@ class Isosurfaces(InspectionGrid):
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Painted:
-    """Colours of a layer: numbers on a scale, colours, or neither (white); base class of shapes."""
+    """Base class of layers with colours: values on a scale, or explicit colours, or white if both are missing."""
 
     values: np.ndarray | None = None  # (N,) numbers, one per vertex, point or ellipsoid; with scale
     scale: Scale | None = None  # colours of values
@@ -92,7 +92,7 @@ class Painted:
 
 @dataclass(frozen=True, eq=False)
 class Ellipsoids(Painted):
-    """N solid ellipsoids, the most important first, as pages show a limited number.
+    """N solid ellipsoids; put the most important first, since HTML pages show a limited number.
 
     Attributes:
         axes: (N, 3, 3) semi-axes as vectors, ``axes[n, k]`` the k-th, scene units.
@@ -104,7 +104,7 @@ class Ellipsoids(Painted):
 
 @dataclass(frozen=True, eq=False)
 class Mesh(Painted):
-    """Triangles, shaded smoothly where they share vertices."""
+    """A triangle mesh; triangles that share vertices are shaded smoothly."""
 
     vertices: np.ndarray  # (N, 3) positions, scene units
     faces: np.ndarray  # (F, 3) integers: rows of vertices
@@ -112,7 +112,7 @@ class Mesh(Painted):
 
 @dataclass(frozen=True, eq=False)
 class Points(Painted):
-    """Points, drawn as balls of one size on the screen."""
+    """Points, drawn as balls; all have the same size on the screen."""
 
     centres: np.ndarray  # (N, 3) positions, scene units
     size: float = 8.0  # diameter in pixels
@@ -154,11 +154,11 @@ _LARGEST = float(np.finfo(np.float32).max)
 
 
 class _InvalidLayer(Exception):
-    """A layer that cannot be drawn; the text names the member, its value, and what was expected."""
+    """Error for a layer that cannot be drawn; the message names the member, its value, and the expected value."""
 
 
 def validate_inspection_layers(found: Any) -> str | None:
-    """Find the first invalid layer of an inspector's result; VTK ends the process on a wrong index.
+    """Find the first invalid layer in an inspector's result (VTK crashes on a wrong index).
 
     Returns:
         ``"returned WHAT; expected WHAT"``, or None if all layers are valid.

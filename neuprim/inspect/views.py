@@ -1,4 +1,4 @@
-"""The built-in inspectors: functions of a frame that return layers."""
+"""The built-in inspectors: functions that take a frame and return layers."""
 
 from __future__ import annotations
 
@@ -89,12 +89,12 @@ DIFFERENCE = Inspector(API_VERSION, "difference", "model minus ground truth", _i
 # ---------------------------------------------------------------- viewpoints
 
 _DIRECTIONS = {"x": (-0.45, 1.0, -1.6), "y": (1.0, 0.45, 1.6), "z": (1.0, -1.6, 0.45)}
-"""Direction from the middle to the camera, by the scene's upward axis."""
+"""Direction from the picture's centre to the camera, by the scene's upward axis."""
 
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Initial camera of a view.
+    """Initial camera of an inspector's view.
 
     Attributes:
         focus: (3,) point in the middle of the picture, scene units.
@@ -110,7 +110,7 @@ class Viewpoint:
 
 
 def find_inspection_viewpoint(inspector: Inspector, frame: InspectionFrame, up: str) -> Viewpoint:
-    """Choose the initial camera of a view: it shows the whole box, or a single primitive.
+    """Choose the initial camera of an inspector's view: it shows the whole grid, or the primitive shown alone.
 
     Args:
         up: the scene's upward axis, "x", "y" or "z".
@@ -133,7 +133,7 @@ def find_inspection_viewpoint(inspector: Inspector, frame: InspectionFrame, up: 
 
 
 def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return (V, 3) float64 points of norm 1 and (F, 3) int64 triangles, anticlockwise seen from outside."""
+    """Return a unit sphere: (V, 3) float64 points and (F, 3) int64 triangles, counterclockwise seen from outside."""
     import trimesh
 
     ball = trimesh.creation.icosphere(subdivisions)
@@ -141,9 +141,9 @@ def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_inspection_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
-    """Make (P, 3) float64 points and (F, 3) int64 triangles of the unit ball's surface without the quarter x > 0 > y.
+    """Make a mesh of the unit ball without its quarter x > 0 > y: (P, 3) float64 points, (F, 3) int64 triangles.
 
-    The sphere and the two planes of the cut share no points, so that their edges stay sharp.
+    The sphere and the two planes of the cut share no points, so that smooth shading preserves their edges.
     """
     radius = np.linspace(0, 1, rings // 2)
     around, down = np.radians(np.linspace(0, 270, 2 * rings + 1)), np.linspace(0, np.pi, rings)

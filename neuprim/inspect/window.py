@@ -1,4 +1,4 @@
-"""Draw panels of inspectors with pyvista: in a window with a slider, or as pictures off screen."""
+"""Draw inspectors with pyvista, one panel each: in a window with a slider for frames, or as pictures off screen."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ _PANEL = (720, 640)
 
 
 def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
-    """List (inspector, side) of each panel. Views of the extinction are shown twice if there is a ground truth."""
+    """List (inspector, side) of each panel. Inspectors of the extinction get a second panel for the ground truth."""
     return [
         (i, side)
         for i in inspectors
@@ -43,7 +43,7 @@ def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) ->
 
 
 class Window:
-    """A plotter with one panel per (inspector, side). Panels of the scene share one camera.
+    """A pyvista window with one panel per (inspector, side). Panels in scene coordinates share one camera.
 
     Args:
         size: size of the picture in pixels; None for 720 x 640 per panel.
@@ -68,7 +68,7 @@ class Window:
         self.plotter.subplot(*divmod(panel, self.shape[1]))
 
     def draw(self, frame: InspectionFrame) -> None:
-        """Draw a frame in all panels."""
+        """Draw an inspection frame in all panels."""
         for title in list(self.plotter.scalar_bars.keys()):
             self.plotter.remove_scalar_bar(title, render=False)
         for panel, (inspector, side) in enumerate(self.panels):
@@ -97,7 +97,7 @@ class Window:
         self._cameras_placed = True
 
     def picture(self) -> np.ndarray:
-        """Return (H, W, 3) uint8 of what was drawn last."""
+        """Return the window's last picture, (H, W, 3) uint8."""
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))[..., :3]
 
@@ -143,7 +143,7 @@ _FINE_ELLIPSOIDS = 4000  # ellipsoids up to which each gets many triangles
 
 
 def _add_pyvista_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> None:
-    """Draw valid layers and a bar for each of their scales into the plotter's current panel, number ``panel``."""
+    """Draw valid layers and a colour bar for each scale into the plotter's current panel, number ``panel``."""
     scales: dict[Scale, None] = {}
     for layer in layers:
         if isinstance(layer, Text):
@@ -162,14 +162,14 @@ def _add_pyvista_layers(plotter: Any, layers: Sequence[Layer], panel: int) -> No
 
 
 def _add_pyvista_box(plotter: Any, box: np.ndarray) -> None:
-    """Draw the edges of a (2, 3) box."""
+    """Draw the edges of the box with corners ``box`` (2, 3)."""
     import pyvista
 
     plotter.add_mesh(pyvista.Box(box.T.ravel()).outline(), color="#8894a0", line_width=1, lighting=False)
 
 
 def _add_pyvista_bar(plotter: Any, scale: Scale, panel: int, place: int) -> None:
-    """Draw the scalar bar of ``scale``, whatever is drawn; ``place`` counts from the lowest."""
+    """Draw a colour bar for ``scale``; ``place`` is its position, counted from the lowest bar."""
     import pyvista
 
     mapper = pyvista.DataSetMapper()
@@ -208,7 +208,7 @@ def _add_pyvista_grid(plotter: Any, layer: InspectionGrid) -> None:
 
 
 def _make_pyvista_image(layer: InspectionGrid, values: np.ndarray, around: int = 0) -> Any:
-    """Make ``pyvista.ImageData`` of values at the layer's points, padded by ``around`` zeros."""
+    """Make ``pyvista.ImageData`` of values at the layer's grid points, padded by ``around`` layers of zeros."""
     import pyvista
 
     origin = np.asarray(layer.origin, np.float64) - around * layer.spacing
@@ -219,7 +219,7 @@ def _make_pyvista_image(layer: InspectionGrid, values: np.ndarray, around: int =
 
 
 def _add_pyvista_shape(plotter: Any, layer: Any) -> None:
-    """Draw ellipsoids, a mesh or points, with a colour per vertex."""
+    """Draw a layer of ellipsoids, a mesh or points, with one colour per vertex."""
     import pyvista
 
     vertices = layer.vertices if isinstance(layer, Mesh) else layer.centres
@@ -255,7 +255,7 @@ _PROBE_SECONDS = 120.0
 
 
 def require_pyvista() -> None:
-    """Raise BackendUnavailable if the package is missing."""
+    """Raise BackendUnavailable if the package pyvista is missing."""
     try:
         import pyvista  # noqa: F401
     except ImportError as error:
@@ -265,16 +265,16 @@ def require_pyvista() -> None:
 
 
 def has_display() -> bool:
-    """Tell whether a window could be opened."""
+    """Return whether this machine has a display for windows."""
     return sys.platform in ("win32", "darwin") or bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 @cache
 def prepare_headless() -> None:
-    """Check in a subprocess that VTK can draw off screen; a missing library ends the process.
+    """Check that VTK can draw off screen. A subprocess does the test, because a missing library would crash it.
 
     Raises:
-        BackendUnavailable: it cannot; names the packages to install.
+        BackendUnavailable: VTK cannot draw; the message names the packages to install.
     """
     try:
         done = subprocess.run([sys.executable, "-c", _PROBE], capture_output=True, text=True, timeout=_PROBE_SECONDS)

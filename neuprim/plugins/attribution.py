@@ -1,8 +1,8 @@
 """Call the code of plugins: check what it returns, and name its package in its errors, in one line.
 
-A :class:`~neuprim.core.errors.NeuprimError` passes unchanged, because its text is the whole message. Any other
-exception of another package's code becomes a PluginError that says where it was raised; the traceback stays its
-``__cause__``. An error in neuprim's own code keeps its type.
+A :class:`~neuprim.core.errors.NeuprimError` passes unchanged, because its text is written for users. Any other
+exception from a plugin's code becomes a PluginError that says where the exception was raised. The original exception
+is its ``__cause__``. An error in neuprim's own code keeps its type.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from neuprim.plugins.registry import LOSSES, SCENES, TASKS, PluginError, PluginG
 Kind = TypeVar("Kind")
 
 _VIEW_METRICS = ("name", "psnr", "ssim", "ssim_3dgs", "lpips", "lpips_3dgs", "seconds")
-"""Names that every view has in ``metrics.json``."""
+"""Metrics that every view has in ``metrics.json``; a task may not use their names."""
 _TUNABLE = ("model.", "task.options.")
 
 
@@ -39,7 +39,7 @@ _TUNABLE = ("model.", "task.options.")
 
 
 class ReturnError(NeuprimError):
-    """A plugin's function returned something unusable; :func:`attribute_errors` adds the plugin's name."""
+    """A plugin's function returned an invalid value. :func:`attribute_errors` adds the plugin's name to the message."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class PluginSource:
 
     Attributes:
         label: e.g. ``"task 'glow' of neuprim-glow 0.1"``.
-        module: top-level module that its code is in; empty for a built-in plugin, whose errors keep their tracebacks.
+        module: top-level module of the plugin's code; empty for a built-in plugin, whose errors keep their tracebacks.
     """
 
     label: str
@@ -56,15 +56,15 @@ class PluginSource:
 
     @property
     def built_in(self) -> bool:
-        """Whether neuprim itself registers it."""
+        """Whether the plugin is one of neuprim's own."""
         return not self.module
 
 
 def find_plugin_source(group: PluginGroup[Any], word: str, entry: str | None = None) -> PluginSource:
-    """Find the source of the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses, from package metadata alone.
+    """Return label and module of the plugin ``NAME`` or ``PACKAGE:NAME``, from package metadata, without importing it.
 
     Args:
-        entry: name of the entry point, if it differs from the plugin's.
+        entry: name of the entry point, if it differs from the plugin's name.
     """
     package, name = split_plugin_name(word)
     info = _find_plugin_info(group, package, entry or name)
@@ -82,7 +82,7 @@ def _find_plugin_info(group: PluginGroup[Any], package: str | None, entry: str) 
 
 @contextmanager
 def attribute_errors(source: PluginSource, function: str = "") -> Iterator[None]:
-    """Name the plugin in errors of a call of its ``function``, e.g. ``"build"``."""
+    """Context manager around a call of a plugin's ``function``, e.g. ``"build"``: name the plugin in its errors."""
     where = f"{function} of {source.label}" if function else source.label
     try:
         yield
@@ -111,7 +111,7 @@ def _is_plugin_code(variables: dict[str, Any], source: PluginSource) -> bool:
 
 
 def guard_loss(loss: Loss, source: PluginSource) -> Loss:
-    """Return the loss of a plugin with its results checked and its errors attributed."""
+    """Wrap a plugin's loss function: check its results, and name the plugin in its errors."""
     if not callable(loss):
         raise PluginError(f"{source.label}: the loss is a {type(loss).__name__}; expected a function")
 
@@ -129,7 +129,7 @@ class RunPlugins:
 
     Args:
         task, scene: names, or ``PACKAGE:NAME``.
-        loss: the same for ``train.loss``; None for the task's own loss.
+        loss: ``NAME`` or ``PACKAGE:NAME`` of ``train.loss``; None for the task's own loss.
     """
 
     def __init__(self, task: str, scene: str, loss: str | None = None) -> None:
@@ -144,7 +144,7 @@ class RunPlugins:
 
     @contextmanager
     def attribute_errors(self) -> Iterator[None]:
-        """Name the plugin in errors of code that calls several plugins; the traceback shows which one it is."""
+        """Context manager around code that calls several plugins: name the plugin whose code raised an error."""
         try:
             yield
         except DatasetError as error:
@@ -166,13 +166,13 @@ class RunPlugins:
 
 
 def check_returns(ok: bool, function: str, found: object, expected: str) -> None:
-    """Raise ReturnError unless ``ok``."""
+    """Raise ReturnError unless ``ok``: ``function`` returned ``found`` instead of ``expected``."""
     if not ok:
         raise ReturnError(f"{function}: found {found}; expected {expected}")
 
 
 def check_fields(density: object, colour: object, dataset: Dataset) -> None:
-    """Check that a task's ``build`` returned two fields, the colour with the data set's channels."""
+    """Check that a task's ``build`` returned two fields, and that the colour field has the data set's channels."""
     for name, field, kind in (("density", density, DensityField), ("colour", colour, ColourField)):
         expected = f"a neuprim.core.model.fields.{kind.__name__}"
         check_returns(isinstance(field, kind), f"build: {name}", _describe_returned_type(field), expected)
@@ -182,7 +182,7 @@ def check_fields(density: object, colour: object, dataset: Dataset) -> None:
 
 
 def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
-    """Check one result of a loss (:data:`~neuprim.core.task.Loss`) for this rendered image."""
+    """Check the value and named parts that a loss returned (:data:`~neuprim.core.task.Loss`) for a rendered image."""
     number = isinstance(value, Tensor) and not value.dim()
     check_returns(number, "value", _describe_returned_type(value), "one number as a tensor")
     gradient = value.requires_grad or not rendered.requires_grad
@@ -193,7 +193,7 @@ def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
 
 
 def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
-    """Return the part of a test view whose error is reported on its own, (H, W) bool, or None."""
+    """Return the task's mask of a test view, (H, W) bool, where the error is also reported alone; None without one."""
     mask = task.mask(dataset, index)
     if mask is not None:
         try:
@@ -206,7 +206,7 @@ def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | Non
 def call_task_metrics(
     task: TaskSpec, dataset: Dataset, index: int, rendered: Tensor, truth: Tensor
 ) -> dict[str, float]:
-    """Return the task's own metrics of a test view by name; they may be +inf."""
+    """Return the task's own metrics of a test view: name -> value, finite or +inf."""
     function = f"metrics of test view {dataset.test.view(index).name}"
     metrics = _check_returned_keys(task.metrics(dataset, index, rendered, truth), function)
     for name, value in metrics.items():
@@ -222,13 +222,13 @@ def call_task_diagnose(task: TaskSpec, dataset: Dataset, model: Primitives) -> d
 
 
 def call_task_facts(task: TaskSpec, dataset: Dataset) -> dict[str, Any]:
-    """Return the facts about data that a model's header stores: "up" and "center", and those that the task adds."""
+    """Return facts about the data for the header of a model file: "up", "center", and those that the task adds."""
     own = {"up": [float(x) for x in dataset.up], "center": [float(x) for x in dataset.center]}
     return {**own, **_check_returned_json(task.facts(dataset), "facts")}
 
 
 def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
-    """Return the films that the task makes of its data."""
+    """Return the films that the task makes from views of the data set."""
     clips = _check_returned_list(task.clips(dataset), "clips", Clip)
     for clip in clips:
         count = len(dataset.test if clip.source is None else clip.source)
@@ -239,14 +239,14 @@ def call_task_clips(task: TaskSpec, dataset: Dataset) -> list[Clip]:
 
 
 def call_task_orbit(task: TaskSpec, dataset: Dataset, frames: int) -> list[View]:
-    """Return views that circle the scene, with the task's conditions."""
+    """Return ``frames`` views that circle the scene, with values for the task's conditions."""
     views = _check_returned_list(task.orbit(dataset, frames), "orbit", View)
     check_returns(len(views) > 0, "orbit", "no views", "some")
     return views
 
 
 def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> dict[str, tuple[Any, ...]]:
-    """Return the settings that trade quality for speed or size: name -> values worth training."""
+    """Return the settings that trade quality for speed or size: setting -> values worth training with."""
     found = task.tunable_settings(settings)
     expected = "a dictionary of setting names to values"
     check_returns(isinstance(found, Mapping), "tunable_settings", _describe_returned_type(found), expected)
@@ -261,7 +261,9 @@ def call_task_tunable_settings(task: TaskSpec, settings: Mapping[str, Any]) -> d
 
 
 def draw_task_layer(spec: LayerSpec, frame: LayerFrame, channels: int) -> Tensor | None:
-    """Return a layer's (H, W, C) finite values, or None; layers of light have the ``channels`` of the model's image."""
+    """Compute a layer of one frame: finite (H, W, C) values, or None if the model lacks the layer. Layers of light have
+    ``channels`` channels, like the model's image.
+    """
     values = spec.draw(frame)
     if values is None:
         return None

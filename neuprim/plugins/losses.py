@@ -1,4 +1,5 @@
-"""Built-in losses that any task may use, as ``train.loss=NAME``; registered like those of any package."""
+"""Built-in losses, which any task may use with ``train.loss=NAME``. They are registered like losses of other
+packages."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``neuprim new-task``: write a small package with a working task, as a start for one's own."""
+"""``neuprim new-task``: write a small package with a working task, as a starting point for a plugin."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _TEMPLATE_SUFFIX = ".in"
 
 
 def write_plugin_package(name: str, out: Path | None = None) -> list[str]:
-    """Write a package with the task ``name`` and return lines that say what to do next.
+    """Write a Python package with the task ``name``; return lines that tell the user what to do next.
 
     Args:
-        out: the folder to make; None is ``neuprim-NAME`` in the working directory.
+        out: the folder to create; None for ``neuprim-NAME`` in the working directory.
 
     Raises:
-        ConfigError: the name cannot be a task's or is taken, or the folder exists; nothing was written.
+        ConfigError: the name is not valid for a task or is taken, or the folder exists. Nothing is written then.
     """
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,39}", name) or keyword.iskeyword(name):
         raise ConfigError(

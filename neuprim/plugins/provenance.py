@@ -1,7 +1,7 @@
 """Record which packages and versions made a run, and load the same plugins again.
 
-``config.yaml`` keeps the record as ``made_by``. A stored run is read with the plugins of the packages that made it,
-whichever packages have their names now.
+``config.yaml`` stores the record under ``made_by``. A stored run is read with the plugins of the packages that made it,
+even if a bare name now means the plugin of another package.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class PluginVersion:
 
     Attributes:
         name: name of the task, scene or loss, without its package.
-        package, version: the installed distribution; the version may be empty.
+        package, version: the distribution that provided the plugin; the version may be empty.
     """
 
     name: _Name
@@ -58,18 +58,18 @@ class PluginVersion:
 
     @classmethod
     def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
-        """Record an installed plugin; pass ``name`` if its entry point has another name, as for a scene."""
+        """Record an installed plugin's version; pass ``name`` if it differs from the entry point's, as for a scene."""
         version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
 
     @property
     def origin(self) -> str:
-        """Package and version, e.g. ``"neuprim-spectral 0.1"``."""
+        """Package and version as text, e.g. ``"neuprim-spectral 0.1"``."""
         return f"{self.package} {self.version}".strip()
 
     @property
     def qualified_name(self) -> str:
-        """``PACKAGE:NAME``, as a user types it."""
+        """Name of the plugin as a user types it, ``PACKAGE:NAME``."""
         return qualified_plugin_name(self.package, self.name)
 
 
@@ -79,8 +79,8 @@ class Provenance:
 
     Attributes:
         neuprim: version of neuprim.
-        scene: plugin of a scene that another package adds to the task; None for the task's own.
-        loss: plugin of a loss chosen with ``train.loss``; None for the task's own.
+        scene: plugin of the scene, if another package adds it to the task; None for one of the task's own scenes.
+        loss: plugin of the loss, if ``train.loss`` chooses it; None for the task's own loss.
     """
 
     neuprim: _Version
@@ -90,27 +90,27 @@ class Provenance:
 
     @classmethod
     def of_installed(cls, task: PluginInfo, scene: FoundScene, loss: PluginInfo | None) -> Provenance:
-        """Record the installed plugins of a run; ``loss`` is that of ``train.loss``."""
+        """Return the provenance of a run from its installed plugins; ``loss`` is the plugin of ``train.loss``."""
         added = None if scene.added_by is None else PluginVersion.of(scene.added_by, scene.spec.name)
         return cls(__version__, PluginVersion.of(task), added, None if loss is None else PluginVersion.of(loss))
 
     @property
     def plugins(self) -> dict[str, PluginVersion]:
-        """Kind (task, scene, loss) -> plugin, for those that the run has."""
+        """Kind ("task", "scene", "loss") -> plugin, without the kinds for which there is none."""
         found = {"task": self.task, "scene": self.scene, "loss": self.loss}
         return {kind: plugin for kind, plugin in found.items() if plugin is not None}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return plain values for YAML and JSON."""
+        """Return the provenance as plain values for YAML and JSON."""
         return {"neuprim": self.neuprim, **{kind: asdict(plugin) for kind, plugin in self.plugins.items()}}
 
     @classmethod
     def from_dict(cls, value: object) -> Provenance:
-        """Validate the values of :meth:`to_dict`, which come from an untrusted file."""
+        """Validate and convert the values of :meth:`to_dict`, which come from an untrusted file."""
         return validate_settings(cls, value, "made_by")
 
     def origins(self) -> dict[str, str]:
-        """Return kind -> package and version as readable text."""
+        """Return kind ("task", "scene", "loss") -> package and version as text."""
         return {"neuprim": self.neuprim, **{kind: plugin.origin for kind, plugin in self.plugins.items()}}
 
 
@@ -120,12 +120,13 @@ def load_recorded_plugin(
     """Load the plugin that made a run, and warn if another version of it is installed.
 
     Args:
-        file: file with the record, for messages.
-        entry: name of the entry point, if it differs from the plugin's.
+        plugin: the package and version that made the run.
+        file: file that stores the record, for messages.
+        entry: name of the entry point, if it differs from the plugin's name.
 
     Raises:
         ConfigError: the package is not installed, or no longer has a plugin of that name.
-        PluginError: it is broken, or was written for another version of the interfaces.
+        PluginError: the plugin is broken, or was written for another version of the interfaces.
     """
     try:
         info, spec = group.load_with_info(qualified_plugin_name(plugin.package, entry or plugin.name))
@@ -140,14 +141,16 @@ def load_recorded_plugin(
 
 
 def warn_of_other_provenance(made_by: Provenance, file: Path | None = None) -> None:
-    """Warn if another minor version of neuprim made a run; patch versions keep results."""
+    """Warn if another minor version of neuprim made a run. Patch versions of neuprim do not change results."""
     if _minor_provenance_version(made_by.neuprim) != _minor_provenance_version(__version__):
         text = f"this run was made by neuprim {made_by.neuprim}; this is neuprim {__version__}"
         warn_once(_prefix_provenance_file(file, text))
 
 
 def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:
-    """Raise CheckpointError if a run may not go on from a checkpoint with this record; warn of other versions."""
+    """Raise CheckpointError if a checkpoint with the record ``stored`` cannot continue in the run ``now``; warn if only
+    versions differ.
+    """
     try:
         before = Provenance.from_dict(stored)
     except ConfigError as error:

@@ -1,10 +1,10 @@
 """Find and load plugins: tasks, scenes, losses, exporters and inspectors, registered as entry points.
 
-Built-in plugins are registered like those of any other package. Listing reads package metadata only. A plugin is
-imported when it is chosen by name, so a broken plugin does not affect the others.
+Built-in plugins are registered like those of any other package. Listing plugins reads package metadata only. A plugin
+is imported when it is chosen by name, so a broken plugin does not affect other plugins.
 
-A plugin is chosen by ``NAME`` or ``PACKAGE:NAME``. A bare name that a built-in plugin has means the built-in one,
-whoever else registers it.
+Users choose a plugin by ``NAME`` or ``PACKAGE:NAME``. A bare name means the built-in plugin of that name if there is
+one, even if other packages register the name, too.
 """
 
 from __future__ import annotations
@@ -37,22 +37,22 @@ class PluginError(NeuprimError):
 
 
 class UnknownPlugin(ConfigError):
-    """No installed package registers a plugin of that name."""
+    """No installed package registers a plugin of the given name."""
 
 
 def split_plugin_name(word: str) -> tuple[str | None, str]:
-    """Split ``PACKAGE:NAME`` into the normalised package and the name; the package is None for a bare name."""
+    """Split ``PACKAGE:NAME`` into (normalised package, name); the package is None for a bare name."""
     package, colon, name = word.partition(":")
     return (canonicalize_name(package.strip()), name.strip()) if colon else (None, word)
 
 
 def qualified_plugin_name(distribution: str, name: str) -> str:
-    """Return ``PACKAGE:NAME``, as a user types it."""
+    """Return ``PACKAGE:NAME``, as a user types it, for a plugin ``name`` of a distribution."""
     return f"{canonicalize_name(distribution)}:{name}"
 
 
 def installed_version(package: str) -> str | None:
-    """Return name and version of an installed distribution, or None if it is not installed."""
+    """Return "NAME VERSION" of an installed distribution, or None if it is not installed."""
     try:
         found = metadata.distribution(package)
     except (metadata.PackageNotFoundError, ValueError):  # ValueError: an empty name
@@ -65,9 +65,9 @@ class PluginInfo:
     """Registration of a plugin, from package metadata.
 
     Attributes:
-        name: name of the entry point, such as what the user types after ``task=``.
+        name: name of the entry point; for a task this is what the user types after ``task=``.
         distribution, version: the installed package that registers it.
-        target: ``module:attribute`` of its description, such as a :class:`~neuprim.core.task.TaskSpec`.
+        target: ``module:attribute`` of the plugin's description, for example of a :class:`~neuprim.core.task.TaskSpec`.
     """
 
     name: str
@@ -77,18 +77,18 @@ class PluginInfo:
 
     @property
     def origin(self) -> str:
-        """Package and version, e.g. ``"neuprim 0.1.0"``."""
+        """Package and version as text, e.g. ``"neuprim 0.1.0"``."""
         return f"{self.distribution} {self.version}".strip()
 
     @property
     def built_in(self) -> bool:
-        """Whether neuprim's own distribution registers it."""
+        """Whether neuprim's own distribution registers the plugin."""
         return canonicalize_name(self.distribution) == BUILT_IN
 
 
 @dataclass(frozen=True)
 class PluginReport(Generic[T]):
-    """A registered plugin with its loaded description, or with the reason why it cannot be loaded."""
+    """A registered plugin with its loaded description, or with the reason why the description cannot be loaded."""
 
     info: PluginInfo
     spec: T | None = None
@@ -97,16 +97,15 @@ class PluginReport(Generic[T]):
 
 @dataclass(frozen=True)
 class PluginGroup(Generic[T]):
-    """One kind of plugin.
+    """One kind of plugin, e.g. tasks: lists, finds and loads them.
 
     Attributes:
-        entry_points: the entry-point group.
-        kind: the word for one of them in messages.
-        typed: how a user names one, e.g. ``"task={}"``.
-        described_by: ``module:class`` of the descriptions. It is imported with the first plugin, because it imports
-            torch.
-        name_of: returns the name in a description; it must equal the entry point's.
-        typed_name: returns what a user types for an entry point's name.
+        entry_points: name of the entry-point group.
+        kind: word for one such plugin in messages, e.g. "task".
+        typed: how a user chooses such a plugin, e.g. ``"task={}"``.
+        described_by: ``module:class`` of the descriptions; imported with the first plugin, because it imports torch.
+        name_of: function that returns the name in a description, which must equal the entry point's name.
+        typed_name: function that converts an entry point's name to what a user types.
     """
 
     entry_points: str
@@ -117,30 +116,30 @@ class PluginGroup(Generic[T]):
     typed_name: Callable[[str], str] = lambda name: name
 
     def list_plugins(self) -> list[PluginInfo]:
-        """List all registered plugins by name without importing any; a name registered twice is listed twice."""
+        """List all registered plugins of this kind by name without importing them; a name may occur more than once."""
         return [info for info, _ in self._entries()]
 
     def find(self, word: str) -> PluginInfo:
-        """Find who registers the plugin that ``word`` chooses, without importing it. Raises as :meth:`load`."""
+        """Return the registration of the plugin that ``word`` chooses, without importing it. Raises as :meth:`load`."""
         return self._find(word)[0]
 
     def load(self, word: str) -> T:
-        """Import and check the plugin that ``NAME`` or ``PACKAGE:NAME`` chooses.
+        """Import and check the plugin that ``word``, ``NAME`` or ``PACKAGE:NAME``, chooses; return its description.
 
         Raises:
-            UnknownPlugin: there is none.
+            UnknownPlugin: no installed package registers such a plugin.
             PluginError: several packages register the bare name, or the plugin is broken or was written for another
                 version of the interfaces.
         """
         return self.load_with_info(word)[1]
 
     def load_with_info(self, word: str) -> tuple[PluginInfo, T]:
-        """Return a plugin's registration and its description. Raises as :meth:`load`."""
+        """Return a plugin's registration and its description. Raises the errors of :meth:`load`."""
         info, entry = self._find(word)
         return info, self._load(info, entry)
 
     def survey(self) -> list[PluginReport[T]]:
-        """Load every registered plugin. Broken ones come with their error."""
+        """Load every registered plugin of this kind; report a broken one with its error."""
         reports: list[PluginReport[T]] = []
         for info, entry in self._entries():
             try:
@@ -154,13 +153,13 @@ class PluginGroup(Generic[T]):
         return self.typed.format(qualified_plugin_name(info.distribution, self.typed_name(info.name)))
 
     def shortest_name(self, info: PluginInfo) -> str:
-        """Return the plugin's bare name if it is unambiguous, else ``PACKAGE:NAME``."""
+        """Return the plugin's bare name if that chooses this plugin, else ``PACKAGE:NAME``."""
         name = self.typed_name(info.name)
         clash = any(other.name == info.name and other != info for other in self.list_plugins())
         return qualified_plugin_name(info.distribution, name) if clash and not info.built_in else name
 
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
-        """Warn that the name of ``info`` means another plugin, and how to choose it."""
+        """Warn that the bare name of ``info`` means another plugin, and say how to choose ``info``."""
         what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
         warn_once(f"{what} has the name of {by}, which is used; {self.choice(info)} chooses the other")
 
@@ -193,7 +192,7 @@ class PluginGroup(Generic[T]):
         return f"{self.typed.format(word)}: no such {self.kind}{hint}"
 
     def _entries(self) -> list[tuple[PluginInfo, metadata.EntryPoint]]:
-        """List the group's entry points by name, the built-in ones first."""
+        """List the group's entry points by name, built-in ones first."""
         found, packages = [], set()
         for dist in metadata.distributions():
             try:
@@ -262,15 +261,15 @@ PLUGIN_GROUPS: tuple[PluginGroup[Any], ...] = (TASKS, SCENES, LOSSES, EXPORTERS,
 
 
 def load_task(name: str) -> TaskSpec:
-    """Return the task ``NAME`` or ``PACKAGE:NAME``; raises UnknownPlugin, or PluginError if it is broken."""
+    """Load the task ``NAME`` or ``PACKAGE:NAME``. Raises UnknownPlugin, or PluginError if the task is broken."""
     return TASKS.load(name)
 
 
 def list_scene_names(task: PluginInfo) -> list[str]:
     """List the scenes of a task without importing it.
 
-    They are the YAML files of ``conf/scene/NAME`` beside its module, and those that other packages register. If a task
-    has its files elsewhere, only the latter are listed.
+    The task's own scenes are the YAML files in ``conf/scene/NAME`` beside its module. Other packages may register more.
+    If a task has its YAML files elsewhere, only scenes of other packages are listed.
     """
     added = [SCENES.typed_name(info.name) for info in SCENES.list_plugins() if info.name.startswith(f"{task.name}.")]
     try:
@@ -284,7 +283,7 @@ def list_scene_names(task: PluginInfo) -> list[str]:
 
 @dataclass(frozen=True)
 class FoundScene:
-    """A scene of a task, from the task's own package or another."""
+    """A scene of a task, with the package that provides it: the task's own or another."""
 
     spec: SceneSpec  # the scene
     config_package: str  # the package with scene/TASK/NAME.yaml
@@ -292,9 +291,10 @@ class FoundScene:
 
 
 def find_registered_scene(task: TaskSpec, word: str) -> FoundScene:
-    """Return the scene ``NAME`` or ``PACKAGE:NAME`` of a task; a bare name means the task's own scene if it has one.
+    """Return the scene ``NAME`` or ``PACKAGE:NAME`` of a task. A bare name means the task's own scene of that name, if
+    any.
 
-    Raises UnknownPlugin, or PluginError if the plugin is broken.
+    Raises UnknownPlugin, or PluginError if the scene's plugin is broken.
     """
     package, name = split_plugin_name(word)
     own = {scene.name: scene for scene in task.scenes}

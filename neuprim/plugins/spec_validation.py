@@ -1,4 +1,4 @@
-"""Check a plugin's description when it is loaded, so that nothing fails in the middle of a run."""
+"""Check a plugin's description when it is loaded, so that a wrong description does not fail in the middle of a run."""
 
 from __future__ import annotations
 
@@ -22,11 +22,11 @@ _FUNCTIONS = ("Callable", "Display", "Illuminate")
 
 
 class _InvalidMember(Exception):
-    """A member that cannot be used; the text says which, what it is and what was expected."""
+    """A member of a plugin's description is invalid. The message names the member, its value and what was expected."""
 
 
 def validate_spec(spec: Any) -> str | None:
-    """Return ``"MEMBER is WHAT; expected WHAT"`` of the first member that cannot be used; None if all can."""
+    """Return why a plugin's description is invalid, ``"MEMBER is WHAT; expected WHAT"``; None if it is valid."""
     try:
         _check_spec(spec)
     except _InvalidMember as problem:
@@ -40,7 +40,7 @@ def _require_member(ok: bool, text: str) -> None:
 
 
 def _check_spec(spec: Any) -> None:
-    """Check every member by its annotation, and then by the rules of its class."""
+    """Check every member of a description against its type annotation, and then against the rules of its class."""
     for member in fields(spec):
         name, annotation, value = member.name, str(member.type), getattr(spec, member.name)
         kind, optional = annotation.removesuffix(" | None"), annotation.endswith("| None")
@@ -118,7 +118,7 @@ def _check_exporter(spec: Exporter) -> None:
 
 
 def _check_plugin_options(spec: TaskSpec | LossExtension, *groups: str) -> None:
-    """Check ``options``, and ``uses``, which may name optional settings of these groups."""
+    """Check a description's ``options``, and its ``uses``, which may only name optional settings of ``groups``."""
     for name, entry in spec.options.items():
         known = isinstance(name, str) and name.isidentifier()
         _require_member(known, f"options has {name!r}; expected a name of letters, digits and _")

@@ -1,1 +1,1 @@
-"""HTML pages that stand alone: the report of a run, of a sweep, of trade-offs."""
+"""HTML pages in a single file: reports of a run, of a sweep, and of trade-offs."""

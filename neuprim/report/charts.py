@@ -1,4 +1,4 @@
-"""Charts: curves and Pareto fronts, as SVG for a page or as a PNG file.
+"""Draw charts, curves and Pareto fronts, as SVG for a page or as a PNG file.
 
 An SVG takes its colours from the page's CSS variables, so that it follows light and dark mode.
 """
@@ -34,24 +34,24 @@ SMALL, LARGE = (360, 210), (540, 300)
 """Sizes of a chart in points. Panels are about as wide in CSS pixels, so text keeps its size."""
 
 _BUCKETS = 120
-"""Groups of a band: each is drawn as its median and range. Up to twice as many points are drawn as they are."""
+"""Groups of points in a band, each drawn as its median and range. Up to twice as many points are drawn singly."""
 
 _FEW = 40  # points of a line up to which each is marked
 
 _LOG_RATIO, _FRONT_LOG_RATIO = 4.0, 1.5
-"""An axis is logarithmic where its positive values, or the costs of a front, span at least this factor."""
+"""An axis is logarithmic if its positive values, or the costs of a front, span at least this factor."""
 
 _LEAST_DECIBELS = 0.4  # least range of the y axis of a front: smaller differences are invisible
 
 
 @dataclass(frozen=True)
 class ChartPoints:
-    """Points of one colour; those that are not finite are left out.
+    """Points of one colour in a chart; points that are not finite are not drawn.
 
     Attributes:
-        joined: connect them by a line; points of a line are marked while they are few.
-        band: draw many points as their median and range.
-        spread: half-lengths of horizontal error bars.
+        joined: connect the points by a line; markers are only drawn if there are few points.
+        band: draw many points as a line of their median with a band of their range.
+        spread: half-lengths of horizontal error bars; empty for none.
         labels: texts below the points.
         name: text in the chart's legend.
     """
@@ -66,7 +66,7 @@ class ChartPoints:
     name: str = ""
 
     def finite(self) -> ChartPoints:
-        """Return those with finite coordinates."""
+        """Return only the points with finite coordinates."""
         x, y = np.asarray(self.x, dtype=np.float64), np.asarray(self.y, dtype=np.float64)
         rows = np.flatnonzero(np.isfinite(x) & np.isfinite(y)).tolist()
         spread = [self.spread[i] for i in rows] if self.spread else ()
@@ -79,10 +79,10 @@ class Chart:
     """A chart of any kind; :func:`curve_chart` and :func:`front_chart` make the usual ones.
 
     Attributes:
-        title: for readers who do not see the chart, and above a PNG.
-        ring: a point that is ringed.
-        log_x, log_y: which axes are logarithmic.
-        least: least range of the y axis.
+        title: text for screen readers, and the heading above a PNG.
+        ring: (x, y) of a point that is highlighted by a ring.
+        log_x, log_y: whether the axis is logarithmic.
+        least: smallest range of the y axis.
     """
 
     title: str
@@ -96,18 +96,18 @@ class Chart:
     least: float = 0.0
 
     def known(self) -> list[ChartPoints]:
-        """Return the point sets with at least one finite point, without their other points."""
+        """Return the point sets that have at least one finite point, reduced to their finite points."""
         return [finite for points in self.points if len((finite := points.finite()).x)]
 
 
 class Dot(NamedTuple):
-    """A point of a Pareto front's chart.
+    """A point in a chart of quality against cost.
 
     Attributes:
-        cost, spread: along x, with the half-length of its error bar.
-        good: along y.
-        mark: text beside a point of the front; None for the other points.
-        reference: whether costs are compared with this one; it is ringed.
+        cost, spread: cost, drawn along x, and the half-length of its error bar.
+        good: quality, drawn along y.
+        mark: text beside a point on the Pareto front; None for a point that is not on the front.
+        reference: whether other points are compared with this one, which gets a ring.
     """
 
     cost: float
@@ -123,8 +123,8 @@ def curve_chart(
     """Return a chart of values over seconds, steps, views or frames.
 
     Args:
-        unit: "seconds", which become minutes or hours where they are many, or any other label of the x axis.
-        log: use a logarithmic y axis where the values span a large factor.
+        unit: label of the x axis. "seconds" becomes minutes or hours for long times.
+        log: use a logarithmic y axis if the values span a large factor.
     """
     known = [line.finite() for line in lines]
     longest, divisor = float(max((np.max(line.x) for line in known if len(line.x)), default=0.0)), 1.0
@@ -142,7 +142,7 @@ def front_chart(
 
     Args:
         joined: connect the points of the front by a line.
-        most: points that cost more and are not on the front are left out; the x axis says how many.
+        most: largest cost shown; more expensive points off the front are left out, and the x axis says how many.
     """
     known = [dot for dot in dots if math.isfinite(dot.cost) and math.isfinite(dot.good) and dot.cost > 0]
     drawn = [dot for dot in known if dot.cost <= most or dot.mark is not None]
@@ -163,7 +163,7 @@ def front_chart(
 
 
 def draw_svg(chart: Chart) -> str | None:
-    """Return the chart as an ``<svg>`` element in the page's colours; None where there is nothing to draw."""
+    """Return the chart as an ``<svg>`` element in the page's colours; None if there is nothing to draw."""
     from matplotlib.figure import Figure
 
     if not chart.known():
@@ -178,7 +178,7 @@ def draw_svg(chart: Chart) -> str | None:
 
 
 def write_png_charts(path: Path, charts: Sequence[Chart], rows: int = 1) -> None:
-    """Write charts side by side into a PNG file, ``rows`` times as many as a row holds."""
+    """Write charts side by side into a PNG file, in ``rows`` rows."""
     from matplotlib.figure import Figure
 
     charts = [chart for chart in charts if chart.known()]
@@ -253,7 +253,7 @@ def _set_ticks(axis: Axis, log: bool, values: NDArray[np.float64]) -> None:
 
 
 def _format_tick(value: float) -> str:
-    """Write a number without powers of ten: 12k, 0.002, 3M."""
+    """Format a number without powers of ten, e.g. 12k, 0.002, 3M."""
     for size, suffix in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= size:
             return f"{value / size:g}{suffix}"
@@ -261,7 +261,7 @@ def _format_tick(value: float) -> str:
 
 
 def _style() -> AbstractContextManager[None]:
-    """Return matplotlib's settings of every chart, held from the axes' creation to the file."""
+    """Return a context manager with matplotlib's settings for all charts, from creating axes to writing the file."""
     import matplotlib  # slow to import, and only reports need it
 
     settings: Any = {"svg.fonttype": "none", "svg.hashsalt": "neuprim", "font.size": 10}
@@ -271,7 +271,7 @@ def _style() -> AbstractContextManager[None]:
 
 
 def _chart_to_svg_element(figure: Figure, label: str) -> str:
-    """Return a figure as an element of a page: no outside addresses or global styles, own ids, the page's font."""
+    """Return a figure as an ``<svg>`` element: no outside addresses or global styles, unique ids, the page's font."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", transparent=True)
     body = buffer.getvalue()

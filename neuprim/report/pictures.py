@@ -1,4 +1,5 @@
-"""Pictures of a report: error maps, the worst region of each held-out view, and pictures as a part of the page."""
+"""Pictures for report pages: error maps, the worst region of each held-out view, and conversion to ``data:``
+addresses."""
 
 from __future__ import annotations
 
@@ -22,7 +23,7 @@ from neuprim.core.metrics import comparable_images
 ERROR_SCALE = 0.2  # error at the bright end of :func:`error_map` and of the report's colour bar
 
 _INLINE_LIMIT = 400_000
-"""Bytes up to which a picture enters the page unchanged; larger ones are compressed as WebP of quality 90."""
+"""Bytes up to which a picture is embedded unchanged; larger pictures are compressed as WebP of quality 90."""
 
 _SIDE_SHARE, MIN_SIDE = 0.25, 16  # side of a region over the shorter side of its image, and in pixels
 MAX_REGIONS = 60  # largest number of views whose regions are kept: those with the worst regions
@@ -30,7 +31,7 @@ _STEPS = 8  # candidate positions per length of a region's side
 
 
 def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> NDArray[np.uint8]:
-    """Colour the error of a view on a fixed scale, so that maps of different views and runs compare.
+    """Colour the error of a view on a fixed scale, so that maps of different views and runs can be compared.
 
     The mean absolute difference over channels runs linearly from 0 (black) to ``scale`` (pale yellow) through
     matplotlib's perceptually uniform "inferno"; larger errors are drawn as ``scale``.
@@ -47,7 +48,7 @@ def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> ND
 
 
 def color_bar(stops: int = 13) -> str:
-    """Return a CSS gradient of the error map's colours, left to right."""
+    """Return a CSS gradient of the error map's colours, from zero error on the left to the largest on the right."""
     rows = _error_map_colors()[np.linspace(0, 255, stops).round().astype(np.intp)]
     return "linear-gradient(to right, " + ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in rows.tolist()) + ")"
 
@@ -68,7 +69,7 @@ class InlinedPicture:
 
 
 def inline_picture(source: Path | Tensor) -> InlinedPicture | None:
-    """Return a picture file, or an (H, W, 3) image, as a ``data:`` address; None for a damaged file."""
+    """Return a picture file or (H, W, 3) image as a ``data:`` address with its size; None for a damaged file."""
     if isinstance(source, Tensor):
         buffer = io.BytesIO()
         Image.fromarray(images.to_uint8(source).numpy()).save(buffer, "PNG")
@@ -93,7 +94,7 @@ def inline_picture(source: Path | Tensor) -> InlinedPicture | None:
 
 @dataclass(frozen=True)
 class Region:
-    """A square of a view, in pixels from its upper left corner, and its PSNR, dB (infinite where nothing differs)."""
+    """A square region of a view, in pixels from the upper left corner, and its PSNR in dB (may be infinite)."""
 
     view: str
     x: int
@@ -102,12 +103,12 @@ class Region:
     psnr: float
 
     def of(self, image: Tensor) -> Tensor:
-        """Return the (side, side, C) part of an (H, W, C) image."""
+        """Cut the region out of an (H, W, C) image: (side, side, C)."""
         return image[self.y : self.y + self.side, self.x : self.x + self.side]
 
 
 def worst_region(view: str, rendered: Tensor, truth: Tensor) -> Region:
-    """Return the square of a quarter of the shorter side with the largest mean squared error.
+    """Return the square with the largest mean squared error; its side is a quarter of the image's shorter side.
 
     Args:
         rendered, truth: (H, W, C) images in the same colour space.
@@ -124,10 +125,10 @@ def worst_region(view: str, rendered: Tensor, truth: Tensor) -> Region:
 
 
 class WorstRegions:
-    """Collects the worst regions of views as they are measured, and writes those of the worst views.
+    """Collect the worst region of each view while views are measured, and write pictures of the worst ones.
 
     Args:
-        display: turns a linear or many-channelled image into what a picture shows.
+        display: function that converts a linear or multi-channel image to the displayed image.
     """
 
     def __init__(self, display: Callable[[Tensor], Tensor]) -> None:
@@ -135,7 +136,7 @@ class WorstRegions:
         self._found: list[tuple[Region, Tensor]] = []
 
     def add_view(self, name: str, rendered: Tensor, truth: Tensor) -> None:
-        """Remember a view's worst region."""
+        """Find and store the worst region of a view."""
         region = worst_region(name, rendered, truth)
         if not math.isfinite(region.psnr):
             return
@@ -146,7 +147,8 @@ class WorstRegions:
         del self._found[MAX_REGIONS:]
 
     def write(self, folder: Path) -> list[tuple[Region, Path]]:
-        """Write ``worst_000.png`` (truth, render and error side by side), the worst first; return them."""
+        """Write ``worst_000.png`` and so on (truth, render and error side by side), worst first; return regions and
+        paths."""
         written = []
         for place, (region, picture) in enumerate(self._found):
             path = folder / f"worst_{place:03d}.png"

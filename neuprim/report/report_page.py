@@ -1,7 +1,7 @@
-"""The one template of all report pages, the elements they are made of, and values as text.
+"""The template of all report pages, the HTML elements in them, and functions that format values.
 
-Every page stands alone: pictures and charts are part of the file, and its content policy forbids loading anything.
-Every function that takes a text from a file or a user escapes it, unless it says that it takes HTML.
+Every page is one file: pictures and charts are embedded, and its content policy forbids loading anything else.
+Every function escapes its text arguments, unless its docstring says that they are HTML.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ Tile = tuple[str, str, str]  # label, value and note of a number in large type, 
 
 
 def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str = "", script: str = "") -> str:
-    """Return a whole page.
+    """Return the HTML text of a complete report page.
 
     Args:
         title: title of the browser's tab.
-        sections: HTML, in their order; empty ones leave no gap.
-        kind: class of the page's body; ``compared`` for pages that compare runs.
-        policy: appended to the content policy.
+        sections: HTML of the sections, in order; empty sections leave no gap.
+        kind: CSS class of the page's body; ``compared`` for pages that compare runs.
+        policy: sources appended to the content policy.
         script: HTML of a script, which ``policy`` must allow.
     """
     template = Template(files("neuprim.report").joinpath("page.html").read_text(encoding="utf-8"))
@@ -43,7 +43,7 @@ def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str
 
 
 def inline_script(name: str) -> tuple[str, str]:
-    """Return a script of this package as HTML, and the source that the content policy must list to allow it."""
+    """Return a script of this package as HTML, and the source that the content policy must list to allow the script."""
     text = files("neuprim.report").joinpath(name).read_text(encoding="utf-8")
     digest = base64.b64encode(hashlib.sha256(text.encode()).digest()).decode()
     return f"<script>{text}</script>", f"'sha256-{digest}'"
@@ -53,34 +53,34 @@ def inline_script(name: str) -> tuple[str, str]:
 
 
 def section(title: str, body: str) -> str:
-    """Return HTML under a heading; "" where there is none."""
+    """Return a section under a heading; "" if ``body`` is empty. Both arguments are HTML."""
     return f"<section><h2>{title}</h2>{body}</section>\n" if body else ""
 
 
 def report_note(text: str) -> str:
-    """Return a paragraph of explanation; takes HTML."""
+    """Return a paragraph of explanation as HTML; ``text`` is HTML."""
     return f'<p class="note">{text}</p>'
 
 
 def report_folded(title: str, body: str) -> str:
-    """Return HTML that opens with a click."""
+    """Return a section that opens with a click. Both arguments are HTML."""
     return f"<details><summary>{title}</summary>{body}</details>"
 
 
 def masthead(eyebrow: str, title: str, badge: str = "", more: str = "") -> str:
-    """Return the head of a page: a small line, its heading, a marked note ("" for none), and more HTML."""
+    """Return the head of a page: a small line above the title, a badge ("" for none), and ``more``, which is HTML."""
     head = f'<p class="eyebrow">{escape(eyebrow)}</p>\n<h1>{escape(title)}</h1>'
     mark = f'\n<p class="badge">{escape(badge)}</p>' if badge else ""
     return f'<header class="masthead"><div>{head}{mark}{more}</div></header>'
 
 
 def report_banner(notes: Iterable[str]) -> str:
-    """Return a banner with warnings; takes HTML."""
+    """Return a banner with warnings as HTML; ``notes`` are HTML."""
     return "".join(f'<p class="banner" role="status">{text}</p>' for text in notes)
 
 
 def report_tiles(items: Iterable[Tile]) -> str:
-    """Return numbers in large type."""
+    """Return tiles with key numbers in large type, as HTML."""
     cells = "".join(
         f'<div class="tile"><dt>{label}</dt><dd>{value}</dd><dd class="note" title="{text}">{text}</dd></div>'
         for label, value, text in items
@@ -89,10 +89,10 @@ def report_tiles(items: Iterable[Tile]) -> str:
 
 
 def figure(source: Path | Tensor, caption: str, alternative: str, attributes: str = "") -> str:
-    """Return a picture with its caption; a box with a note where its file is missing or damaged.
+    """Return a picture with its caption as HTML; a box with a note if the file is missing or damaged.
 
     Args:
-        source: a file, or an (H, W, 3) image.
+        source: a picture file, or an (H, W, 3) image.
         caption, alternative, attributes: HTML.
     """
     under = f"<figcaption>{caption}</figcaption>" if caption else ""
@@ -104,7 +104,7 @@ def figure(source: Path | Tensor, caption: str, alternative: str, attributes: st
 
 
 def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> str:
-    """Return charts with their captions, HTML; those without points are left out."""
+    """Return charts as HTML, each with its caption, which is HTML. Charts without points are left out."""
     panels = [
         f'<figure class="panel"><figcaption>{caption}</figcaption>{drawn}</figure>'
         for caption, chart in charts
@@ -114,26 +114,26 @@ def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> s
 
 
 def number_table(head: Iterable[str], rows: Iterable[str], kind: str = "numbers") -> str:
-    """Return a table of HTML rows under titles, as HTML."""
+    """Return a table as HTML; titles and rows (:func:`table_row`) are HTML."""
     titles = "".join(title if title.startswith("<th") else f"<th>{title}</th>" for title in head)
     table = f'<table class="{kind}"><thead><tr>{titles}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     return f'<div class="scroll">{table}</div>'
 
 
 def table_row(name: str, cells: Iterable[str], attributes: str = "") -> str:
-    """Return a row of a table: its heading and its cells, as HTML."""
+    """Return one row of a table as HTML: its heading and its cells, which are HTML."""
     body = "".join(cell if cell.startswith("<td") else f"<td>{cell}</td>" for cell in cells)
     return f"<tr{attributes}><th scope=row>{name}</th>{body}</tr>"
 
 
 def command_line(text: str, purpose: str = "") -> str:
-    """Return a command with a copy button, which appears where scripts run, and what the command is for."""
+    """Return a command line as HTML, with the purpose of the command, and a copy button if scripts run."""
     button = '<button type="button" class="copy" hidden>Copy</button>'
     return f"<code>{escape(text)}</code>{button}" + (f"<span>{escape(purpose)}</span>" if purpose else "")
 
 
 def fact_list(pairs: Iterable[tuple[str, object]]) -> str:
-    """Return names and values, both as text."""
+    """Return a list of names and values as HTML; both are text."""
     cells = "".join(f"<div><dt>{escape(name)}</dt><dd>{escape(value)}</dd></div>" for name, value in pairs)
     return f'<dl class="facts">{cells}</dl>'
 
@@ -147,7 +147,7 @@ def escape(value: object) -> str:
 
 
 def format_report_setting(value: object) -> str:
-    """Write a setting as users type it: ``true``, ``null``, ``0.001``, ``[1, 2]``; strings bare. Not escaped."""
+    """Format a setting as users type it: ``true``, ``null``, ``0.001``, ``[1, 2]``; strings bare. Not escaped."""
     if isinstance(value, str):
         return value
     if value is None or isinstance(value, bool | int | float | Sequence | Mapping):
@@ -156,7 +156,7 @@ def format_report_setting(value: object) -> str:
 
 
 def format_decimal(value: float | None, digits: int, unit: str = "") -> str:
-    """Write a fixed number of decimals and a unit; the infinity sign for infinite values."""
+    """Format a number with ``digits`` decimals and a unit; infinite values as the infinity sign."""
     if value is None:
         return MISSING
     text = f"{value:,.{digits}f}" if math.isfinite(value) else ("∞" if value > 0 else "−∞")
@@ -164,7 +164,7 @@ def format_decimal(value: float | None, digits: int, unit: str = "") -> str:
 
 
 def format_report_count(value: object) -> str:
-    """Write a whole number with thousands separated; other numbers with up to two decimals."""
+    """Format a whole number with thousands separators; other numbers with up to two decimals."""
     found = as_reported_number(value)
     if found is None:
         return MISSING
@@ -172,7 +172,7 @@ def format_report_count(value: object) -> str:
 
 
 def format_report_bytes(value: object) -> str:
-    """Write a size in bytes, in powers of 1000."""
+    """Format a size in bytes with a unit, in powers of 1000."""
     found = as_reported_number(value)
     if found is None:
         return MISSING
@@ -184,7 +184,7 @@ def format_report_bytes(value: object) -> str:
 
 
 def format_report_duration(seconds: object) -> str:
-    """Write ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
+    """Format a duration as ``8.3 s``, ``4 min 07 s`` or ``2 h 05 min``."""
     found = as_reported_number(seconds)
     if found is None:
         return MISSING

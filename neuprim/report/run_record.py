@@ -1,4 +1,4 @@
-"""Read a run directory for report pages: its numbers, curve and pictures, whether or not the run has ended."""
+"""Read a run directory for report pages: metrics, curve and pictures of a run, finished or not."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neuprim.core.metrics import metric_from_json
 
 @dataclass(frozen=True)
 class ViewFiles:
-    """The pictures of one held-out view: its index in the split, its name as in file names, and their paths."""
+    """The picture files of one held-out view: its index in the split, its name in file names, and the files' paths."""
 
     index: int
     stem: str
@@ -27,11 +27,11 @@ class ViewFiles:
 
 @dataclass(frozen=True)
 class ReportedRun:
-    """Content of a run directory that report pages show.
+    """The content of a run directory that report pages show.
 
     Attributes:
-        metrics: content of ``metrics.json``; empty while the run has not finished.
-        log: lines of ``metrics.jsonl``, without those that a kill cut short.
+        metrics: content of ``metrics.json``; empty if the run has not finished.
+        log: complete lines of ``metrics.jsonl``.
         views, clips: pictures and films in ``renders/``.
     """
 
@@ -43,7 +43,7 @@ class ReportedRun:
 
     @property
     def shown(self) -> str:
-        """Text that says which channels pictures show; empty if they are red, green and blue, or grey."""
+        """Text that says which channels the pictures show; empty if the channels are red, green and blue, or grey."""
         return str(self.metrics.get("shown") or "")
 
     @property
@@ -53,19 +53,21 @@ class ReportedRun:
         return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
     def numbers_of(self, view: ViewFiles) -> Mapping[str, Any]:
-        """Return the metrics of a pictured view; empty if there are none."""
+        """Return the metrics of a view that has pictures; empty if there are none."""
         entries = self.view_numbers
         return entries[view.index] if view.index < len(entries) else {}
 
     def series(self, x: str, y: str) -> tuple[list[float], list[float]]:
-        """Return the values of two keys, from the log lines that have finite numbers for both."""
+        """Return the values of the keys ``x`` and ``y`` from all log lines in which both are finite."""
         pairs = [(as_reported_number(line.get(x)), as_reported_number(line.get(y))) for line in self.log]
         known = [(a, b) for a, b in pairs if a is not None and b is not None]
         return [a for a, _ in known], [b for _, b in known]
 
 
 def median_and_worst(views: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
-    """Return the indices of the views with the median (the lower of two) and the lowest PSNR, as far as they differ.
+    """Return the indices of the view with the median PSNR (the lower of two) and of the view with the lowest PSNR.
+
+    If both are the same view, its index is returned once.
 
     Args:
         views: entries of ``per_view`` in ``metrics.json``; those without a PSNR are left out.
@@ -83,7 +85,7 @@ def as_reported_number(value: object) -> float | None:
 
 
 def read_reported_run(run_dir: Path) -> ReportedRun:
-    """Read a run directory; files that are missing leave their part empty.
+    """Read a run directory. The fields of missing files stay empty.
 
     Raises:
         DataError: ``metrics.json`` is damaged, or a file cannot be read.
@@ -111,7 +113,7 @@ def _parse_reported_line(text: str) -> Mapping[str, Any] | None:
 
 
 def _find_reported_views(folder: Path) -> list[ViewFiles]:
-    """Return the views with pictures. A view's error map is written last, so its other pictures exist, too."""
+    """Return the views that have pictures. A view's error map is written last, so if it exists the others do, too."""
     views = []
     for error in folder.glob("test_*_error.png"):
         name = error.stem.removesuffix("_error")

@@ -1,4 +1,4 @@
-"""The report of one run: ``report.html`` with its model, held-out views, measurements, curves and settings."""
+"""Write the report of one run, ``report.html``: interactive model, held-out views, measurements, curves, settings."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _VIEWER_FILE = "viewer.html"
 
 @dataclass(frozen=True)
 class Viewer:
-    """A page that draws the model, and the nonce of its scripts, which the report's content policy must allow."""
+    """An HTML page that renders the model, and its scripts' nonce, which the report's content policy must allow."""
 
     text: str
     nonce: str
@@ -53,15 +53,16 @@ def write_report(
     regions: Sequence[tuple[Region, Path]] = (),
     command: str = "",
 ) -> Path:
-    """Write ``report.html`` into the directory of a run that has just been measured, and return its path.
+    """Write ``report.html`` into a run directory that holds ``metrics.json``; return the report's path.
 
-    An earlier report is replaced only once the new one is complete.
+    An earlier report is replaced only when the new one is complete.
 
     Args:
-        conditions: those of the run's task; the commands that the page offers animate them.
-        viewer: becomes a part of the page, or ``viewer.html`` beside it where both exceed :data:`VIEWER_LIMIT`.
-        regions: the worst regions with their pictures, the worst first.
-        command: command that made the run; "" where no single command did.
+        conditions: conditions of the run's task, for which the page shows commands that animate them.
+        viewer: page that renders the model. It is embedded, or written as ``viewer.html`` if the report would exceed
+            :data:`VIEWER_LIMIT`.
+        regions: the worst regions with their pictures, worst first.
+        command: command line that made the run; "" if no single command made it.
 
     Raises:
         DataError: ``metrics.json`` is damaged.
@@ -106,7 +107,7 @@ def _embed_viewer(viewer: Viewer) -> tuple[str, str]:
 
 
 def _report_head(run: ReportedRun, command: str) -> str:
-    """Return task and scene, a badge unless the data is real, the command, and where and when it was measured."""
+    """Return the report's head: task and scene, a badge if the data are not real, command, machine and date."""
     metrics = run.metrics
     source, drawn = str(metrics.get("data_source")), metrics.get("rendered_from")
     badge = "" if source == "real" else _SOURCES.get(source, source)
@@ -135,7 +136,7 @@ def _report_warnings(metrics: Mapping[str, Any]) -> list[str]:
 
 
 def _report_headline(metrics: Mapping[str, Any]) -> str:
-    """Return quality, size and training time in large type, as far as they were measured."""
+    """Return tiles with quality, size and training time, as far as they were measured."""
     psnr, worst = (metric_from_json(metrics, key) for key in ("psnr", "psnr_worst"))
     tiles: list[Tile] = []
     if psnr is not None:
@@ -163,7 +164,7 @@ def _report_orbit(run: ReportedRun) -> str:
 
 
 def _report_comparison(run: ReportedRun) -> str:
-    """Return the frame in which ``run.js`` shows ground truth and render of a view, with a divider between them."""
+    """Return the HTML element in which ``run.js`` shows ground truth and render of a view with a divider."""
     pictured = {view.index for view in run.views}
     chosen = zip(median_and_worst(run.view_numbers), ("Median view", "Worst view"), strict=False)
     buttons = "".join(_view_button(index, text) for index, text in chosen if index in pictured)
@@ -178,7 +179,7 @@ def _report_comparison(run: ReportedRun) -> str:
 
 
 def _view_button(index: int, text: str) -> str:
-    """Return a button that compares a view's pictures; ``run.js`` shows it."""
+    """Return a button that opens a view's pictures in the comparison; ``run.js`` makes it visible."""
     return f'<button type="button" data-view="view-{index}" hidden>{text}</button>'
 
 
@@ -192,12 +193,12 @@ def _report_films(run: ReportedRun) -> str:
 
 
 def _report_shown_channels(run: ReportedRun) -> str:
-    """Return a line on what pictures show of the channels, where that is not plain colour."""
+    """Return a line that says which channels the pictures show; "" for plain colour."""
     return report_note(f"Shown: {escape(run.shown)}.") if run.shown else ""
 
 
 def _report_held_out_section(run: ReportedRun) -> str:
-    """Return ground truth, render and error map of each pictured view with its numbers, and their scale once."""
+    """Return a section with ground truth, render, error map and metrics of each pictured view, and the error scale."""
     bar = f'0<span class="bar" style="background: {color_bar()}"></span>{ERROR_SCALE:g} or more'
     scale = report_note(f"Error: mean absolute difference over {'all ' if run.shown else ''}channels, {bar}.")
     orders = (("0", "view"), ("1", "PSNR, lowest first"), ("-1", "PSNR, highest first"))
@@ -222,7 +223,7 @@ def _report_view(run: ReportedRun, view: ViewFiles) -> str:
 
 
 def _report_worst_regions(regions: Sequence[tuple[Region, Path]]) -> str:
-    """Return the square of every held-out view with the largest error, worst first, folded after the first six."""
+    """Return a section with the worst region of the held-out views, worst first; all after the sixth are folded."""
     figures = []
     for region, path in regions:
         name, place = escape(region.view), f"{region.side}×{region.side} at ({region.x}, {region.y})"
@@ -265,7 +266,7 @@ def _report_curves(run: ReportedRun) -> str:
 
 
 def _report_commands_section(run: ReportedRun, conditions: Sequence[ConditionSpec]) -> str:
-    """Return commands for this run, among them an animation of each condition of the task that has one."""
+    """Return a section with commands for this run, including one that animates each condition that can be animated."""
     folder = shlex.quote(str(run.run_dir))
     orbit = f"neuprim render {folder} --camera orbit"
     lines = [(f"neuprim view {folder}", "open the model in the viewer"), (orbit, "render a camera orbit")]
@@ -280,7 +281,7 @@ def _report_commands_section(run: ReportedRun, conditions: Sequence[ConditionSpe
 
 
 def _report_details(run: ReportedRun) -> str:
-    """Return, folded, all measurements, settings and versions."""
+    """Return a folded section with all measurements, settings and versions."""
     views, file = _report_view_table(run.view_numbers), run.run_dir / "config.yaml"
     parts = {
         "All measurements": page.fact_list(_report_measurements(run.metrics)),
@@ -293,7 +294,7 @@ def _report_details(run: ReportedRun) -> str:
 
 
 def _report_measurements(metrics: Mapping[str, Any]) -> list[tuple[str, object]]:
-    """Return name and value of what the tiles leave out, as far as it was measured."""
+    """Return (name, value) of the measurements that the tiles do not show."""
     rows: list[tuple[str, str, int, str]] = [
         ("PSNR of sRGB images", "psnr_srgb", 2, "dB"),
         ("PSNR of displayed images", "psnr_display", 2, "dB"),

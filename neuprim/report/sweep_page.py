@@ -1,4 +1,4 @@
-"""The page of a sweep: its runs in one table, their curves in one chart, and the same held-out views side by side."""
+"""Write the page of a sweep: one table and one chart of all runs, and the same held-out views of runs side by side."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _LESS = (
     *("lpips", "flip", "model_bytes", "primitives", "parameters", "train_seconds"),
     *("sigma_relative", "sigma_max_error"),
 )
-"""Prefixes of the names of metrics of which a higher, or a lower, value is better. Others are not ranked."""
+"""Prefixes of names of metrics: higher is better, and lower is better. Other metrics are not ranked."""
 
 _FIRST = (
     *("psnr", "ssim", "psnr_worst", "psnr_mask", "lpips"),
@@ -32,21 +32,21 @@ _FIRST = (
 _TITLES = {"psnr": "PSNR", "ssim": "SSIM", "lpips": "LPIPS", "model_bytes": "model file", "train_seconds": "training"}
 
 _NOT_COMPARED = ("psnr_black_image", "seed", "vdb_bytes")
-"""Prefixes of the names of numbers that describe the data or the request instead of the result."""
+"""Prefixes of names of metrics that describe the data or the request instead of the result."""
 
 _MOST_PICTURES, _MOST_VIEWS = 8, 3  # runs whose pictures are shown, and held-out views of each
 
 
 @dataclass(frozen=True)
 class SweepPageRun:
-    """One run of a sweep.
+    """One run of a sweep, as the sweep's page shows it.
 
     Attributes:
-        name: name of its folder in the sweep's.
+        name: name of the run's folder in the sweep's directory.
         swept: key -> value, as typed, of the settings that differ between runs.
-        state, line: how it ended, and why it failed.
-        seconds, attempts: time from its start to its end; number of starts.
-        run: content of its directory.
+        state, line: how the run ended, and why it failed.
+        seconds, attempts: time from the run's start to its end; number of starts.
+        run: content of the run's directory.
     """
 
     name: str
@@ -59,14 +59,14 @@ class SweepPageRun:
 
     @property
     def numbers(self) -> dict[str, float]:
-        """Metric -> value, for the entries of ``metrics.json`` that are one number; empty for an unfinished run."""
+        """Metric -> value, for entries of ``metrics.json`` that are a single number; empty for an unfinished run."""
         metrics = self.run.metrics
         found = {name: metric_from_json(metrics, name) for name in metrics if not name.endswith("_infinite")}
         return {name: value for name, value in found.items() if value is not None}
 
 
 def better_sign(name: str) -> int:
-    """Return 1 if a higher value of a metric is better, -1 if a lower one is; 0 if that is not known."""
+    """Return 1 if a higher value of the metric is better, -1 if a lower one is better, 0 if this is not known."""
     if name == "parameters_per_primitive":
         return 0
     signs = {**dict.fromkeys(_MORE, 1), **dict.fromkeys(_LESS, -1)}
@@ -74,9 +74,9 @@ def better_sign(name: str) -> int:
 
 
 def write_sweep_page(folder: Path, runs: Sequence[SweepPageRun], words: Sequence[str]) -> Path:
-    """Write ``sweep.html`` into a sweep's directory, finished or not, and return its path.
+    """Write ``sweep.html`` into the directory of a sweep, finished or not; return the path.
 
-    The page needs no other files; without scripts its runs are in the order of the mean PSNR.
+    The page needs no other files. Runs are sorted by mean PSNR until a script sorts them otherwise.
 
     Args:
         words: overrides of the sweep, as after ``neuprim run -m``.
@@ -172,7 +172,7 @@ def _charts(runs: Sequence[SweepPageRun], colours: Mapping[str, str]) -> str:
 
 
 def _views_side_by_side(runs: Sequence[SweepPageRun]) -> str:
-    """Return a few views, evenly spread, of the first runs, which are the best."""
+    """Return a section with a few held-out views, evenly spread, of the first runs in ``runs``, which are the best."""
     pictured = [run for run in runs if run.run.views]
     if not pictured:
         return ""

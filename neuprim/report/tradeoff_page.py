@@ -1,4 +1,4 @@
-"""The page of ``neuprim tradeoff``: fronts, pictures of their points, and the numbers of all points."""
+"""Write the page of ``neuprim tradeoff``: Pareto fronts, pictures of the points on them, and a table of all points."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Command = Callable[[Sequence[str]], str]
 
 
 class TradeoffPicture(NamedTuple):
-    """Displayed image of a point, (H, W, 3) sRGB, and the image that it is compared with (None: not compared)."""
+    """Displayed image of a trade-off's point, (H, W, 3) sRGB, and the image that the page compares it with, or None."""
 
     image: Tensor
     against: Tensor | None
@@ -36,9 +36,9 @@ def write_tradeoff_page(
     """Write ``tradeoff.html`` and ``front.png`` into ``folder``.
 
     Args:
-        record: content of ``tradeoff.json``, of a finished run or of trained models.
+        record: content of ``tradeoff.json``: points are render configurations of a finished run, or trained models.
         pictures: number of a point -> its picture; -1 is the ground truth.
-        command: overrides of a point -> the command that draws or trains it.
+        command: function that returns, for a point's overrides, the command that renders or trains the point.
     """
     page = _TradeoffPage(record, pictures, command)
     title = f"{record['task']} / {record['scene']}"
@@ -87,7 +87,7 @@ class _TradeoffPage:
         return elements.masthead(eyebrow, title, badge, more)
 
     def fronts(self) -> list[Chart]:
-        """Return charts of PSNR against time and bytes; for a finished run the latter has only smaller points."""
+        """Return charts of PSNR against time and bytes. For a finished run the latter only has smaller models."""
         bytes_of = [float(point["bytes"]) for point in self.points]
         sized = [i for i, size in enumerate(bytes_of) if self.trained or i == 0 or size < bytes_of[0]]
         dots = [Dot(bytes_of[i], self.quality(i), 0.0, self._mark("size", i), i == 0) for i in sized]
@@ -116,7 +116,7 @@ class _TradeoffPage:
         return section("Fronts", panels + report_note(text))
 
     def cards(self, front: str, title: str, text: str) -> str:
-        """Return a card with picture, numbers and command for every point of a front."""
+        """Return a card for every point of a front, with picture, metrics and command, as HTML."""
         cards = [self._card(-1, "ground truth", "")] if -1 in self.pictures else []
         if 0 not in self.front[front]:
             cards.append(self._card(0, escape(self.points[0]["name"]), self.reference))

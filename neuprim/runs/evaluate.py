@@ -36,9 +36,11 @@ _ORBIT_FRAMES = 36
 
 
 def evaluate_fitted(fitted: Fitted, directory: Path, command: str = "") -> dict[str, Any]:
-    """Write ``metrics.json``, ``renders/`` and the report of a model saved in ``directory``; returns the metrics.
+    """Write ``metrics.json``, ``renders/`` and the report of a trained model into ``directory``; return the metrics.
 
-    The report shows ``command``, the command line that made the run; "" if there is no single one.
+    Args:
+        fitted: a trained model that is saved in ``directory``.
+        command: command line that made the run, shown in the report; "" if no single command made it.
     """
     task, dataset, model, settings = fitted.task, fitted.dataset, fitted.model, fitted.config.renderer
     display = fitted.channels.display
@@ -99,7 +101,7 @@ def evaluate_fitted(fitted: Fitted, directory: Path, command: str = "") -> dict[
 
 
 def _make_run_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
-    """Return the viewer page of the model; None of a model that a page cannot show."""
+    """Return an interactive web page that shows the model; None if a page cannot show this kind of model."""
     task, dataset, channels, model = fitted.task, fitted.dataset, fitted.channels, fitted.model
     settings = fitted.config.renderer
     if channels.own is not None or channels.rgb is None or None in (model.density.script(), model.colour.script()):

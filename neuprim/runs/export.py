@@ -36,17 +36,17 @@ def export_run(
     overwrite: bool = False,
     progress: Progress = ignore_progress,
 ) -> ExportReport:
-    """Write a run's model in the export format ``name``; the files are complete or absent.
+    """Write a run's model in the export format ``name``. An export that fails leaves no partial files.
 
-    They are in ``RUN_DIR/export`` unless ``out`` is given. Only ``overwrite`` replaces existing files.
+    The files go to ``RUN_DIR/export`` unless ``out`` is given. Existing files are only replaced with ``overwrite``.
 
     Args:
         words: ``KEY=VALUE`` options of the exporter, and conditions of the task as ``--NAME TEXT`` or ``--NAME=TEXT``.
         progress: called with (text, fraction 0..1).
 
     Raises:
-        NeuprimError: run, format or option do not exist, the format cannot hold the model, files exist already, or the
-            exporter crashed.
+        NeuprimError: the run, format or option does not exist, the format cannot hold the model, the files exist
+            already, or the exporter crashed.
     """
     run_dir = run.directory if isinstance(run, StoredRun) else run
     try:
@@ -81,7 +81,7 @@ def _run_export_destination(run_dir: Path, exporter: Exporter, out: Path | None)
 
 
 def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) -> tuple[Path, ...]:
-    """Return the final paths of the files in a report. Raises PluginError for a wrong report."""
+    """Return the final paths of the files that an exporter reported. Raises PluginError if the report is wrong."""
     if not isinstance(report, ExportReport):
         raise PluginError(f"{exporter}: write returned {type(report).__name__}; expected an ExportReport")
     files = []
@@ -101,7 +101,7 @@ def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) ->
 def _parse_run_export_options(
     words: Sequence[str], exporter: Exporter, specs: Sequence[ConditionSpec]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the exporter's options, with defaults, and the texts of conditions."""
+    """Split the command's words into the exporter's options, completed with defaults, and the texts of conditions."""
     options = {name: default for name, (default, _) in exporter.options.items()}
     conditions, rest = split_conditions(words, specs)
     if conditions and not exporter.conditions:
@@ -137,14 +137,14 @@ def _parse_run_export_option(text: str) -> Any:
 
 
 def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path:
-    """Create a run directory from a file of a lossless exporter or of ``neuprim compress``; return it.
+    """Create a run directory from a file written by a lossless exporter or by ``neuprim compress``; return its path.
 
-    It has ``config.yaml`` and ``model.safetensors``, or the compressed file as ``model.neuprim``. Commands accept it
-    like the original run.
+    The new directory holds ``config.yaml``, and the model as ``model.safetensors``, or compressed as
+    ``model.neuprim``. Commands accept it like the original run.
 
     Raises:
         ConfigError: ``out`` exists and is not empty, or no format reads such files.
-        DataError: the file is damaged or foreign.
+        DataError: the file is damaged or was not written by neuprim.
         CheckpointError: the model in the file is damaged.
     """
     if not path.is_file():
@@ -171,7 +171,7 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
 
 
 def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
-    """Write a stored model as the run directory ``out``. It is loaded once before, so that ``out`` is always valid."""
+    """Write a stored model as the run directory ``out``. The result is loaded once before it becomes ``out``."""
     header: Mapping[str, Any] = {key: value for key, value in stored.header.items() if key not in ("format", "kind")}
     tensors = {name: torch.from_numpy(value) for name, value in stored.tensors.items()}
 
@@ -182,7 +182,7 @@ def import_model_as_run(stored: StoredModel, path: Path, out: Path) -> Path:
 
 
 def _write_imported_run(path: Path, out: Path, config: str, write: Callable[[Path], object]) -> Path:
-    """Create and validate a run directory from the text of ``config.yaml`` and a function that writes the model."""
+    """Create and validate a run directory with the text of ``config.yaml``; ``write`` writes the model's file."""
     out.parent.mkdir(parents=True, exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix=f".{out.name}-", dir=out.parent))
     try:

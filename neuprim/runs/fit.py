@@ -1,6 +1,6 @@
 """Train in memory: load the data of a configuration, create its model and train it, without a run directory.
 
-A training reports its progress as events. It calls a listener, a function of one event, on the training thread.
+A training reports its progress as events: it calls a listener function with each event, on the training thread.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ from neuprim.runs.measure import measure_views, render_image, summarize_run_metr
 from neuprim.runs.open import load_dataset
 
 _CURVE_VIEWS = 5
-"""Number of held-out views that a point of the held-out curve averages."""
+"""Number of held-out views that are measured during the training."""
 
 _CURVE_PSNR_MAX = 200.0
-"""Upper bound of a view's PSNR in the curve, dB: equal images have an infinite PSNR, which JSON cannot represent."""
+"""Upper bound of a view's PSNR during the training, dB. Equal images have an infinite PSNR, which JSON cannot store."""
 
 _TRIAL_PRIMITIVES, _TRIAL_STEPS, _TRIAL_SECONDS, _TRIAL_WARM = 10_000, 20, 2.0, 3
 """Trial training that measures the time per step: number of primitives (fewer if the data offer fewer starting points),
@@ -53,7 +53,7 @@ __all__ = ["Evaluated", "Finishing", "Fitted", "Note", "Preparing", "Step", "fit
 
 @dataclass(frozen=True)
 class Preparing:
-    """Event: work before the training loop."""
+    """Event: progress of work before the training loop, such as loading data and compiling kernels."""
 
     text: str
     fraction: float = 0.0  # done fraction of the work, 0..1
@@ -61,7 +61,7 @@ class Preparing:
 
 @dataclass(frozen=True)
 class Step:
-    """Event: one training step."""
+    """Event: one training step has ended."""
 
     report: StepReport
     progress: float  # used fraction of the budget, 0..1
@@ -69,21 +69,21 @@ class Step:
 
 @dataclass(frozen=True)
 class Evaluated:
-    """Event: a new point of the held-out curve."""
+    """Event: held-out views were measured during the training."""
 
     psnr: float  # mean PSNR of a few held-out views, dB
 
 
 @dataclass(frozen=True)
 class Finishing:
-    """Event: work after the training loop."""
+    """Event: work after the training loop has started, such as measuring held-out views."""
 
     text: str
 
 
 @dataclass(frozen=True)
 class Note:
-    """Event: a line of text for the user, which stays on the screen."""
+    """Event: a line of text for the user. A display keeps it on the screen."""
 
     text: str
 
@@ -93,7 +93,7 @@ Events = Callable[[Event], None]
 
 
 def ignore_run_event(event: Event) -> None:
-    """Do nothing."""
+    """Ignore an event: the default listener of a training."""
 
 
 # ---------------------------------------------------------------- fit
@@ -145,7 +145,7 @@ def fit(config: RunConfig, events: Events = ignore_run_event, dataset: Dataset |
         dataset: the scene of the configuration, if it is loaded already.
 
     Raises:
-        NeuprimError: the input is wrong, or numbers are not finite.
+        NeuprimError: the input is wrong, or the training produced numbers that are not finite.
     """
     with find_config_plugins(config).attribute_errors():
         return train_to_end(prepare_training(config, events, dataset), events)
@@ -169,11 +169,11 @@ def prepare_training(
     make: TrainerFactory | None = None,
     group: ProcessGroup | None = None,
 ) -> Fitted:
-    """Load the data and create loss, model and trainer, up to the first step. Raises the errors of :func:`fit`.
+    """Load the data and create loss, model and trainer; run no step. Raises the errors of :func:`fit`.
 
     Args:
-        hold_out: n > 1: every n-th training view replaces the test views; 0: the data are taken as they are.
-        make: makes the trainer; None: :func:`make_run_trainer`, of a fresh model.
+        hold_out: n > 1: every n-th training view is held out and replaces the test views; 0: use the splits unchanged.
+        make: function that makes the trainer; None: :func:`make_run_trainer`, which creates an untrained model.
         group: the ranks that train the model together; None for one process.
     """
     if make is None:
@@ -215,9 +215,9 @@ def prepare_training(
 
 
 def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iterator[tuple[StepReport, float | None]]:
-    """Train until the budget is used; yield each step's report, with the held-out PSNR at points of the curve.
+    """Train until the budget is used; yield (report, held-out PSNR) after each step.
 
-    Between two steps the caller may save the state or leave the loop.
+    The PSNR is None except every ``eval_every``. Between two steps the caller may save the state or leave the loop.
     """
     next_point = _next_run_curve_progress(trainer)
     for report in trainer.run():
@@ -238,13 +238,13 @@ def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iter
 
 
 def _next_run_curve_progress(trainer: Trainer) -> float:
-    """Return the progress, 0..1, at the next point of the held-out curve; infinity if ``eval_every`` is 0."""
+    """Return the progress, 0..1, at which held-out views are measured next; infinity if ``eval_every`` is 0."""
     every = trainer.settings.eval_every
     return (int(trainer.progress / every + 1e-9) + 1) * every if every > 0 else float("inf")
 
 
 def measure_run_curve_point(trainer: Trainer) -> float:
-    """Return the mean PSNR of a few held-out views, each at most 200 dB; the training state does not change."""
+    """Return the mean PSNR of a few held-out views, each clamped to 200 dB, without changing the training state."""
     views, background = trainer.dataset.test, trainer.dataset.background
     chosen = sorted({i * len(views) // _CURVE_VIEWS for i in range(_CURVE_VIEWS)})
     total = 0.0
@@ -263,7 +263,7 @@ def make_run_loss(job: Job) -> Loss:
     """Make the loss of a job: its task's own, or the one that ``train.loss`` names.
 
     Raises:
-        ConfigError: no such loss, or an option that it refuses.
+        ConfigError: the loss does not exist, or refuses an option.
         PluginError: the loss of another package cannot be made.
     """
     config, task = job.config, job.task
@@ -275,13 +275,13 @@ def make_run_loss(job: Job) -> Loss:
 
 
 def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup | None = None) -> Trainer:
-    """Make an untrained model for a job, and return its trainer.
+    """Make an untrained model for a job, and return a trainer for it.
 
     Args:
         group: the ranks that train the model together; None for one process.
 
     Raises:
-        ConfigError: a rate or starting value for something the model does not have.
+        ConfigError: a learning rate or initial value is set for a parameter that the model does not have.
         DataError: the data set offers no starting point.
         PluginError: the task of another package does not build what the data set needs.
     """
@@ -306,8 +306,8 @@ def make_run_trainer(job: Job, dataset: Dataset, loss: Loss, group: ProcessGroup
 
 
 def drop_unused_run_rates(train: TrainSettings, task: TaskSpec, model: Primitives) -> TrainSettings:
-    """Drop the rates of parameters that the model does not have: a preset has rates for every density and colour of its
-    task, and the trainer refuses other names."""
+    """Return the settings without learning rates for parameters that the model does not have. A preset has rates for
+    every density and colour field of its task, and the trainer refuses unknown names."""
     others = task.parameter_names() - model.params.keys()
     rates = {k: v for k, v in train.rates.items() if k not in others}
     units = {k: v for k, v in train.rate_units.items() if k not in others}
@@ -320,7 +320,9 @@ def _starting_count_of_run(config: RunConfig) -> int:
 
 
 def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> int:
-    """Return the number of primitives that a trial's pace allows in ``train.max_seconds`` (model.primitives=auto)."""
+    """Return the number of primitives that can be trained in ``train.max_seconds``, for ``model.primitives=auto``. A
+    few steps of a trial model give the time per step.
+    """
     config = job.config
     whole = replace(config.train, population=replace(config.train.population, grow_from=1.0))
     trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES), train=whole)
@@ -340,7 +342,7 @@ def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> 
 
 
 def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> None:
-    """Compile the kernels outside the training clock: one throw-away step on a copy of a few primitives."""
+    """Compile the kernels before the training clock starts, by one step on a temporary copy of a few primitives."""
     events(Preparing("loading kernels; once per installation they are compiled, which takes about a minute"))
     model = trainer.model
     rows = torch.arange(0, model.count, max(model.count // 64, 1))  # some of them are active in the view
@@ -354,7 +356,7 @@ def compile_run_kernels(trainer: Trainer, events: Events = ignore_run_event) -> 
 
 @contextmanager
 def use_one_torch_thread_for_run() -> Iterator[None]:
-    """Limit PyTorch to one thread: its tensors are small, and its pool would spin on the cores the kernels need."""
+    """Limit PyTorch to one thread: its tensors are small, and its threads would take cores from the kernels."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
@@ -364,11 +366,11 @@ def use_one_torch_thread_for_run() -> Iterator[None]:
 
 
 def is_chunked(config: RunConfig) -> bool:
-    """Return whether the scene is fitted in chunks. Other scenes may use the setting ``chunks`` for something else."""
+    """Return whether the scene is trained in chunks. Some scenes use a setting ``chunks`` otherwise."""
     return config.scene.get("chunks") not in (None, 1) and Job.of(config).scene.spec.chunks is not None
 
 
 def refuse_chunks(config: RunConfig, reason: str) -> None:
-    """Raise ConfigError if the scene is to be fitted in chunks; ``reason`` says why the caller cannot do that."""
+    """Raise ConfigError if the configuration trains in chunks; ``reason`` says why the caller cannot do it."""
     if is_chunked(config):
         raise ConfigError(f"scene.chunks={config.scene['chunks']}: {reason}; expected scene.chunks=null")

@@ -21,19 +21,19 @@ from neuprim.runs.launch.launcher import OnStatus, launch_jobs
 from neuprim.runs.open import Progress, ignore_progress, make_run_scene_context
 
 _MOST_FRAMES = 16
-"""Frames that a worker takes at a time."""
+"""Largest number of frames in one job."""
 
 _loaded: dict[str, DatasetImages] = {}
-"""Ground truth of this process's last job, by scene key: all jobs of a launch have one scene."""
+"""Scene key -> ground truth of this process's last job, because all jobs of a launch have the same scene."""
 
 
 def load_run_ground_truth(
     config: RunConfig, progress: Progress = ignore_progress, known: Mapping[str, Any] | None = None
 ) -> DatasetImages | None:
-    """Return the ground truth of a configuration's scene; None if its images are not rendered frame by frame.
+    """Return the ground-truth images of a configuration's scene; None if the scene does not render them frame by frame.
 
     Raises:
-        NeuprimError: files or settings that the scene refuses, or its loader crashed.
+        NeuprimError: the scene refuses its files or settings, or its loader crashed.
     """
     job = Job.of(config)
     make = job.scene.spec.truth
@@ -46,10 +46,11 @@ def load_run_ground_truth(
 def launch_ground_truth_jobs(
     config: RunConfig, settings: LauncherSettings, events: Events = ignore_run_event
 ) -> DatasetImages | None:
-    """Render the missing frames of the ground truth with a launcher; return it, None for a scene that renders none.
+    """Render the missing frames of a scene's ground truth with a launcher; return the images, None if there are none
+    to render.
 
-    Existing frames are not rendered again, and each new one is stored at once. The first frame that fails stops the
-    others, as no run can do without it. The launcher's temporary files are in the run directory's parent.
+    Existing frames are not rendered again. Each new frame is stored at once. The first frame that fails stops the
+    others, because a run needs all frames. The launcher's temporary files are in the run directory's parent.
 
     Raises:
         KeyboardInterrupt: Ctrl-C came.
@@ -68,13 +69,13 @@ def launch_ground_truth_jobs(
 
 
 def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: LauncherSettings, on_status: OnStatus) -> None:
-    """Render the ground truth of runs before they are launched, once per scene. With ``launcher=inline`` the runs do it
-    themselves.
+    """Render the ground truth of runs before they are launched, once per scene. With ``launcher=inline`` do nothing:
+    the runs render it themselves.
 
-    Errors are ignored here: the run that needs the ground truth reports them, and other runs go on.
+    Errors are ignored here. The run that needs the ground truth reports them; other runs continue.
 
     Args:
-        on_status: called with (index of each run that waits, its status).
+        on_status: called with (index of a waiting run, its status).
     """
     if settings.name == "inline":
         return
@@ -95,8 +96,8 @@ def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: Launcher
 
 
 def render_ground_truth_before_run(config: RunConfig, settings: LauncherSettings, progress: Progress) -> None:
-    """Render the ground truth of a training in this process with a launcher, unless that is ``inline``. Raises the
-    errors of :func:`launch_ground_truth_jobs`."""
+    """Render a run's ground truth with a launcher before this process trains it. With ``launcher=inline`` do nothing.
+    Raises the errors of :func:`launch_ground_truth_jobs`."""
 
     def tell(event: Event) -> None:
         if isinstance(event, Preparing):
@@ -107,7 +108,7 @@ def render_ground_truth_before_run(config: RunConfig, settings: LauncherSettings
 
 
 def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[list[int]]:
-    """Yield the frames of one job after the other: several at first, single ones at the end, so that a slow worker
+    """Yield a list of frames for each job: several frames at first, single frames at the end, so that a slow worker
     delays the end little (guided self-scheduling; Polychronopoulos and Kuck, 1987)."""
     left = list(missing)
     while left:
@@ -117,7 +118,7 @@ def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[lis
 
 
 def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> int:
-    """Render the frames of a job in its worker; return their number."""
+    """Render a job's ground-truth frames in a worker; return how many."""
     config = RunConfig.from_dict(data["config"])
     key = _run_scene_key(config)
     if key not in _loaded:

@@ -1,4 +1,4 @@
-"""``neuprim inspect``: a run's density on screen, as pictures, as a page, or as OpenVDB files."""
+"""``neuprim inspect``: show a run's density in a window, or write it as pictures, a web page or OpenVDB files."""
 
 from __future__ import annotations
 
@@ -55,8 +55,8 @@ class InspectRequest:
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
         grid: number of points along the longest side of the box.
         box: (2, 3) box in the coordinates of the run's data; None for the ground truth's, or the model's extent.
-        levels: extinctions of isosurfaces, 1/scene unit.
-        against: ground truth: an OpenVDB file or folder, or "scene".
+        levels: extinctions at which to draw isosurfaces, 1/scene unit.
+        against: ground truth to compare with: an OpenVDB file or folder, or "scene".
         up: upward axis, "x", "y" or "z"; None for the scene's setting, or z.
         overwrite: whether existing files may be replaced.
     """
@@ -82,7 +82,7 @@ def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> l
     window.
 
     Args:
-        events: function that is called with notes: ground truth, errors of each frame, grid, warnings.
+        events: function that is called with notes for the user: ground truth, errors of each frame, grid, warnings.
 
     Raises:
         NeuprimError: arguments or files are wrong, or files exist already.
@@ -120,7 +120,7 @@ def inspect_run(request: InspectRequest, events: Events = ignore_run_event) -> l
 
 
 def _load_run_inspector(name: str) -> Inspector:
-    """Load an inspector by name; for a plugin, errors name its package and its layers are checked."""
+    """Load an inspector by name. Errors in a plugin's inspector name its package, and its layers are checked."""
     inspector, source = INSPECTORS.load(name), find_plugin_source(INSPECTORS, name)
     if source.built_in:
         return inspector
@@ -137,7 +137,7 @@ def _load_run_inspector(name: str) -> Inspector:
 
 
 def _output_paths(out: Path | None, count: int) -> list[Path]:
-    """List the files to write: numbered ones for several frames, or one film or page of all."""
+    """List the files to write: one numbered picture or OpenVDB file per frame, or a single film or page."""
     if out is None:
         return []
     suffix = out.suffix.lower()
@@ -167,7 +167,7 @@ def _write_run_frames(out: Path, film: _RunFrames, write: Callable[[Path, Inspec
 
 
 class _RunFrames:
-    """The requested frames, made one at a time, with one box and scale for all."""
+    """The frames that an inspection shows, computed one at a time, with one box and one scale for all frames."""
 
     def __init__(self, request: InspectRequest, events: Events) -> None:
         run = open_run(request.run)
@@ -207,7 +207,7 @@ class _RunFrames:
         return len(self.pairs)
 
     def _compare_frame(self, index: int, events: Events) -> dict[str, float] | None:
-        """Return the frame's errors against the truth, on the truth's own points."""
+        """Return the errors of the frame's density at the points of the ground truth; None without ground truth."""
         if self.truth is None:
             return None
         conditions, number = self.pairs[index]
@@ -217,7 +217,7 @@ class _RunFrames:
         return numbers
 
     def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
-        """Return the largest extinction shown, the factor on opacities of volumes, and the extinction's centroid."""
+        """Return the end of the extinction scale, the factor on opacities of volumes, and the extinction's centroid."""
         matrix, shape = box_lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:
@@ -237,7 +237,7 @@ class _RunFrames:
         return _round_scale_of_run_frames(most), _DEPTH / depth if depth > 0 else 1.0, tuple(focus.tolist())
 
     def frame(self, index: int) -> InspectionFrame:
-        """Make a frame; its grids are computed once per frame object."""
+        """Return a frame with its conditions. Each grid of the frame is computed at most once."""
         conditions, number = self.pairs[index]
         truth = self.truth
         return InspectionFrame(
@@ -259,7 +259,7 @@ class _RunFrames:
 
 
 def _round_scale_of_run_frames(value: float) -> float:
-    """Round up to two significant digits, for the end of a scale; 1 for 0."""
+    """Round ``value`` up to two significant digits, for the end of a colour scale; return 1 for 0."""
     if not value > 0:
         return 1.0
     unit = 10.0 ** (math.floor(math.log10(value)) - 1)

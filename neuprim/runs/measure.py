@@ -1,11 +1,11 @@
-"""Measure a model: every held-out view, their means, and what the task adds.
+"""Measure a model: metrics of every held-out view, their means, and further metrics of the task.
 
 PSNR and SSIM compare float images in the data set's own colour space, unclamped and unquantised. A linear data set of
-red, green and blue also gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``); a task with a display
-of its own gets both of that display (``psnr_display``, ``ssim_display``). If the task masks a part of a view, the error
-inside the mask is also reported alone, because a black background improves the mean. ``ssim_3dgs`` is the SSIM of the
-displayed image by the rule of 3D Gaussian splatting; ``lpips`` and ``lpips_3dgs`` are LPIPS as published and by that
-rule.
+red, green and blue also gets both after the sRGB transfer curve (``psnr_srgb``, ``ssim_srgb``). A task that converts
+its channels to a displayed image itself gets both of the displayed image (``psnr_display``, ``ssim_display``). If the
+task masks a part of a view, the error inside the mask is also reported alone, because a black background improves the
+mean. ``ssim_3dgs`` is the SSIM of the displayed image as 3D Gaussian splatting computes it. ``lpips`` is LPIPS as
+published; ``lpips_3dgs`` is LPIPS as 3D Gaussian splatting computes it.
 """
 
 from __future__ import annotations
@@ -54,12 +54,12 @@ class ViewMetrics:
     """Metrics of one view.
 
     Attributes:
-        seconds: time of the forward pass.
-        black: PSNR of an image of the background alone.
+        seconds: render time of the view.
+        black: PSNR of an image that shows only the background.
         more: further metrics by name: those of :attr:`~neuprim.core.task.TaskSpec.metrics`; ``psnr_gain`` of opaque
             photographs; ``psnr_mask`` and ``mse_mask`` inside the task's mask; ``psnr_black_image`` and
             ``psnr_black_image_mask`` of an empty image.
-        empty: whether the image is the background alone, because the model is not in the view.
+        empty: whether the rendered image shows only the background, because the model is not in the view.
     """
 
     name: str
@@ -72,7 +72,7 @@ class ViewMetrics:
 
 
 def render_image(model: Primitives, view: View, settings: RenderSettings, background: Tensor) -> Tensor:
-    """Return the (H, W, C) image of one view on the CPU, without gradients."""
+    """Render one view without gradients; return its (H, W, C) image on the CPU."""
     with torch.no_grad():
         return render(model, view.camera, view.conditions, settings, background).rgb.cpu()
 
@@ -85,13 +85,14 @@ def render_light_sum(
     background: Tensor,
     on_alpha: Callable[[Tensor], None] = lambda alpha: None,
 ) -> Tensor:
-    """Sum a view's images under one or more lights, over the background once: (H, W, C) on the CPU.
+    """Render a view under several lights at once, as the sum of one image per light: (H, W, C) on the CPU.
 
-    Exact for models that are linear in light, as opacity does not depend on it. Sums are float64.
+    Exact for models that are linear in light, because opacity does not depend on light. The sum is computed in float64,
+    and the background is added once.
 
     Args:
-        lights: each replaces the view's conditions of the same names.
-        on_alpha: called after every image, with its alpha.
+        lights: conditions of each light, which replace the view's conditions of the same names.
+        on_alpha: called with the alpha of each image.
     """
     total, alpha = torch.zeros(()), torch.zeros(())
     for light in lights:
@@ -111,10 +112,10 @@ def measure_views(
     on_view: Callable[[int, View, Tensor, Tensor], None] | None = None,
     render_view: Callable[[Primitives, View, Tensor], Tensor] | None = None,
 ) -> list[ViewMetrics]:
-    """Return the metrics of every view of the test split, composited over the data set's background.
+    """Return the metrics of every view of the test split. Images are composited over the data set's background.
 
     Args:
-        lpips: LPIPS network, if LPIPS is measured, too.
+        lpips: LPIPS network; None if LPIPS is not measured.
         on_view: function that is called with (index, view, rendered, truth), for example to write pictures.
         render_view: function (model, view, background) -> image, instead of :func:`render_image`.
     """
@@ -139,7 +140,9 @@ def measure_views(
 def _measure_view(
     rendered: Tensor, seconds: float, task: TaskSpec, dataset: Dataset, index: int, lpips: Lpips | None
 ) -> tuple[ViewMetrics, Tensor, Tensor]:
-    """Return metrics, rendering and ground truth of a test view; outside of its mask the rendering is the truth."""
+    """Return metrics, rendering and ground truth of a test view. Outside the view's pixel mask the rendering is
+    replaced by the ground truth.
+    """
     view, pixels, background = dataset.test.view(index), dataset.test.pixels(index), dataset.background
     channels = find_channels(task, dataset)
     check_pixels("test", view, pixels, dataset.channels)
@@ -160,7 +163,7 @@ def _measure_view(
 def measure_quality(
     model: Primitives, task: TaskSpec, dataset: Dataset, settings: RenderSettings
 ) -> tuple[float, float]:
-    """Return the mean PSNR and SSIM of the held-out views, as in ``metrics.json``, on the device that renders them."""
+    """Return mean PSNR and SSIM of the held-out views, as in ``metrics.json``, on the device of the backend."""
     views = measure_views(move_to_render_device(model, settings, dataset.test.view(0)), task, dataset, settings)
     return float(np.mean([v.psnr for v in views])), float(np.mean([v.ssim for v in views]))
 
@@ -190,7 +193,7 @@ def _mask_metrics(rendered: Tensor, truth: Tensor, dataset: Dataset, mask: Tenso
 
 
 def _table_metrics(rendered: Tensor, truth: Tensor, channels: Channels, lpips: Lpips | None) -> dict[str, float]:
-    """Return SSIM and LPIPS of the displayed image by the conventions of published tables."""
+    """Return SSIM and LPIPS of the displayed image, computed by the conventions of published tables."""
     a, b = (channels.display(x).clamp(0.0, 1.0) for x in (rendered, truth))
     found = {"ssim_3dgs": ssim_3dgs(a, b)}
     if lpips is not None and min(a.shape[:2]) >= lpips.least:
@@ -205,8 +208,8 @@ def evaluate_run(
 
     Args:
         lpips: file or folder with weights for LPIPS; None for the run's own.
-        overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`; ``model_bytes`` is the size
-            of the model with them.
+        overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`. If they reduce the model,
+            ``model_bytes`` is the size of the reduced model.
     """
     run = load_run(run)
     config = parse_run_rendering(overrides, run.config.renderer, run.model)
@@ -234,11 +237,11 @@ def summarize_run_metrics(
     lpips: Lpips | None = None,
     split: str = "test",
 ) -> dict[str, Any]:
-    """Return the content of ``metrics.json``.
+    """Return the content of ``metrics.json`` from the metrics of all views.
 
     Args:
-        training: iterations and train_seconds as the run recorded them.
-        split: the measured views; only "test", the data set's own, has means per frame of the task's clips.
+        training: entries ``iterations`` and ``train_seconds``, as the run recorded them.
+        split: name of the measured views; means per frame of the task's clips are only computed for "test".
     """
     config, task, channels = job.config, job.task, find_channels(job.task, dataset)
     worst, first = min(views, key=lambda v: v.psnr), dataset.test.view(0)
@@ -298,7 +301,7 @@ def _run_view_metrics_entry(view: ViewMetrics) -> dict[str, Any]:
 
 
 def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dict[str, Any]:
-    """Return which network measured LPIPS, or why none did."""
+    """Return entries of ``metrics.json`` that name the LPIPS network, or say why LPIPS was not measured."""
     if lpips is None:
         why = "no weights were given (metrics.lpips=FILE, or neuprim eval --lpips FILE)"
         return {"lpips": None, "not_measured": {"lpips": why}}
@@ -309,7 +312,7 @@ def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dic
 
 
 def _run_frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Return the metrics of each frame, averaged over the test views' clips, if all clips have the same length."""
+    """Return each metric's mean per frame over the clips of the test views, if all clips have the same length."""
     own = [[views[i] for i in clip.views] for clip in clips if clip.source is None]
     if not own or len({len(clip) for clip in own}) != 1:
         return {}

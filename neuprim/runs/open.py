@@ -1,6 +1,6 @@
-"""A run's directory: lock it, open a finished run from it, and list what the end of a run writes.
+"""Run directories: lock one, load a finished run from one, and list the result files of a run.
 
-The lock keeps other processes out. Configuration, task, model, data and metrics come from disk alone.
+The lock keeps other processes out. Configuration, task, model, data and metrics are read from disk only.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ COMPRESSED = "model.neuprim"
 """File name of a run's compressed model, as ``neuprim compress`` writes it."""
 
 PRUNED = "pruned.json"
-"""File in the run directory of a pruned model: how it was pruned."""
+"""File in the run directory of a pruned model that records the pruning."""
 
 LOCK_FILE = ".lock"
-"""File in a run directory while it is locked; it names the process that holds the lock."""
+"""File in a locked run directory that names the process which holds the lock."""
 
 _RESULT_FILES = ("metrics.json", "report.html", "viewer.html")
 _RESULT_PICTURES = re.compile(r"test_\d{3,}_.*\.png|clip_.*\.webp|orbit\.webp|worst_\d{3,}\.png|preview\.png")
@@ -57,12 +57,12 @@ Progress = Callable[[str, float], None]
 
 
 def ignore_progress(text: str, fraction: float) -> None:
-    """Do nothing."""
+    """Ignore progress: the default of functions that report (text, fraction)."""
 
 
 @dataclass(frozen=True)
 class StoredRun(Job):
-    """A finished run. ``task`` reads positions in the coordinates of the data's files."""
+    """A finished run, loaded from its directory. ``task`` reads positions in the coordinates of the data's files."""
 
     directory: Path
     model: Primitives
@@ -71,7 +71,7 @@ class StoredRun(Job):
 
     @property
     def world(self) -> World:
-        """Transform between the coordinates of the model and those of the data's files."""
+        """Transform between the model's coordinates and those of the data's files."""
         return World.of(self.header, str(model_file(self.directory)))
 
 
@@ -82,16 +82,16 @@ def model_file(run_dir: Path) -> Path:
 
 
 def load_run(run: Path | StoredRun, named: bool = True) -> StoredRun:
-    """Return configuration, task and model of a run directory; a loaded run is returned unchanged.
+    """Load configuration, task and model from a run directory; an already loaded run is returned unchanged.
 
     Warns if another version of neuprim or of the task's package made the run.
 
     Args:
-        named: whether warnings name the file; not for a directory that the user does not know.
+        named: whether warnings name the file; False for a temporary directory that the user does not know.
 
     Raises:
         CheckpointError: a file is missing or damaged.
-        ConfigError: ``config.yaml`` is wrong.
+        ConfigError: a setting in ``config.yaml`` is wrong.
     """
     if isinstance(run, StoredRun):
         return run
@@ -117,7 +117,7 @@ def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContex
     """Return the context of a run's scene loader: seed, cache directory and progress function.
 
     Raises:
-        ConfigError: a stored configuration makes the scene contact an address, or write outside of the run
+        ConfigError: an untrusted stored configuration would make the scene contact an address, or write outside the run
         (:mod:`neuprim.config.stored_run`).
     """
     refuse_untrusted_settings(config)
@@ -125,7 +125,7 @@ def make_run_scene_context(config: RunConfig, progress: Progress) -> SceneContex
 
 
 def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
-    """Return the data set of a run, with the coordinates of the stored model.
+    """Load the data set of a run, in the coordinates of the stored model.
 
     Raises:
         NeuprimError: the files or settings are wrong, or the loader crashed.
@@ -143,7 +143,7 @@ def load_dataset(job: Job, progress: Progress = ignore_progress) -> Dataset:
 
 
 def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> TrainedModel:
-    """Return the model of a run for exporters and inspectors; its scene is loaded only on demand.
+    """Return a run's model as exporters and inspectors take it. The scene is only loaded on demand.
 
     Raises the errors of :func:`load_run`.
     """
@@ -170,7 +170,7 @@ def open_run(run: Path | StoredRun, progress: Progress = ignore_progress) -> Tra
 
 
 def move_to_render_device(model: Primitives, settings: RenderSettings, view: View) -> Primitives:
-    """Return the model on the device on which views like this one are rendered."""
+    """Move the model to the device on which the backend for ``settings`` renders views like ``view``."""
     return model.to(best_render_backend_device(model, settings, view.camera, view.conditions))
 
 
@@ -193,7 +193,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
 
 
 def kept_shares(model: Primitives) -> dict[str, float]:
-    """Return group of prunable units (e.g. ``density.neuron 0``) -> share of its parameters that pruning kept, 0..1."""
+    """Return unit name (e.g. ``density.neuron 0``) -> fraction of its parameters that pruning has not removed, 0..1."""
     kept: dict[str, float] = {}
     sizes: dict[str, int] = {}
     for name, unit in prunable_units_of_model(model.density, model.colour).items():
@@ -208,19 +208,18 @@ def kept_shares(model: Primitives) -> dict[str, float]:
 
 @contextmanager
 def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
-    """Lock a directory for one process at a time. A missing directory is created, and removed again if it stays
-    empty.
+    """Lock a directory against other processes. A missing directory is created, and removed again if it stays empty.
 
-    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``), which ends with its process. On
-    shared folders it works between machines where their file system has such locks: NFS from version 4 on, CephFS,
-    GPFS, Lustre mounted with ``flock``.
+    The lock is an advisory lock of the system (``flock``; on Windows ``msvcrt``). It ends with the process. On shared
+    folders it works between machines if the file system supports it: NFS from version 4 on, CephFS, GPFS, Lustre
+    mounted with ``flock``.
 
     Args:
-        what: noun for the directory's content in the error message.
+        what: what the error message calls the directory's content, e.g. "run".
 
     Raises:
         ConfigError: another process, or another thread, holds the lock.
-        OSError: the directory cannot be made or written.
+        OSError: the directory cannot be created or written.
     """
     new = not directory.exists()
     directory.mkdir(parents=True, exist_ok=True)
@@ -261,21 +260,20 @@ def _describe_lock_holder(file: Path) -> str:
 
 
 def result_files(run_dir: Path) -> list[Path]:
-    """List the files that the end of a run wrote: metrics, pictures and report; not what other commands drew into
-    ``renders/``."""
+    """List a run's metrics, pictures and report, without files that other commands write into ``renders/``."""
     pictures = (path for path in sorted((run_dir / "renders").glob("*")) if _RESULT_PICTURES.fullmatch(path.name))
     return [*(path for name in _RESULT_FILES if (path := run_dir / name).is_file()), *pictures]
 
 
 def discard_results(run_dir: Path) -> None:
-    """Remove the results. A run that resumes does so before its model changes, so that a kill never leaves numbers of
-    another model."""
+    """Remove a run's result files. A resumed run calls this before its model changes, so that an interruption never
+    leaves metrics of another model."""
     for path in result_files(run_dir):
         path.unlink(missing_ok=True)
 
 
 def refuse_run_results(run_dir: Path, targets: Iterable[Path]) -> None:
-    """Raise ConfigError if a command that writes ``targets`` would replace one of the run's results."""
+    """Raise ConfigError if one of ``targets``, the files that a command will write, is a result file of the run."""
     own = {path.resolve() for path in result_files(run_dir)}
     for target in targets:
         if target.resolve() in own:

@@ -1,7 +1,7 @@
-"""The paper's tables, and the runs that reproduce their rows, for ``neuprim bench paper``.
+"""``neuprim bench paper``: the tables of the paper that introduced the method, and runs that reproduce their rows.
 
-Runs are compared by ``psnr``, ``ssim_3dgs`` and ``lpips_3dgs``, the rules by which such tables are made. Numbers of a
-run are those of its last checkpoint; the paper's are the best of a run on the test views.
+Runs are compared by ``psnr``, ``ssim_3dgs`` and ``lpips_3dgs``, which are computed like the numbers in such tables. A
+run is measured at its last checkpoint. The paper reports the best checkpoint on the test views.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ _OWN_NAMES = {"psnr": "psnr", "ssim": "ssim_3dgs", "lpips": "lpips_3dgs"}
 
 @dataclass(frozen=True)
 class PlannedRun:
-    """A run that reproduces a table's row in one scene; table and row are from :func:`load_paper_run_tables`."""
+    """A run for one table row and scene; table and row come from :func:`load_paper_run_tables`."""
 
     table: Mapping[str, Any]
     row: Mapping[str, Any]
@@ -33,7 +33,7 @@ class PlannedRun:
 
 
 def load_paper_run_tables() -> list[dict[str, Any]]:
-    """Load the paper's tables from ``paper_tables.yaml``. Lists in a row are in the order of the table's scenes."""
+    """Load the paper's tables from ``paper_tables.yaml``. Lists in a row follow the order of the table's scenes."""
     tables: list[dict[str, Any]] = yaml.safe_load(
         (resources.files(__package__) / "paper_tables.yaml").read_text(encoding="utf-8")
     )
@@ -41,7 +41,7 @@ def load_paper_run_tables() -> list[dict[str, Any]]:
 
 
 def find_paper_figure(table: Mapping[str, Any], row: Mapping[str, Any], scene: str, kind: str) -> float | None:
-    """Return the paper's psnr, ssim, lpips or primitives (``kind``) of a scene in a row; None if there is none."""
+    """Return the paper's psnr, ssim, lpips or primitives (``kind``) for a scene and table row; None if missing."""
     figure: float | None = row[kind][table["scenes"].index(scene)] if kind in row else None
     return figure
 
@@ -56,7 +56,7 @@ def plan_paper_runs(
     out: Path,
     words: Sequence[str],
 ) -> list[PlannedRun]:
-    """Return the runs of all rows and scenes whose data exist; every configuration is checked before a run starts.
+    """Plan a run for each table row and scene whose data exist. All configurations are checked before a run starts.
 
     Args:
         data: folder with a folder per scene, named like the scene in upper or lower case.
@@ -68,7 +68,7 @@ def plan_paper_runs(
         words: overrides ``key=value``, on top of those of the table and row.
 
     Raises:
-        ConfigError: no such scene, row or folder, nothing found, or a setting that is refused.
+        ConfigError: a scene, row or folder does not exist, no data were found, or a setting is refused.
     """
     every_scene = [scene for table in tables for scene in table["scenes"]]
     every_row = [row["name"] for table in tables for row in table["rows"]]
@@ -108,9 +108,9 @@ def plan_paper_runs(
 def compare_run_with_paper(
     planned: PlannedRun, metrics: Mapping[str, Any]
 ) -> Iterator[tuple[str, float | None, float | None, float | None]]:
-    """Yield (metric, our value, the paper's value, the value of its baseline) of a finished run; None if missing.
+    """Yield (metric, our value, the paper's value, the paper's baseline) of a finished run; None for missing values.
 
-    LPIPS is left out unless it was measured with VGG, as by the paper's tools.
+    LPIPS is left out unless it was measured with VGG, like the paper's LPIPS.
     """
     table, row, scene = planned.table, planned.row, planned.scene
     for kind, name in _OWN_NAMES.items():

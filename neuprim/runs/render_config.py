@@ -5,8 +5,8 @@ resolution=0.5           render at half the width and height, and upsample bilin
 density.NAME=N           a smaller density, for example fewer neurons (Field.reductions)
 colour.NAME=N            a smaller colour: bands of spherical harmonics, lobes, terms in time
 
-A view is rendered as an image, or as layers of one OpenEXR file: linear light, data such as depth, and the camera and
-conditions in its header.
+A view is rendered as an image, or as layers of one OpenEXR file. The file holds linear light and data such as depth;
+its header holds the camera and the conditions.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # sRGB primaries: x
 def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -> int:
     """Return the bytes of a run's model file if it held ``reduced`` instead of the ``full`` model.
 
-    A model of unchanged size has the size of its file. Otherwise a compressed file, or one without zeros, counts as
-    uncompressed float32 tensors.
+    If both models have equally many values, this is the size of the file. For a smaller model, a compressed or sparse
+    file counts as uncompressed float32 tensors.
     """
     before, after = (4 * model.count * model.parameters_per_primitive for model in (full, reduced))
     size = path.stat().st_size
@@ -77,7 +77,7 @@ class RenderConfig:
     reduced: Mapping[tuple[str, str], int] = field(default_factory=dict)
 
     def to_overrides(self, defaults: RenderSettings) -> tuple[str, ...]:
-        """Return the overrides that :func:`parse_run_rendering` parses to this configuration."""
+        """Return the overrides from which :func:`parse_run_rendering` makes this configuration."""
         before = dataclasses.asdict(defaults)
         values = dataclasses.asdict(self.settings)
         words = [
@@ -89,20 +89,20 @@ class RenderConfig:
         return (*words, *(f"{kind}.{name}={value}" for (kind, name), value in self.reduced.items()))
 
     def prepare_model(self, model: Primitives) -> Primitives:
-        """Return the model with reduced fields; itself if nothing changes."""
+        """Return the model with reduced fields; the model itself if this configuration reduces none."""
         for (kind, name), value in self.reduced.items():
             model = reduce_model(model, kind, name, value)
         return model
 
     def scale_view(self, view: View) -> View:
-        """Return the view at the resolution to render."""
+        """Return the view with its camera scaled to ``resolution``."""
         if self.resolution == 1.0:
             return view
         size = (max(1, round(self.resolution * side)) for side in (view.camera.width, view.camera.height))
         return replace(view, camera=view.camera.resized(*size))
 
     def upsample(self, image: Tensor, camera: AnyCamera) -> Tensor:
-        """Return an image scaled to the size of the camera, (H, W, C)."""
+        """Scale an image to the size of the camera, (H, W, C)."""
         size = (camera.height, camera.width)
         if image.shape[:2] == size:
             return image
@@ -112,7 +112,7 @@ class RenderConfig:
     def render_view(
         self, model: Primitives, view: View, background: Tensor, on_alpha: Callable[[Tensor], None] = lambda alpha: None
     ) -> Tensor:
-        """Return the (H, W, C) image of a view on the CPU, without gradients.
+        """Render a view without gradients; return its (H, W, C) image on the CPU.
 
         Args:
             model: the result of :meth:`prepare_model`.
@@ -126,10 +126,10 @@ class RenderConfig:
 
 
 def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, model: Primitives) -> RenderConfig:
-    """Return the render configuration of overrides such as ``renderer.samples=2`` and ``resolution=0.5``.
+    """Parse overrides such as ``renderer.samples=2`` and ``resolution=0.5`` into a render configuration.
 
     Args:
-        defaults: settings that the overrides do not name.
+        defaults: values of settings that the overrides do not name.
 
     Raises:
         ConfigError: an unknown key or setting, a reduction that the model's fields lack, or an invalid value.
@@ -173,14 +173,14 @@ class RunExrLayers:
     """Writer of a run's views as layers of OpenEXR files.
 
     Attributes:
-        names: layers, as after ``--layers``; None: all except one layer per light.
-        half: whether light and alpha are 16-bit floats.
+        names: names of the layers, as after ``--layers``; None: all layers except those of single lights.
+        half: whether alpha and the layers that hold light are stored as 16-bit floats.
         background: (C,) in the model's colour space. Without an alpha layer, beauty is composited over it.
         lights: conditions of the lights of an environment map, whose images are summed; empty: the view's own light.
         world: coordinates and units of cameras, positions and depths in the file.
 
     Raises:
-        ConfigError: an unknown layer, or a layer of light although the model's colours are not linear light.
+        ConfigError: a layer is unknown, or holds light although the model's colours are not linear light.
     """
 
     run_dir: Path
@@ -198,7 +198,7 @@ class RunExrLayers:
 
     @property
     def _splits_lights(self) -> bool:
-        """Whether every light gets a layer of its own."""
+        """Whether every light gets its own layer."""
         return bool(self.lights) and self.names is not None and LIGHTS in [n.strip() for n in self.names.split(",")]
 
     def _layer_specs(self) -> tuple[LayerSpec, ...]:
@@ -221,7 +221,7 @@ class RunExrLayers:
     def write(
         self, path: Path, model: Primitives, view: View, on_alpha: Callable[[Tensor], None] = lambda alpha: None
     ) -> None:
-        """Render and write one view; ``on_alpha`` is called after each of its lights, with the image's alpha.
+        """Render one view and write its layers; ``on_alpha`` is called with the alpha of the image of each light.
 
         Raises:
             ConfigError: the user named a layer that the model does not have.
@@ -253,7 +253,7 @@ class RunExrLayers:
     def _exr_channels(
         self, found: Mapping[str, Tensor], specs: Mapping[str, LayerSpec], alpha: Tensor, view: View
     ) -> tuple[dict[str, ExrChannel], dict[str, str]]:
-        """Return channel -> values at the view's full resolution, and header attributes that describe each layer."""
+        """Return channel name -> values at the view's full resolution, and header attributes for each layer."""
         channels: dict[str, ExrChannel] = {}
         summaries: dict[str, str] = {}
         large_alpha = self.point.upsample(alpha[..., None], view.camera)
@@ -281,7 +281,7 @@ class RunExrLayers:
         return channels, summaries
 
     def _exr_attributes(self, model: Primitives, view: View) -> dict[str, Any]:
-        """Return the file's header: camera, conditions, the run that it comes from, and the colour space."""
+        """Return the file's header attributes: camera, conditions, name of the run, and colour space."""
         space = self.channels.color_space
         near = resolve_near(self.point.settings, model.params["means"], [view.camera]).near_plane
         origin = "" if space == "linear" else ", of a model whose colours are sRGB values"
@@ -305,8 +305,8 @@ class RunExrLayers:
         return found
 
     def _condition_values(self, conditions: Conditions) -> Iterator[tuple[str, Any]]:
-        """Yield conditions in the user's coordinates and OpenEXR's types: one number, a vector of two or three, or a
-        list."""
+        """Yield (name, value) of the conditions, in the user's coordinates, as OpenEXR types: a number, a vector of two
+        or three, or a list."""
         specs = {spec.name: spec for spec in self.task.conditions}
         for name, value in conditions.items():
             given = specs[name].given(value, self.world) if name in specs else value
@@ -320,7 +320,7 @@ def _linear_light_of_run_layer(image: Tensor, color_space: str, alpha: Tensor | 
     """Convert an (H, W, C) image from ``color_space`` to linear light; negative sRGB values become 0.
 
     Args:
-        alpha: (H, W) that the image is premultiplied by. The curve applies to the colour without it.
+        alpha: (H, W), if the image is premultiplied by it. The transfer curve is applied to the unpremultiplied colour.
     """
     if color_space == "linear":
         return image

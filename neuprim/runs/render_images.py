@@ -38,7 +38,7 @@ SETS = ("orbit", "test")
 
 ANIMATIONS = ("webp", "gif", "mp4")
 FORMATS = ("png", "exr", "npy", *ANIMATIONS)
-"""Formats that ``neuprim render`` writes. EXR and npy hold all channels as they are; the others hold the displayed
+"""Formats that ``neuprim render`` writes. EXR and npy hold all channels unchanged; the others hold the displayed
 image."""
 
 
@@ -56,13 +56,14 @@ class RenderRequest:
         frame: numbers of source frames to render, e.g. "1001-1048x2", for volumes; they replace the condition "time"
             and appear in file names.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: frames per second; None for those of the cameras' file, or for about four seconds, at 5 to 30.
+        fps: frames per second of an animation; None for the rate in the file of cameras, or 5 to 30 so that the
+            animation takes about four seconds.
         environment: environment map that replaces the task's light.
         overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`.
-        layers: layers of an OpenEXR file, separated by commas; None for all but a layer per light.
-        datatype: type of light and alpha in an OpenEXR file, "half" or "float" (16 or 32 bits, the default).
-        space: coordinates of cameras in files, lights and depths: "world", those of the data's files, or "scene", those
-            of the model.
+        layers: layers of an OpenEXR file, separated by commas; None for all layers except those of single lights.
+        datatype: type of alpha and layers of light in OpenEXR files: "half" (16 bits) or "float" (32 bits, default).
+        space: coordinates of cameras in files, lights and depths: "world" (those of the data's files) or "scene" (those
+            of the model).
         overwrite: whether to replace pictures of the run's report.
     """
 
@@ -88,15 +89,15 @@ def render_run(
     notify: Callable[[str], None] = lambda text: None,
     progress: Callable[[str, float], None] = lambda text, fraction: None,
 ) -> list[Path]:
-    """Render images of a run, as one file per view or one animation; return the files.
+    """Render images of a run as one file per view, or as one animation; return the files.
 
     Args:
-        notify: function that is called with lines for the user, e.g. about conditions beyond the training data.
+        notify: function that is called with lines for the user, e.g. about conditions outside the training range.
         progress: function that is called with (text, fraction 0..1).
 
     Raises:
-        NeuprimError: cameras, conditions or run directory are wrong, or no image shows anything of the model.
-        BackendUnavailable: the package of a format is missing.
+        NeuprimError: cameras, conditions or run directory are wrong, or the model is in none of the images.
+        BackendUnavailable: a package that the file format needs is missing.
     """
     run = load_run(run)
     session = _RunRenderSession(run, request, notify, progress)
@@ -113,7 +114,7 @@ def render_run(
 
 
 class _RunRenderSession:
-    """A loaded run with the views of a request."""
+    """A loaded run and the views that a request asks for."""
 
     def __init__(
         self,
@@ -267,7 +268,7 @@ class _RunRenderSession:
             raise
 
     def _write_image(self, path: Path, pixels: Tensor) -> None:
-        """Write one image: npy holds the data set's channels unchanged, other formats the displayed image."""
+        """Write one image: npy files hold the data set's channels unchanged, other formats the displayed image."""
         shown = pixels if self.format == "npy" else self.channels.display(pixels)
         if self.format == "npy":
             write_npy(path, shown.contiguous().numpy())
@@ -286,7 +287,7 @@ class _RunRenderSession:
             return config.upsample(image, view.camera)
 
     def _count_pass(self, alpha: Tensor) -> None:
-        """Count one rendered image, of a view under a light with this alpha, and report the progress."""
+        """Count a rendered image (one per view and light) with this alpha, and report the progress."""
         lights, count = max(len(self.lights), 1), len(self.views)
         self._visible |= bool((alpha > 0).any())
         self._passes += 1
@@ -314,8 +315,7 @@ class _RunRenderSession:
 
 
 def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Mapping[str, str]) -> list[View]:
-    """Return a view per camera of a file. A view has the file's time if the task has a time and the user gave
-    none."""
+    """Return one view per camera in the file, with the file's time if the task has a time and the user gave none."""
     has_time = any(spec.name == "time" and not spec.shape for spec in task.conditions)
     timed = file.times is not None and "time" not in conditions and has_time
     times = [{"time": torch.tensor(time)} for time in file.times or ()] if timed else [{} for _ in file.named]
@@ -325,12 +325,13 @@ def _run_views_of_camera_file(file: CameraViews, task: TaskSpec, conditions: Map
 def set_run_view_conditions(
     views: list[View], task: TaskSpec, texts: Mapping[str, str], warn: Callable[[str], None] = lambda text: None
 ) -> tuple[list[View], bool]:
-    """Return the views with the user's conditions, and whether a condition is animated. Animated conditions advance
-    together, frame by frame. If the numbers of frames and cameras differ, the smaller number is spread evenly over the
-    larger.
+    """Return the views with the user's conditions, and whether a condition is animated.
+
+    All animated conditions advance together, frame by frame. If there are more frames than cameras, or the reverse,
+    the fewer ones are spread evenly over the others.
 
     Raises:
-        ConfigError: a view lacks a condition that the task needs, or as
+        ConfigError: a view lacks a condition that the task needs, or a text is refused by
         :func:`neuprim.core.conditions.read_conditions`.
     """
     given = read_conditions(task.conditions, texts, warn)
@@ -361,7 +362,7 @@ def _name_views_by_frame(views: Sequence[View], numbers: Sequence[int], name: st
 
 
 def _view_file_names(names: Sequence[str]) -> list[str]:
-    """Return file names of views, numbered if two views would share a file."""
+    """Return a file name for each view; the names are numbered if two views would have the same one."""
     names = ["".join(c if c.isalnum() or c in "-_." else "_" for c in name) for name in names]
     if len({name.lower() for name in names}) == len(names):
         return list(names)

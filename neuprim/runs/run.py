@@ -1,7 +1,8 @@
 """Train, measure, render and report a run in its directory, as one model or in chunks.
 
-Every chunk of a scene is a run of its own. Then the chunks' models are joined, and trained together as one model for
-the last part of the budget. ``chunks.json`` records the state of each chunk, so that nothing is done twice.
+In chunks: a run trains each chunk of the scene separately. Then the models of the chunks are joined, and trained as
+one model for the last part of the budget. ``chunks.json`` records the state of each chunk, so that a resumed run does
+not repeat finished chunks.
 """
 
 from __future__ import annotations
@@ -45,15 +46,15 @@ CHUNKS_FILE, CHUNKS_FOLDER = "chunks.json", "chunks"
 __all__ = ["run"]
 
 JOINT_SHARE = 0.2
-"""Share of the budget in which the joined model is trained as one, so that primitives on both sides of a boundary adapt
-to each other. More of it makes the result worse."""
+"""Fraction of the budget for training the joined model, in which primitives on both sides of a boundary adapt to each
+other. A larger fraction makes the result worse."""
 
 _MIN_PRIMITIVES = 8
-"""Smallest number of primitives in a chunk: their sizes follow from the distances between them."""
+"""Smallest number of primitives in a chunk. Initial sizes of primitives are made from the distances between them."""
 
 
 class ChunksMissing(NeuprimError):
-    """Some chunks of a run failed; the text says which and why. The others are kept."""
+    """Some chunks of a run failed. The message says which and why. Finished chunks stay on disk."""
 
 
 def run(
@@ -71,13 +72,13 @@ def run(
     Args:
         config: the configuration.
         events: function that is called with every event.
-        between: function (trained model, event) to call between steps; setting the event stops like Ctrl-C.
-        group: processes that train this model together, each of which calls this function; the first one writes files.
-        launcher: where to train the chunks of a scene, if it is trained in chunks.
+        between: function (training, stop event) to call between steps; setting the event stops the run like Ctrl-C.
+        group: processes that train this model together. Each of them calls this function; the first one writes files.
+        launcher: where to train the chunks, if the scene is trained in chunks.
 
     Raises:
-        NeuprimError: the input is wrong, another process uses the directory, or numbers are not finite; existing files
-            are intact.
+        NeuprimError: the input is wrong, another process uses the directory, or the training produced numbers that are
+            not finite. Existing files stay intact.
         RankError: another rank ended; the checkpoint has the last state.
     """
     directory, preview = config.output_dir, RunPreview(events, between)
@@ -108,7 +109,9 @@ def summarize_run(run_dir: Path) -> str:
 
 
 def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
-    """Run a configuration as a job; return its directory. A retry after a worker's death resumes the checkpoint."""
+    """Run a configuration as a launcher's job; return its directory. After a worker died, the retry resumes from the
+    checkpoint.
+    """
     config = RunConfig.from_dict(data)
     return str(run(replace(config, resume=config.resume or attempt > 0), events))
 
@@ -122,8 +125,8 @@ class ChunkPlan:
 
     Attributes:
         chunks: the scene's chunks, with the function that joins their models.
-        configs: configurations of the chunks' runs. runs: their entries in the record.
-        steps: steps of the joined model's training; None: as many as fit into ``seconds``.
+        configs: configuration of each chunk's run. runs: entry of each chunk's run in ``chunks.json``.
+        steps: training steps of the joined model; None: as many as fit into ``seconds``.
     """
 
     chunks: Chunks
@@ -134,11 +137,11 @@ class ChunkPlan:
 
 
 def _plan_chunks(config: RunConfig, chunks: Chunks) -> ChunkPlan:
-    """Plan the chunks' runs, each with its share of primitives and budget, and with as many interventions of population
-    control as the whole run.
+    """Plan the chunks' runs: divide primitives and budget among them. Each run gets as many interventions of population
+    control as the whole run has.
 
     Raises:
-        ConfigError: fewer primitives than the chunks need.
+        ConfigError: ``model.primitives`` is too small for the number of chunks.
     """
     least, train = _MIN_PRIMITIVES * len(chunks.parts), config.train
     if config.model.count < least:
@@ -179,18 +182,18 @@ def train_in_chunks(
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     between: BetweenSteps = lambda fitted, stop: None,
 ) -> tuple[Fitted, bool]:
-    """Fit the chunks of ``scene.chunks``, join their models, and train the joined model. If ``auto`` finds one run
-    better, this is :func:`~neuprim.runs.training.train_in_directory`.
+    """Train the chunks of ``scene.chunks``, join their models, and train the joined model. If the scene finds that one
+    run is better, call :func:`~neuprim.runs.training.train_in_directory` instead.
 
-    Finished chunks are kept: the same command with ``resume=true`` fits the missing ones.
+    Finished chunks are not repeated: the same command with ``resume=true`` trains the missing ones.
 
     Args:
-        launcher: where chunks are fitted, and their ground truth is rendered. The joined model is trained here.
+        launcher: where chunks are trained and their ground truth is rendered. This process trains the joined model.
 
     Raises:
         ChunksMissing: some chunks failed; the others were completed.
         KeyboardInterrupt: Ctrl-C came before all chunks were done; unfinished ones have checkpoints.
-        NeuprimError: errors of a run, a launcher that cannot work here, or chunks that differ from those of the
+        NeuprimError: an error of a run, the launcher cannot work here, or the chunks differ from those of the
         interrupted run.
     """
 
@@ -230,12 +233,12 @@ def train_in_chunks(
 
 
 def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher: LauncherSettings) -> LaunchRecord:
-    """Launch the runs of all chunks that are not done yet; return the updated record."""
+    """Launch the runs of all unfinished chunks; return the updated record."""
     folder, count = record.file.parent, len(plan.configs)
     statuses = [JobStatus()] * count
 
     def on_status(number: int, status: JobStatus) -> None:
-        """Report all chunks together as one piece of work."""
+        """Report the progress of all chunks as one event."""
         before, statuses[number] = statuses[number], status
         if status.state == "failed" != before.state:
             events(Note(f"{plan.configs[number].output_dir}: {status.text}"))

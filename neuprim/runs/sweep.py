@@ -1,7 +1,7 @@
-"""Launch several runs together: those of a sweep, which are compared at the end, or the chunks of one run.
+"""Launch several runs together: the runs of a sweep, or the chunks of one run.
 
-A record, ``sweep.json`` or ``chunks.json``, has the requested settings and the state of each run, also during the work.
-``sweep.csv`` and ``sweep.html`` are written at the end.
+The file ``sweep.json`` or ``chunks.json`` records the requested settings and the state of each run, and is updated
+during the work. At the end of a sweep, ``sweep.csv`` and ``sweep.html`` compare its runs.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ SWEEP_FILE = "sweep.json"
 """File name of the record in a sweep's directory."""
 
 FIT_JOB = "neuprim.runs.run:fit_job"
-"""Function that the worker of a run calls."""
+"""Function that a worker calls to perform a run."""
 
 _FORMAT = 1
 
@@ -46,13 +46,13 @@ class LaunchedRun:
     """Record of one launched run.
 
     Attributes:
-        name: name of its folder.
-        words: its overrides, without ``output_dir`` and ``resume``.
+        name: name of the run's folder.
+        words: the run's overrides, without ``output_dir`` and ``resume``.
         swept: key -> value, as typed, of the settings that differ between the runs.
         state: waiting, done, failed or interrupted.
-        line: why it failed.
-        seconds: from its start to its end, measuring included.
-        attempts: number of starts; it is started again if its worker dies.
+        line: one line that says why the run failed.
+        seconds: time of the whole run, including the measurements.
+        attempts: number of starts. A run is started again if its worker dies.
     """
 
     name: str
@@ -66,12 +66,12 @@ class LaunchedRun:
 
 @dataclass(frozen=True)
 class LaunchRecord:
-    """Record of runs that are launched together.
+    """Record of all runs that are launched together, stored as JSON.
 
     Attributes:
-        file: file of the record, in the folder of the launch.
+        file: the file that stores the record.
         words: the requested overrides, without ``output_dir`` and ``resume``.
-        joined_steps: for a run in chunks: steps of the joined model's training, once they are known.
+        joined_steps: for a run in chunks: training steps of the joined model; None until they are known.
     """
 
     file: Path
@@ -86,19 +86,20 @@ class LaunchRecord:
         write_json(self.file, {"format": _FORMAT, "words": list(self.words), "runs": runs, **joined})
 
     def end_run(self, number: int, result: JobResult) -> LaunchRecord:
-        """Return the record with the result of run ``number``."""
+        """Return a copy of the record that includes the result of run ``number``."""
         runs, (state, line) = list(self.runs), (result.state, result.line)
         runs[number] = replace(runs[number], state=state, line=line, seconds=result.seconds, attempts=result.attempts)
         return replace(self, runs=tuple(runs))
 
     def resume(self, before: LaunchRecord | None, more: bool) -> LaunchRecord:
-        """Return this record with the states of an earlier one, and with the runs that only the earlier one has.
+        """Return this record with the run states of an earlier one (``before``), and with runs that only the latter
+        has.
 
         Args:
-            more: whether the two may have different runs.
+            more: whether the two records may have different runs.
 
         Raises:
-            ConfigError: a run of the same name had other overrides, or the runs differ without ``more``.
+            ConfigError: a run of the same name had other overrides, or the runs differ although ``more`` is False.
         """
         if before is None:
             return self
@@ -120,10 +121,10 @@ class LaunchRecord:
 
 
 def read_launch_record(file: Path) -> LaunchRecord | None:
-    """Read a record; None where there is none.
+    """Read the record of launched runs from ``file``; None if the file does not exist.
 
     Raises:
-        DataError: the file is damaged, or of another version.
+        DataError: the file is damaged, or has another format version.
     """
 
     def parse(data: Mapping[str, Any]) -> LaunchRecord:
@@ -141,27 +142,26 @@ def read_launch_record(file: Path) -> LaunchRecord | None:
 
 
 def make_run_job(config: RunConfig) -> LaunchJob:
-    """Return the job that runs a configuration."""
+    """Return a job that trains and measures the run of a configuration."""
     return LaunchJob(config.output_dir.name, FIT_JOB, config.to_dict())
 
 
 def launch_missing_runs(
     record: LaunchRecord, configs: Sequence[RunConfig], settings: LauncherSettings, on_status: OnStatus
 ) -> tuple[LaunchRecord, list[JobResult | None]]:
-    """Render the ground truth of a record's unfinished runs, then launch them, each in its own directory.
+    """Render the ground truth of a record's unfinished runs, then launch these runs, each in its own directory.
 
-    The record is written at the first status, so that a launcher that fails to start leaves no file, and whenever a run
-    ends.
+    The record is written at the first status and whenever a run ends. A launcher that fails to start leaves no file.
 
     Args:
-        configs: configurations of the record's first runs.
-        on_status: called with (index in ``configs``, status) whenever it is new; once for each finished run.
+        configs: configurations of the record's runs, in the same order; the record may have further runs.
+        on_status: called with (index in ``configs``, status) at every change; once for each finished run.
 
     Returns:
-        the record, and a result for each configuration; None for runs that Ctrl-C prevented.
+        The updated record, and a result for each configuration; None for runs that did not start because of Ctrl-C.
 
     Raises:
-        NeuprimError: a launcher that cannot work here.
+        NeuprimError: the launcher cannot work here.
         OSError: the record cannot be written.
     """
     results = list[JobResult | None]([None] * len(configs))
@@ -205,10 +205,12 @@ def _is_finished_run(run_dir: Path) -> bool:
 
 
 def read_sweep_overrides(words: Sequence[str]) -> list[str]:
-    """Return the overrides of an earlier sweep plus ``words``, which contain its ``output_dir`` and ``resume=true``.
+    """Return the overrides of the sweep to resume, followed by ``words``, the overrides typed now.
+
+    ``words`` contain the sweep's ``output_dir`` and ``resume=true``.
 
     Raises:
-        ConfigError: there is no sweep, or its overrides contain ``${``.
+        ConfigError: the directory holds no sweep, or the sweep's overrides contain ``${``.
     """
     given = {a.key: a.value for a in parse_overrides(words)}
     before = None
@@ -229,7 +231,7 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
 
 
 def read_sweep_runs(record: LaunchRecord) -> list[SweepPageRun]:
-    """Read the runs in a sweep's directory, in the record's order."""
+    """Read the results of all runs of a sweep from their directories, in the record's order."""
     rows = []
     for run in record.runs:
         directory = record.file.parent / run.name
@@ -242,8 +244,8 @@ def read_sweep_runs(record: LaunchRecord) -> list[SweepPageRun]:
 
 
 def write_sweep_csv(path: Path, runs: Sequence[SweepPageRun]) -> None:
-    """Write a row for every run: its name, its swept settings, its state, every number of its ``metrics.json``, and
-    its directory below the sweep's. Cells without a value are empty."""
+    """Write one row per run: its name, swept settings, state, every number of its ``metrics.json``, and its directory
+    relative to the sweep's. Cells without a value are empty."""
     keys = list(dict.fromkeys(key for run in runs for key in run.swept))
     metrics = list(dict.fromkeys(name for run in runs for name in run.numbers if name not in keys))
     buffer = io.StringIO()
@@ -269,7 +271,7 @@ def run_sweep(
 ) -> tuple[LaunchRecord, list[JobResult | None]]:
     """Train all configurations of a sweep, each in its own directory, and write the page that compares them.
 
-    Finished runs are kept; with ``resume`` the others continue. A failed run does not stop the others.
+    With ``resume``, finished runs are not repeated and unfinished ones continue. A failed run does not stop the others.
 
     Args:
         configs: configurations of :func:`~neuprim.config.compose_all`, all in one directory.
@@ -278,7 +280,7 @@ def run_sweep(
         on_status: function that is called with (index of the run, status).
 
     Returns:
-        the record of the sweep, and a result for each configuration; None for runs that Ctrl-C prevented.
+        The record of the sweep, and a result for each configuration; None for runs that Ctrl-C kept from starting.
 
     Raises:
         NeuprimError: the launcher cannot work here, or another process uses the directory.

@@ -1,6 +1,6 @@
 """Train in a run directory, resume from its checkpoint, and fine-tune a changed model.
 
-Fine-tuning repeats the end of a run, with learning rates like those of its end and a fixed population.
+Fine-tuning repeats the last part of a run's training: learning rates are similar, and the population is fixed.
 """
 
 from __future__ import annotations
@@ -53,30 +53,30 @@ from neuprim.runs.open import discard_results
 CURVE_FILE, PREVIEW_FILE = "metrics.jsonl", "renders/preview.png"
 
 _PREVIEW_PROGRESS = (0.05, 0.5)
-"""Progress at which :data:`PREVIEW_FILE` is written; the end of the run replaces it."""
+"""Progress at which :data:`PREVIEW_FILE` is written; it is written again at the end of the run."""
 
 BEGIN = 0.8
-"""Progress of the run, 0..1, to which the first step of fine-tuning corresponds."""
+"""Progress of the run, 0..1, whose schedules the first step of fine-tuning uses."""
 
 START, COOL = 3.0, 0.02
-"""Ratios of fine-tuning's learning rates: first step over the end of the run, and last step over first step.
+"""Learning rates of fine-tuning: first step divided by the end of the run, and last step divided by first step.
 Rates near zero at the end let the parameters settle. This improves quality by itself, and matters most where
 parameters are rounded."""
 
 LONG, LEAST_START = 2000, 1.0
-"""Number of steps from which the rates begin at :data:`START`. With fewer steps they begin proportionally lower, but at
-least at :data:`LEAST_START`: a few hundred steps at high rates degrade a well trained volume."""
+"""Least number of steps with which the rates begin at :data:`START`. With fewer steps they begin proportionally lower,
+at :data:`LEAST_START` or more, because a few hundred steps at high rates degrade a well trained volume."""
 
 VOXELS_EVERY = 8
-"""Largest number of steps between two steps with voxels, if the run trained with them. At a run's longer interval a few
-hundred steps hardly reach some frames, and their extinction drifts; at an interval of four, images get worse."""
+"""Largest number of steps between two steps with voxels, if the run trained with voxels. With the longer interval of a
+run, a few hundred steps miss some frames, whose extinction then drifts. With an interval of 4, images get worse."""
 
 _PACE_WARMUP, _PACE_STEPS = 5, 20
-"""Number of warm-up steps, and of the steps after them whose pace is measured."""
+"""Number of warm-up steps, and of the steps after them that are timed."""
 
 BetweenSteps = Callable[[Fitted, threading.Event], None]
-"""Callback on the training thread, before the first step and after every step. It gets what is trained, and an event
-that ends the training as Ctrl-C does. It may read and save the state, and wait; it must not change the state."""
+"""Callback on the training thread, before the first step and after every step. Its arguments are the training and
+an event that ends the training like Ctrl-C. It may read and save the state, and wait, but must not change the state."""
 
 
 def train_in_directory(
@@ -88,19 +88,20 @@ def train_in_directory(
     group: ProcessGroup | None = None,
     make: TrainerFactory | None = None,
 ) -> tuple[Fitted, bool]:
-    """Train until the budget is used or Ctrl-C, which finishes the step. Either way write configuration, curve,
-    checkpoint and model into the run's directory; of several ranks the first one writes them.
+    """Train until the budget is used or the user presses Ctrl-C, which finishes the current step. In both cases write
+    configuration, curve, checkpoint and model into the run's directory. If several ranks train, the first one writes.
 
     Args:
-        dataset, hold_out, make, group: as of :func:`~neuprim.runs.fit.prepare_training`.
+        dataset, hold_out, make, group: as in :func:`~neuprim.runs.fit.prepare_training`.
         between: called between steps, see :data:`BetweenSteps`.
 
     Returns:
-        what was trained, and whether Ctrl-C ended it.
+        The trained model with its trainer, and whether Ctrl-C ended the training.
 
     Raises:
-        NeuprimError: the input is at fault, or numbers are not finite; what was on disk before is intact.
-        RankError: another rank ended; the first one, if it is there, has written a checkpoint of the last whole step.
+        NeuprimError: the input is wrong, or the training produced numbers that are not finite. Existing files stay
+            intact.
+        RankError: another rank ended. The first rank, if it still runs, has saved a checkpoint of the last whole step.
     """
     with nullcontext() if group is None else group.in_turn():
         fitted = prepare_training(config, events, dataset, hold_out, make, group)
@@ -138,7 +139,7 @@ def _resume_training(fitted: Fitted, events: Events) -> None:
 
 
 def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bool:
-    """Train until the budget is used or Ctrl-C; returns whether it was interrupted. Leaves a checkpoint either way."""
+    """Train until the budget is used or Ctrl-C, and write a checkpoint; return whether Ctrl-C ended the training."""
     trainer, config = fitted.trainer, fitted.config
     curve, saved = config.output_dir / CURVE_FILE, config.output_dir / "checkpoint.safetensors"
     cut_run_curve(curve, trainer.step)
@@ -174,12 +175,12 @@ def _train_and_save(fitted: Fitted, events: Events, between: BetweenSteps) -> bo
 
 
 class RunPreview:
-    """Callback between steps that writes a picture of a held-out view early in the training and again halfway: ground
-    truth on the left, the model on the right.
+    """Callback between training steps that writes a picture of a held-out view at 5 % and 50 % of the training: ground
+    truth on the left, rendering on the right.
 
     Args:
-        events: receives a note with the name of the file, after the first picture.
-        between: another callback, which is called before.
+        events: function that is called with a note after the first picture; the note has the name of the file.
+        between: another callback between steps, which is called first.
     """
 
     def __init__(self, events: Events, between: BetweenSteps) -> None:
@@ -196,7 +197,7 @@ class RunPreview:
                 self._events(Note(f"first picture (left ground truth, right model): {path}"))
 
     def write(self, fitted: Fitted) -> Path:
-        """Write the picture of the model as it is now, and return its path."""
+        """Write the preview picture of the current model; return its path."""
         test, background, display = fitted.dataset.test, fitted.dataset.background, fitted.channels.display
         index, path = 3 * len(test) // 4, fitted.config.output_dir / PREVIEW_FILE  # not the first of a film
         rendered = render_image(fitted.model, test.view(index), fitted.trainer.renderer, background)
@@ -208,7 +209,7 @@ class RunPreview:
 
 
 def _train_run_as_follower(trainer: Trainer) -> bool:
-    """Train on a rank that writes nothing; returns whether the training was interrupted."""
+    """Train on a rank that writes no files; return whether the training was interrupted."""
     with interruptible_run(terminated=True) as stop, use_one_torch_thread_for_run():
         trainer.stop_requested = stop.is_set
         return any(trainer.stopping for _ in train_run_steps(trainer))
@@ -216,7 +217,7 @@ def _train_run_as_follower(trainer: Trainer) -> bool:
 
 @contextmanager
 def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
-    """Warn once if a file cannot be written during the training, as on a full disk. At the end it is an error."""
+    """Context manager during the training: only warn, once, if ``file`` cannot be written, e.g. on a full disk."""
     try:
         yield
     except (CheckpointError, OSError) as error:
@@ -225,7 +226,7 @@ def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
 
 
 def cut_run_curve(path: Path, step: int) -> None:
-    """Remove the lines after a checkpoint's step from ``metrics.jsonl``; a missing file is created empty."""
+    """Remove the lines after training step ``step`` from ``metrics.jsonl``; create an empty file if it is missing."""
     kept = []
     if step and path.exists():
         for text in path.read_text(encoding="utf-8", errors="replace").splitlines():
@@ -238,7 +239,7 @@ def cut_run_curve(path: Path, step: int) -> None:
 
 
 def add_run_curve_line(path: Path, line: str) -> None:
-    """Append a line completely or not at all. Raises OSError; the lines before it are intact."""
+    """Append a line to a file, completely or not at all. Raises OSError; the lines before it stay intact."""
     with open(path, "ab", buffering=0) as file:
         data, end = line.encode(), os.fstat(file.fileno()).st_size
         try:
@@ -277,11 +278,11 @@ def save_run_training(fitted: Fitted) -> None:
 def make_run_finetune_trainer(
     job: Job, dataset: Dataset, model: Primitives, steps: int, begin: float = BEGIN, voxels_every: int = VOXELS_EVERY
 ) -> Trainer:
-    """Make a trainer for a copy of a finished run's model, with ``steps`` steps left of its budget.
+    """Make a trainer that fine-tunes a copy of a finished run's model for ``steps`` steps.
 
-    Schedules are those of a run from the progress ``begin`` on, except for the rates (:data:`START`, :data:`COOL`);
-    the population is fixed, and views keep their resolution. Exposures and corrections of views go on from the
-    run's checkpoint, if there is one.
+    Schedules are those of the run from progress ``begin`` to 1, except for the learning rates (:data:`START`,
+    :data:`COOL`). The population is fixed, and views have their full resolution. If the run has a checkpoint, the
+    exposures and corrections of its views are continued.
     """
     config, params = job.config, {name: value.detach().clone() for name, value in model.params.items()}
     copy = Primitives(model.density, model.colour, params)
@@ -311,7 +312,7 @@ def make_run_finetune_trainer(
 
 
 def count_run_finetune_steps(seconds: float, job: Job, dataset: Dataset, model: Primitives) -> int:
-    """Return the number of fine-tuning steps that fit into ``seconds`` at the measured pace; 0 for 0 seconds."""
+    """Return how many fine-tuning steps fit into ``seconds``, from the measured time per step; 0 for 0 seconds."""
     if seconds <= 0:
         return 0
     trainer = make_run_finetune_trainer(job, dataset, model, _PACE_WARMUP + _PACE_STEPS)

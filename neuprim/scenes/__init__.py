@@ -1,4 +1,4 @@
-"""Generated scenes (solids, room, lit solids, smoke), in layouts that loaders read; no task is used."""
+"""Generators of the built-in scenes (solids, room, lit solids, smoke). Loaders of tasks read the written files."""
 
 __all__ = ["PIXEL_CLASSES"]
 

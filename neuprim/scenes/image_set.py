@@ -1,4 +1,4 @@
-"""Image sets on disk: camera poses, pixel rays, and writing a data set once into the cache."""
+"""Helpers for generated scenes: camera poses, pixel rays, and writing an image set once into the cache."""
 
 from __future__ import annotations
 
@@ -34,19 +34,19 @@ V = TypeVar("V")
 
 
 def hash_scene_settings(settings: Any, version: int) -> str:
-    """Return a short hash of every field of a settings dataclass and the generator's version."""
+    """Return a short hash of all fields of a settings dataclass and of the generator's ``version``."""
     text = json.dumps({"version": version, **asdict(settings)}, sort_keys=True, default=str)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def scene_direction(cosine: float, azimuth: float) -> NDArray[np.float64]:
-    """Return the (3,) unit vector of a zenith cosine and ``azimuth``, radians from x towards y."""
+    """Return the (3,) unit vector with zenith cosine ``cosine`` and ``azimuth``, radians from x towards y."""
     across = math.sqrt(max(1.0 - cosine * cosine, 0.0))
     return np.array([across * math.cos(azimuth), across * math.sin(azimuth), cosine])
 
 
 def scene_camera_pose(eye: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (4, 4) camera to world, OpenGL axes, at ``eye`` (3,), facing the origin, z up."""
+    """Return the (4, 4) camera-to-world matrix, OpenGL axes, of a camera at ``eye`` (3,) facing the origin, z up."""
     view = look_at(torch.from_numpy(np.asarray(eye, dtype=np.float64)), torch.zeros(3), torch.tensor([0.0, 0.0, 1.0]))
     return torch.linalg.inv(view).numpy() @ np.diag([1.0, -1.0, -1.0, 1.0])
 
@@ -56,8 +56,8 @@ def scene_ray_bands(
 ) -> Iterator[NDArray[np.float64]]:
     """Yield (N, 3) unit ray directions, whole rows of pixels at a time, from the top.
 
-    There are ``samples`` rays per pixel side. ``pose`` (4, 4) is camera to world, OpenGL axes; ``field_of_view`` in
-    radians holds along both axes.
+    A pixel has ``samples`` x ``samples`` rays. ``pose`` is the (4, 4) camera-to-world matrix, OpenGL axes.
+    ``field_of_view``, radians, is the same along both axes.
     """
     fine = size * samples
     plane = ((np.arange(fine) + 0.5) / fine * 2 - 1) * math.tan(field_of_view / 2)  # at distance 1
@@ -70,7 +70,7 @@ def scene_ray_bands(
 
 
 def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> NDArray[np.float32]:
-    """Average (N, C) ray values of a band of :func:`scene_ray_bands` to (rows, size, C) pixels."""
+    """Average (N, C) values of the rays of one band of :func:`scene_ray_bands` to (rows, size, C) pixels."""
     channels = values.shape[1]
     rows = len(values) // (size * samples * samples)
     across = values.reshape(rows, samples, size, samples * channels).mean(axis=1)
@@ -78,7 +78,7 @@ def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> 
 
 
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Do the work for every job in threads; ``progress`` receives the fraction done. An error cancels waiting jobs."""
+    """Call ``work`` for every job in threads; ``progress`` gets the fraction done. An error cancels waiting jobs."""
     pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):
@@ -88,13 +88,13 @@ def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: C
 
 
 def scene_drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
-    """Return the progress text that is shown while images are drawn."""
+    """Return the progress text for drawing a scene's images."""
     slow = "" if scene.engine == "embree" else " (without embreex, which would be faster)"
     return f"{name}: drawing {width}x{height} images{slow}"
 
 
 def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Fill the folder ``final`` by ``write`` unless all ``files`` exist; it appears when complete."""
+    """Create the folder ``final`` with ``write``, unless all ``files`` exist in it. It appears only when complete."""
     names = tuple(files)
     try:
         publish_folder(final, write, lambda folder: all((folder / name).is_file() for name in names))
@@ -105,7 +105,7 @@ def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path]
 
 @dataclass(frozen=True)
 class SceneImageSet(Generic[V]):
-    """The images of a scene, written as ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view."""
+    """Images of a generated scene, in ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view."""
 
     name: str
     key: str  # hash of everything the files depend on
@@ -120,7 +120,7 @@ class SceneImageSet(Generic[V]):
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {}  # scene -> further fields of a transforms file
 
     def generate(self, cache_dir: Path, progress: Progress) -> Path:
-        """Write the data set unless it is complete; return its folder ``cache_dir/NAME-KEY``."""
+        """Write the image set unless it exists completely; return its folder ``cache_dir/NAME-KEY``."""
         names = [f"transforms_{split}.json" for split in self.splits]
         names += [f"{split}/{file}" for split, views in self.splits.items() for v in views for file in self.files(v)]
         folder = Path(cache_dir) / f"{self.name}-{self.key}"

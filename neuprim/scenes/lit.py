@@ -1,15 +1,14 @@
-"""The scene ``lit_solids`` on disk, in the layout of GS³.
+"""Generator of the scene ``lit_solids``: solids under one point light per image, in the file layout of GS³.
 
     transforms_{train,test,circle}.json    camera_angle_x, poses with OpenGL axes, pl_pos, pl_intensity
     train/r_0000.exr                 RGBA, linear radiance over the exposure, premultiplied, half floats
-    train/r_0000_unshadowed.exr      the same without cast shadows
+    train/r_0000_unshadowed.exr      the same image without cast shadows
     train/r_0000_classes.png         8-bit grey, index into :data:`neuprim.scenes.PIXEL_CLASSES`
     test/new_light_03_nearest.exr    test views only: the view under the nearest of 25 training lights
 
-A pixel is background if fewer than half of its rays hit anything. Otherwise it has the class of more than half of the
-rays that hit, else "lit". The light has the intensity :data:`INTENSITY` in every image.
-
-Scene, cameras and lights are fixed: equal settings give equal files for any seed.
+A pixel's class is background if fewer than half of its rays hit a surface. Otherwise, if more than half of the rays
+that hit have the same class, the pixel has that class; if not, it is "lit". The light has the intensity
+:data:`INTENSITY` in every image. Scene, cameras and lights do not depend on a seed: equal settings give equal files.
 """
 
 from __future__ import annotations
@@ -49,11 +48,11 @@ GENERATOR_VERSION = 1
 DISTANCE = (4.0, 5.0)  # least and largest distance of cameras and lights from the origin, scene units
 
 FIELD_OF_VIEW = 2 * float(np.arcsin(1.19 / DISTANCE[0]))
-"""Radians; from the nearest camera it holds the sphere of radius 1.19 about the whole scene."""
+"""Field of view, radians. From the nearest camera, it contains the sphere of radius 1.19 around the scene."""
 
 INTENSITY = 69.2
-"""Radiant intensity of the lights over the exposure: it makes 1 the 99.5th percentile of the training images at the
-default settings."""
+"""Radiant intensity of the lights divided by the exposure. With default settings, the 99.5th percentile of the training
+images is 1."""
 
 PARTS = ("new_view", "new_light", "new_both")
 """Parts of the test split: new camera under a training light, training camera under a new light, and both new."""
@@ -71,7 +70,7 @@ _LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shad
 
 @dataclass(frozen=True)
 class LitSettings:
-    """Settings of ``scene=lit_solids`` that change the images: size in pixels, images a split, rays per pixel side."""
+    """Settings of the images of ``scene=lit_solids``: size in pixels, images per split, rays per pixel side."""
 
     size: ImageSize = 256
     train_views: Annotated[int, Range(1, 100000)] = 500
@@ -86,7 +85,7 @@ class LitSettings:
 
 
 class LitView(NamedTuple):
-    """View to render: (3,) positions of camera, light and, for test views, nearest baseline light."""
+    """A view of ``lit_solids``: (3,) positions of camera, light and, in test views, the baseline's nearest light."""
 
     name: str
     camera: NDArray[np.float64]
@@ -95,7 +94,7 @@ class LitView(NamedTuple):
 
 
 class LitImage(NamedTuple):
-    """Premultiplied radiance and coverage (size, size, 4), the same without cast shadows, and pixel classes."""
+    """Image of ``lit_solids``: premultiplied radiance and coverage, radiance without cast shadows, pixel classes."""
 
     rgba: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -105,7 +104,7 @@ class LitImage(NamedTuple):
 def generate_lit_solids(
     settings: LitSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/lit_solids-KEY``."""
+    """Write the images of ``scene=lit_solids`` unless they exist; return the folder ``cache_dir/lit_solids-KEY``."""
 
     def draw(scene: Scene, view: LitView, paths: Sequence[Path]) -> None:
         pose, quality = scene_camera_pose(view.camera), (settings.size, settings.supersampling)
@@ -149,11 +148,12 @@ def _lit_frame_entry(split: str, view: LitView) -> dict[str, Any]:
 
 
 def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, list[LitView]]:
-    """Return all views by split: "train", "test", "circle".
+    """Return the views of ``lit_solids`` by split: "train", "test", "circle".
 
-    Cameras look at the origin from 4 to 5 units, at most 75 degrees from the zenith; lights are as far away, at most
-    60 degrees from it. Directions are uniform on their cap, distances on their range. The test split has the three
-    equal :data:`PARTS`. ``circle`` is a film: one new camera and a light that goes round once.
+    Cameras look at the origin from a distance of 4 to 5 scene units, at most 75 degrees from the zenith. Lights have
+    the same distances, at most 60 degrees from the zenith. Directions are uniform on the spherical cap, distances on
+    the range. The test split has three :data:`PARTS` of equal size. "circle" is a video from one new camera, with a
+    light that goes around the solids once.
     """
     digits = max(4, len(str(train_views)))
     cameras, lights = _draw_lit_positions(1, train_views)
@@ -181,7 +181,7 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 
 
 def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Draw positions of ``count`` cameras and lights; longer lists begin with shorter ones."""
+    """Draw positions of ``count`` cameras and lights. A larger ``count`` only appends to the list."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
     return [_position_above_lit_solids(n[:3], _CAMERA_POLAR) for n in numbers], [
         _position_above_lit_solids(n[3:], _LIGHT_POLAR) for n in numbers
@@ -189,7 +189,7 @@ def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]]
 
 
 def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> NDArray[np.float64]:
-    """Map three numbers 0..1 to a point in a direction uniform on the cap of half-angle ``polar`` about the zenith."""
+    """Map three uniform numbers 0..1 to a position, uniform in direction within angle ``polar`` of the zenith."""
     cosine = 1.0 - numbers[0] * (1.0 - math.cos(polar))
     return (DISTANCE[0] + numbers[2] * (DISTANCE[1] - DISTANCE[0])) * scene_direction(cosine, 2 * math.pi * numbers[1])
 
@@ -198,7 +198,7 @@ def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> ND
 
 
 def build_lit_solids() -> list[Solid]:
-    """Build the solids without their plate, a bright slab that shows shadows, and a dark ring that shows highlights."""
+    """Build ``lit_solids``: the solids without plate, a bright slab to show shadows, a dark ring to show highlights."""
     thick, edge, major, minor = 0.1, 0.012, 0.235, 0.1
     profile = [(0.0, 1.0 - edge), (edge, 1.0), (thick - edge, 1.0), (thick, 1.0 - edge)]
     slab = lathe([0, 0, FLOOR - thick], [0, 0, 1], profile, sections=256)
@@ -213,7 +213,7 @@ def build_lit_solids() -> list[Solid]:
 def draw_lit_solids(
     scene: Scene, pose: NDArray[np.float64], light: NDArray[np.float64], size: int, supersampling: int
 ) -> LitImage:
-    """Draw the view at ``pose`` (camera to world, OpenGL axes) under a light at ``light`` (3,) of :data:`INTENSITY`."""
+    """Render ``scene`` from ``pose`` (camera to world, OpenGL axes), with a light of :data:`INTENSITY` at ``light``."""
     parts = []
     for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         seen = shade_point_light(scene, pose[:3, 3], directions, light, INTENSITY)
@@ -231,7 +231,7 @@ def draw_lit_solids(
 
 
 class ShadedRays(NamedTuple):
-    """Shaded rays: (N, 3) linear radiance, the same without cast shadows, and (N,) pixel classes."""
+    """Result for N shaded rays: (N, 3) linear radiance, with and without cast shadows, and (N,) pixel classes."""
 
     rgb: NDArray[np.float32]
     unshadowed: NDArray[np.float32]
@@ -243,9 +243,9 @@ def shade_point_light(
 ) -> ShadedRays:
     """Cast N rays and shade them under one point light at ``light`` (3,).
 
-    Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. A highlight is brighter than
-    the diffuse part and :data:`_BRIGHT`. Surfaces in attached shadow face away from the light, those in cast shadow are
-    occluded.
+    Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. Class "highlight": the
+    highlight is brighter than the diffuse part and than :data:`_BRIGHT`. Attached shadow: the surface faces away from
+    the light. Cast shadow: another surface occludes the light.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)

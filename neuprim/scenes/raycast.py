@@ -1,4 +1,4 @@
-"""Ray casting by Embree (``embreex``), or where it has no wheel by a box hierarchy in numba."""
+"""Ray casting with Embree (``embreex``), or with a bounding volume hierarchy in numba where embreex is missing."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neuprim.scenes.shapes import Solid, solid_corner_normals
 Engine = Literal["auto", "embree", "numba"]
 
 LIFT = 2e-4
-"""How far a shadow ray starts above the surface, in scene units: a hundred times the rounding of float32 there."""
+"""Distance of shadow rays' origins from the surface, scene units: a hundred times the rounding error of float32."""
 
 _LEAF = 4  # most triangles per leaf
 _DEPTH = 64  # size of the traversal's stack; median splits of 2^31 triangles need 32
@@ -24,7 +24,7 @@ _DEPTH = 64  # size of the traversal's stack; median splits of 2^31 triangles ne
 
 @dataclass(frozen=True)
 class Hits:
-    """Hits of N rays. Only ``hit`` has a row per ray; the others have one per hit, M in all, in order."""
+    """Surface hits of N rays. ``hit`` has one row per ray; all other arrays have one row per hit, M, in ray order."""
 
     hit: NDArray[np.bool_]  # (N,) bool
     position: NDArray[np.float32]  # (M, 3) float32, scene units
@@ -43,12 +43,12 @@ class Hits:
     emission: NDArray[np.float32] | None = None  # (M, 3) float32 linear RGB of emitted light, if any
 
     def lifted(self) -> NDArray[np.float32]:
-        """Return (M, 3) positions just off the surface, where shadow rays start."""
+        """Return the hits' (M, 3) positions, moved slightly off the surface: origins for shadow rays."""
         return self.position + np.float32(LIFT) * self.face
 
 
 class Scene:
-    """Solids ready for ray queries, by ``engine`` "embree" or "numba"; read-only, so threads may share it."""
+    """A set of solids for ray queries, with ``engine`` "embree" or "numba". Read-only, so threads may share a scene."""
 
     def __init__(self, solids: Sequence[Solid], engine: Engine = "auto") -> None:
         self.solids = tuple(solids)
@@ -65,7 +65,7 @@ class Scene:
         self.engine, self._search = _open_ray_engine(vertices, np.concatenate(faces).astype(np.int32), engine)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Return the first hit of each (N, 3) ray; scene units, directions of any length."""
+        """Return the first hit of each of N rays; ``origins`` in scene units, ``directions`` (N, 3) of any length."""
         o, d = _broadcast_raycast_rays(origins, directions)
         triangle, u, v, distance = self._first_hits(o, d)
         hit = triangle >= 0
@@ -84,13 +84,14 @@ class Scene:
         return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
 
     def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return (N,) triangles or -1, barycentric u and v, and distances in lengths of ``d``."""
+        """Return per ray, (N,): triangle index or -1, barycentric u and v, and distance in lengths of ``d``."""
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """Return (N,) bool: whether a surface is within ``distance``, in lengths of the direction.
+        """Return (N,) bool: whether a surface lies on the segment from each point along its direction.
 
-        Points must lie off a surface, see :meth:`Hits.lifted`.
+        ``distance`` is the segment's end, in lengths of the direction. Points must lie off a surface, see
+        :meth:`Hits.lifted`.
         """
         o, d = _broadcast_raycast_rays(points, directions)
         return self._search.any(o, d, np.broadcast_to(np.asarray(distance, dtype=np.float32), len(o)))
@@ -138,7 +139,7 @@ class _EmbreeEngine:
 
 
 class _BoxHierarchy:
-    """Box hierarchy of triangles (F, 3) of vertices (V, 3), with the queries of :class:`_EmbreeEngine`."""
+    """Bounding volume hierarchy of triangles (F, 3) of vertices (V, 3); same queries as :class:`_EmbreeEngine`."""
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         corners = vertices[faces].astype(np.float64)
@@ -158,7 +159,7 @@ class _BoxHierarchy:
 
 
 def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Return triangle order, node boxes, and per node (first child of two, 0) or (first triangle, count)."""
+    """Build the tree; return triangle order, node boxes, and per node (first child, 0) or (first triangle, count)."""
     order = np.arange(len(low))
     middle = (low + high) / 2
     boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]
@@ -185,7 +186,7 @@ def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDAr
 
 @numba.njit(nogil=True, error_model="numpy")
 def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the box of a node; infinity if it does not."""
+    """Return the distance at which a ray enters the box of ``node``; infinity if it misses the box."""
     near, far = 0.0, limit
     for axis in range(3):
         a, b = (low[node, axis] - o[axis]) * inverse[axis], (high[node, axis] - o[axis]) * inverse[axis]
@@ -198,7 +199,7 @@ def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-u
 
 @numba.njit(nogil=True, error_model="numpy")
 def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
-    """Return barycentric u, v and distance of a ray's hit on a triangle (3, 3); -1 without a hit."""
+    """Intersect a ray with a triangle (3, 3); return barycentric u, v and distance, -1 without a hit."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx

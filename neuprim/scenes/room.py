@@ -1,6 +1,6 @@
-"""The scene ``room`` on disk: photographs through a lens, from a walk around the solids, and reconstructed points.
+"""Generator of the scene ``room``: simulated photographs from a walk around the solids, with lens distortion.
 
-transforms.json, images/...    the layout of nerfstudio, with OpenCV's distortion and a split
+transforms.json, images/...    layout of nerfstudio, with OpenCV's lens distortion and a split
 points.ply                     simulated reconstruction: points where there is detail, a few of them wrong
 exposures.json                 the factor that each image is multiplied by
 """
@@ -82,7 +82,7 @@ class RoomSettings:
 
 
 def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/room-KEY``."""
+    """Write the files of ``scene=room`` unless they exist; return the folder ``cache_dir/room-KEY``."""
     poses = room_camera_poses(settings.train_views, settings.test_views)
     gains = room_exposure_gains(settings.train_views, settings.exposure).tolist()
     shots = [(f"train_{i:04d}.png", pose, gains[i]) for i, pose in enumerate(poses["train"])]
@@ -94,12 +94,12 @@ def generate_room(settings: RoomSettings, cache_dir: Path, progress: Progress = 
 
 
 def build_room(settings: RoomSettings) -> Room:
-    """Build the room, its textures filtered for the spacing of the images' rays."""
+    """Build the scene ``room``, with textures filtered for the ray spacing of the images."""
     return Room(build_solids(), furnish_room(), 1 / (room_lens(settings).focal * settings.supersampling))
 
 
 def room_exposure_gains(count: int, stops: float) -> NDArray[np.float64]:
-    """Return (count,) gains of training images, their log2 uniform in -``stops``..``stops``."""
+    """Return (count,) exposure factors of training images; their log2 is uniform in -``stops``..``stops``."""
     return 2.0 ** (stops * (2 * np.random.default_rng(_EXPOSURE_SEED).random(count) - 1))
 
 
@@ -156,7 +156,7 @@ def _room_transforms_document(lens: RoomLens, shots: list[_Shot]) -> dict[str, A
 
 @dataclass(frozen=True)
 class RoomLens:
-    """Intrinsics of images ``width`` pixels wide; all-zero ``distortion`` is a pinhole."""
+    """Camera intrinsics for images ``width`` pixels wide. With all-zero ``distortion``, the camera is a pinhole."""
 
     width: int
     distortion: RadialDistortion = LENS
@@ -172,16 +172,16 @@ class RoomLens:
 
     @property
     def camera(self) -> Camera:
-        """Pinhole of the undistorted image at the identity pose, its principal point slightly off centre."""
+        """Pinhole camera of the undistorted image, at the identity pose; its principal point is slightly off centre."""
         centre = 0.504 * self.width, 0.495 * self.height
         return Camera(torch.eye(4, dtype=torch.float64), self.focal, self.focal, *centre, self.width, self.height)
 
     def pixels(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (M, 2) distorted pixels of directions (x/z, y/z), OpenCV axes; centres at +0.5."""
+        """Project (M, 2) directions (x/z, y/z), OpenCV axes, to (M, 2) distorted pixels; pixel centres are at +0.5."""
         return self.distortion.project(points, self.camera)
 
     def rays(self, pose: NDArray[np.float64], pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return (M, 3) unit ray directions of (M, 2) distorted pixels; ``pose`` (4, 4): camera to world."""
+        """Return (M, 3) unit ray directions of (M, 2) distorted pixels; ``pose`` (4, 4) is camera to world."""
         x, y = self._undistort(pixels).T
         local = np.stack([x, -y, -np.ones_like(x)], axis=1)
         local /= np.sqrt(np.einsum("nc,nc->n", local, local))[:, None]
@@ -200,7 +200,7 @@ class RoomLens:
         return points
 
     def ray_bands(self, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
-        """Yield (N, 3) unit ray directions by whole pixel rows, ``samples`` rays per pixel side."""
+        """Yield (N, 3) unit ray directions for bands of pixel rows, with ``samples`` rays per pixel side."""
         across = (np.arange(self.width * samples) + 0.5) / samples
         down = (np.arange(self.height * samples) + 0.5) / samples
         rows = max(1, RAYS_AT_ONCE // (len(across) * samples)) * samples
@@ -210,14 +210,14 @@ class RoomLens:
 
 
 def room_lens(settings: RoomSettings) -> RoomLens:
-    """Return the lens that the images are taken with."""
+    """Return the lens for the images of ``scene=room``."""
     return RoomLens(settings.size, LENS if settings.distortion else RadialDistortion())
 
 
 def photograph_room(
     room: Room, lens: RoomLens, pose: NDArray[np.float64], supersampling: int, gain: float = 1.0
 ) -> NDArray[np.uint8]:
-    """Render (H, W, 3) uint8 sRGB of linear light, averaged over rays and multiplied by ``gain``."""
+    """Render a photograph, (H, W, 3) uint8 sRGB. Rays are averaged in linear light, then multiplied by ``gain``."""
     bands = (room_lamplight_radiance(room, pose[:3, 3], d) for d in lens.ray_bands(pose, supersampling))
     mean = np.concatenate([average_scene_rays(band, lens.width, supersampling) for band in bands])
     return np.round(encode_scene_srgb(mean * np.float32(gain)) * 255).astype(np.uint8)
@@ -227,7 +227,7 @@ def photograph_room(
 
 
 def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
-    """Return positions on the walk, 0..1, by split: test views evenly, training views between them."""
+    """Return the views' positions on the walk, 0..1, by split. Test views are evenly spaced, training views between."""
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
     first = np.searchsorted(gap, gap)
@@ -236,7 +236,7 @@ def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]
 
 
 def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float64]]]:
-    """Return (4, 4) camera-to-world matrices, OpenGL axes, by split; test poses ignore ``train``."""
+    """Return (4, 4) camera-to-world matrices, OpenGL axes, by split; test poses do not depend on ``train``."""
     poses = {}
     for split, times in room_walk_positions(train, test).items():
         shake = 2 * np.random.default_rng(_WALKS_SEEDS[split]).random((len(times), 7)) - 1
@@ -245,7 +245,7 @@ def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float6
 
 
 def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (4, 4) pose at ``t``, 0..1, of two rounds; ``shake`` (7,), -1..1, moves eye, aim, roll."""
+    """Return the (4, 4) pose at ``t``, 0..1, of a walk of two rounds; ``shake`` (7,), -1..1, varies eye, aim, roll."""
     turn = 2 * math.pi
     distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
     height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]
@@ -281,10 +281,10 @@ def reconstruct_room_points(
     luma: Callable[[int], NDArray[np.float32]],
     count: int,
 ) -> ReconstructedPoints:
-    """Return ``count`` points, each seen by the training camera that found it and at least one other.
+    """Simulate a reconstruction: return ``count`` points that at least two training cameras see.
 
-    ``poses`` (4, 4) are camera to world; points are drawn where ``luma``, camera -> (H, W) brightness, has detail.
-    Raises ConfigError if the cameras have too little in view together.
+    Points are drawn where the images have detail; ``luma`` maps a camera's index to the (H, W) brightness. ``poses``
+    (4, 4) are camera to world. Raises ConfigError if too few surfaces are seen by two cameras.
     """
     chances = [_room_pixel_detail_chances(luma(i)) for i in range(len(poses))]
     directions, finders = np.zeros((0, 3)), np.zeros(0, np.intp)
@@ -321,7 +321,7 @@ def reconstruct_room_points(
 
 
 def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Return the (H * W,) cumulative probability of pixels, which grows with the brightness gradient."""
+    """Return (H * W,) cumulative probabilities of pixels; a pixel's probability grows with its brightness gradient."""
     down, across = np.gradient(luma.astype(np.float64))
     detail = np.hypot(down, across)
     total = np.cumsum((detail + _PLAIN * max(detail.mean(), 1e-6)).ravel())
@@ -331,7 +331,7 @@ def _room_pixel_detail_chances(luma: NDArray[np.float32]) -> NDArray[np.float64]
 def _room_seen_by_another(
     room: Room, lens: RoomLens, poses: Sequence[NDArray[np.float64]], camera: int, directions: NDArray[np.float64]
 ) -> NDArray[np.bool_]:
-    """Return (M,) bool: whether what ``camera`` sees along ``directions`` is visible in another image."""
+    """Return (M,) bool: whether the surface point along each direction from ``camera`` is visible in another image."""
     hits = room.intersect(poses[camera][:3, 3], directions)
     starts = hits.lifted()
     seen = np.zeros(len(starts), dtype=np.bool_)
@@ -356,9 +356,9 @@ _GRAZING = np.float32(0.04)  # least cosine of the angle of incidence in the wid
 
 
 class Room(Scene):
-    """Solids and furnishings, with textures averaged over ray footprints.
+    """Scene of solids and furnishings, with textures averaged over ray footprints.
 
-    Rays are ``spacing`` apart at distance 1.
+    ``spacing`` is the distance of neighbouring rays at distance 1 from the camera.
     """
 
     def __init__(
@@ -371,7 +371,7 @@ class Room(Scene):
         self._spacing = np.float32(spacing)
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Intersect as :meth:`Scene.intersect`, for directions of unit length."""
+        """Return the first hits as :meth:`Scene.intersect` does; directions must have unit length."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         # The footprint is an ellipse; the width is the root of its area, so grazing views blur instead of flickering.
@@ -386,7 +386,7 @@ class Room(Scene):
 
 
 def room_lamplight_radiance(room: Room, origins: ArrayLike, directions: ArrayLike) -> NDArray[np.float32]:
-    """Return (N, 3) linear RGB of rays with ``origins`` (N, 3) or (3,), unit ``directions``."""
+    """Shade N rays in the room: return (N, 3) linear RGB. ``origins``: (N, 3) or (3,); ``directions``: unit (N, 3)."""
     d = np.asarray(directions, dtype=np.float32)
     hits = room.intersect(origins, d)
     to_eye = -d[hits.hit]

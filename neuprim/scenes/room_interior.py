@@ -1,4 +1,4 @@
-"""The interior of the scene ``room``: furnishings, and textures that are averaged over the width of a ray."""
+"""Furnishings of the scene ``room``, and textures that are averaged over the width of a ray."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from neuprim.scenes.shapes import (
 Array = NDArray[np.float32]
 
 Texture = Callable[[Array, Array], Array]
-"""(M, 3) positions in scene units and (M,) widths in the same -> (M, 3) linear RGB reflectance 0..1."""
+"""(M, 3) positions and (M,) ray widths, both in scene units -> (M, 3) linear RGB reflectance 0..1."""
 
 _PRIMES = (0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D)
 
 
 def stripes(x: Array, period: float, part: float, width: Array) -> Array:
-    """Return (M,) box-filtered stripes: the share of ``width`` about ``x`` that stripes cover.
+    """Return (M,) box-filtered stripes: the fraction of an interval of length ``width`` around ``x`` that is striped.
 
-    A stripe is the first ``part``, 0..1, of every ``period``.
+    Each ``period`` begins with a stripe, whose length is the fraction ``part``, 0..1, of the period.
     """
 
     def covered(t: Array) -> NDArray[np.float64]:  # of 0..t, in double precision, as nearly equal values are subtracted
@@ -44,10 +44,10 @@ def stripes(x: Array, period: float, part: float, width: Array) -> Array:
 
 
 def lattice_noise(points: Array, width: Array, cell: float, seed: int, octaves: int = 4, fall: float = 0.55) -> Array:
-    """Return (M,) smooth noise, about -1..1, of mean 0 at ``points`` (M, D).
+    """Return (M,) smooth noise at ``points`` (M, D), about -1..1, with mean 0.
 
-    Octaves have lattices of edge ``cell``, ``cell``/2, ...; each is ``fall`` times as strong as the last, and left out
-    where its cells are smaller than about ``width`` (M,).
+    The noise is a sum of octaves with lattice edges ``cell``, ``cell``/2, ... Each octave has ``fall`` times the
+    amplitude of the one before. Octaves whose lattice edge is smaller than about ``width`` (M,) are left out.
     """
     total, strength = np.zeros(len(points), dtype=np.float32), 1.0
     for octave in range(octaves):
@@ -73,15 +73,15 @@ def cell_random(index: NDArray[np.integer], seed: int) -> Array:
 
 
 def mix_colours(one: Array, other: Array, share: Array) -> Array:
-    """Blend from ``one`` at ``share`` (M,) 0 to ``other`` at 1, both (3,) or (M, 3), to (M, 3)."""
+    """Return (M, 3) blended colours. ``share``: (M,), 0 gives ``one``, 1 gives ``other``; both (3,) or (M, 3)."""
     t = np.clip(share, 0, 1)[:, None].astype(np.float32, copy=False)
     return one + t * (other - one)
 
 
 def _lattice_noise(points: Array, seed: int) -> Array:
-    """Return (M,) random values -1..1 of a lattice, interpolated by a quintic.
+    """Return (M,) noise -1..1: random values on the integer lattice, interpolated by quintic polynomials.
 
-    Its first two derivatives are smooth.
+    The first two derivatives are continuous.
     """
     base = np.floor(points)
     t = points - base
@@ -101,7 +101,7 @@ def _lattice_noise(points: Array, seed: int) -> Array:
 
 
 def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) -> Texture:
-    """One colour, unevenly painted."""
+    """Return a texture of uneven paint in one colour."""
     colour = parse_solid_srgb(code)
     return lambda p, w: np.clip(colour * (1 + np.float32(strength) * lattice_noise(p, w, cell, seed))[:, None], 0, 1)
 
@@ -109,7 +109,7 @@ def speckled(code: str, seed: int, strength: float = 0.12, cell: float = 0.5) ->
 def planks(
     dark: str, light: str, along: int, across: int, seed: int, width: float = 0.3, length: float = 2.2
 ) -> Texture:
-    """Boards along ``along``, side by side ``across``, each of its own tone, with grain and gaps."""
+    """Return a texture of wooden boards with grain and gaps; ``along`` and ``across`` are the indices of their axes."""
     one, other = parse_solid_srgb(dark), parse_solid_srgb(light)
 
     def texture(p: Array, w: Array) -> Array:
@@ -127,7 +127,7 @@ def planks(
 
 
 def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22, mortar: float = 0.03) -> Texture:
-    """A wall of bricks, each of its own red, rough, every other row moved by half a brick."""
+    """Return a texture of red bricks and mortar; ``u``, ``v`` are the indices of the horizontal and vertical axis."""
     dark, light, grout = parse_solid_srgb("#7d3527"), parse_solid_srgb("#cf7d5a"), parse_solid_srgb("#c9c0b2")
 
     def texture(p: Array, w: Array) -> Array:
@@ -144,7 +144,7 @@ def bricks(u: int, v: int, seed: int, width: float = 0.62, height: float = 0.22,
 
 
 def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> Texture:
-    """Squares of two colours with fine joints, worn unevenly."""
+    """Return a texture of worn squares in two colours, with fine joints."""
     first, second = parse_solid_srgb(one), parse_solid_srgb(other)
 
     def texture(p: Array, w: Array) -> Array:
@@ -159,7 +159,7 @@ def chequered(one: str, other: str, u: int, v: int, cell: float, seed: int) -> T
 
 
 def wallpaper(u: int, v: int, seed: int) -> Texture:
-    """Broad and narrow stripes with a row of dots in every broad one."""
+    """Return a wallpaper texture: broad and narrow stripes, with a row of dots in every broad one."""
     ground, broad, narrow, dot = map(parse_solid_srgb, ("#e9dcc0", "#9db8a2", "#4f7a6b", "#b5533c"))
 
     def texture(p: Array, w: Array) -> Array:
@@ -179,7 +179,7 @@ def wallpaper(u: int, v: int, seed: int) -> Texture:
 
 
 def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
-    """Rough plaster in clouds of ochre; below the height ``panel`` a wainscot of upright boards."""
+    """Return a texture of rough ochre plaster, with upright boards below the height ``panel``."""
     light, dark, board, seam, edge = map(parse_solid_srgb, ("#e6c98c", "#b0764a", "#5d6f86", "#2f3a4a", "#efe9dc"))
     narrow = np.array([1, 0.2], np.float32)
 
@@ -196,7 +196,7 @@ def plaster(u: int, v: int, seed: int, panel: float) -> Texture:
 
 
 def painting(u: int, v: int, seed: int) -> Texture:
-    """A picture: three colours flow into each other, with contours where one gives way to the next."""
+    """Return the texture of an abstract painting: three colours that blend, with contour lines between them."""
     ground, *colours = map(parse_solid_srgb, ("#12355b", "#e4572e", "#f3a712", "#76b041"))
 
     def texture(p: Array, w: Array) -> Array:
@@ -212,7 +212,7 @@ def painting(u: int, v: int, seed: int) -> Texture:
 
 
 def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5) -> Texture:
-    """Spines side by side: each of its own colour, with a band, and a dark line to the next."""
+    """Return a texture of book spines in random colours, each with a band, separated by dark lines."""
     codes = ("#8c2f39", "#1d3557", "#e0b04c", "#3a5a40", "#d8d0c0", "#5e3a78", "#c8553d", "#247ba0")
     colours = np.stack([parse_solid_srgb(code) for code in codes])
 
@@ -230,7 +230,7 @@ def books(u: int, v: int, seed: int, thickness: float = 0.11, shelf: float = 0.5
 
 
 def marble(seed: int) -> Texture:
-    """Dark veins through light stone, in all three dimensions."""
+    """Return a 3D marble texture: dark veins in light stone."""
     light, vein = parse_solid_srgb("#e4e0d8"), parse_solid_srgb("#5a6470")
 
     def texture(p: Array, w: Array) -> Array:
@@ -242,7 +242,7 @@ def marble(seed: int) -> Texture:
 
 
 def rug(radius: float, seed: int) -> Texture:
-    """Rings about the z axis, some of them cut into wedges, woven from coarse yarn."""
+    """Return the texture of a woven rug: rings about the z axis, some of them divided into wedges."""
     red, navy, cream = parse_solid_srgb("#a63a3a"), parse_solid_srgb("#1f2f4f"), parse_solid_srgb("#e8dcc2")
 
     def texture(p: Array, w: Array) -> Array:
@@ -261,7 +261,7 @@ def rug(radius: float, seed: int) -> Texture:
 
 
 def sky(seed: int, low: float, high: float) -> Texture:
-    """View through a window: clouds on a blue that pales from height ``high`` down to ``low``."""
+    """Return a texture of sky and clouds; the blue becomes paler from height ``high`` down to ``low``."""
     zenith, horizon, cloud = parse_solid_srgb("#4f8fd6"), parse_solid_srgb("#cfe3f2"), parse_solid_srgb("#ffffff")
 
     def texture(p: Array, w: Array) -> Array:
@@ -283,7 +283,7 @@ _UP = [0, 0, 1]
 
 
 class Furnishing(NamedTuple):
-    """One closed body; with ``glow`` above 0 its ``texture`` emits light and reflects none."""
+    """A closed body in the room. If ``glow`` is above 0, it emits the colour of ``texture`` and reflects no light."""
 
     name: str
     mesh: trimesh.Trimesh
@@ -293,9 +293,9 @@ class Furnishing(NamedTuple):
 
 
 def furnish_room() -> list[Furnishing]:
-    """Build the room but the solids, the same at every call.
+    """Build all bodies of the scene ``room`` except the solids; every call returns equal bodies.
 
-    A cylinder of radius 4.7 about z is free of furniture.
+    The walk needs space: a cylinder of radius 4.7 about z is free of furniture.
     """
     inside = [*_wall_furnishings(), *_table_furnishings(), *_lamp_furnishings()]
     inside += [*_brick_side_furnishings(), *_plaster_side_furnishings()]
@@ -303,12 +303,12 @@ def furnish_room() -> list[Furnishing]:
 
 
 def _room_corner_box(low: Corner, high: Corner, chamfer: float = 0.02) -> trimesh.Trimesh:
-    """Build a chamfered box with these opposite corners."""
+    """Build a chamfered box from two opposite corners."""
     return chamfered_box(np.subtract(high, low), np.add(low, high) / 2, chamfer)
 
 
 def _wall_slab(low: Corner, high: Corner) -> trimesh.Trimesh:
-    """Build a box without chamfers."""
+    """Build a box without chamfers from two opposite corners."""
     mesh = trimesh.creation.box(extents=np.subtract(high, low))
     mesh.apply_translation(np.add(low, high) / 2)
     return mesh
@@ -321,7 +321,7 @@ def _room_corner_boxes(*corners: tuple[Corner, Corner], chamfer: float = 0.02) -
 def _picture_frame(
     x: float, y: float, low: float, high: float, half: float, along: int, width: float, depth: float
 ) -> trimesh.Trimesh:
-    """Build four bars on a wall around an opening of half width ``half``, from ``low`` to ``high``."""
+    """Build a frame of four bars around an opening of half width ``half``, between the heights ``low`` and ``high``."""
     middle = np.array([x, y, (low + high) / 2])
     side = np.eye(3)[along]
     upright, level = np.full(3, depth), np.full(3, depth)
@@ -362,7 +362,7 @@ def _wall_furnishings() -> list[Furnishing]:
 
 
 def _table_furnishings() -> list[Furnishing]:
-    """A round table under the plate of the solids, on a rug."""
+    """Build a round table under the plate of the solids, on a rug."""
     top, foot, radius = FLOOR - 0.08, LOW[2], 1.3
     disc = [(0, radius - 0.04), (0.03, radius), (0.06, radius), (0.09, radius - 0.03)]
     leg = [(0.02, 0.62), (0.09, 0.6), (0.16, 0.2), (0.5, 0.13), (top - foot - 0.16, 0.16), (top - foot - 0.08, 0.5)]
@@ -386,7 +386,7 @@ def _lamp_furnishings() -> list[Furnishing]:
 
 
 def _brick_side_furnishings() -> list[Furnishing]:
-    """The wall at x = 6: a window with four panes, and crates below."""
+    """Build the wall at x = 6: a window with four panes, and crates below."""
     x, low, high = HIGH[0], 0.2, 2.4
     pane = _room_corner_box((x - 0.02, -1.4, low), (x + 0.05, 1.4, high), 0.005)
     upright = _room_corner_box((x - 0.1, -0.05, low), (x, 0.05, high), 0.01)
@@ -408,7 +408,7 @@ def _brick_side_furnishings() -> list[Furnishing]:
 
 
 def _plaster_side_furnishings() -> list[Furnishing]:
-    """The wall at y = 6: a shelf full of books, and a picture in a frame."""
+    """Build the wall at y = 6: a shelf full of books, and a picture in a frame."""
     y0, y1, left, right, z, step = 5.3, 6.0, -4.6, -1.6, -1.6, 0.62
     boards = [((left, y0, z + step * i), (right, y1, z + step * i + 0.06)) for i in range(6)]
     sides = (left - 0.08, (left + right) / 2, right)
@@ -429,7 +429,7 @@ def _plaster_side_furnishings() -> list[Furnishing]:
 
 
 def _wallpaper_side_furnishings() -> list[Furnishing]:
-    """The wall at x = -6: a long bench, two pictures above it, and a pillar in the corner."""
+    """Build the wall at x = -6: a long bench, two pictures above it, and a pillar in the corner."""
     column = [(0.0, 0.62), (0.2, 0.62), (0.3, 0.45), (4.7, 0.42), (4.8, 0.6), (5.0, 0.6)]
     bench = [
         _room_corner_box((-5.95, -2.6, -1.35), (-5.15, 1.4, -1.1), 0.05),
@@ -453,7 +453,7 @@ def _wallpaper_side_furnishings() -> list[Furnishing]:
 
 
 def _tile_side_furnishings() -> list[Furnishing]:
-    """The wall at y = -6: a cupboard, a door and a big pot."""
+    """Build the wall at y = -6: a cupboard, a door and a big pot."""
     places = [(x, z) for x in (-4.3, -3.55, -2.8) for z in (-1.4, -0.3)]
     panels = _room_corner_boxes(*(((x, -5.27, z), (x + 0.62, -5.22, z + 0.95)) for x, z in places))
     places = [(x, z) for x in (1.45, 2.2) for z in (-1.4, 0.1)]

@@ -1,4 +1,4 @@
-"""Reflectance of the solids: Lambert's reflectance plus Blinn and Phong's highlight in its energy-scaled form,
+"""Shading of the generated scenes: Lambertian reflectance plus a normalised Blinn-Phong highlight,
 
 f = albedo / pi + k (n + 8) / (8 pi) (N.H)^n,     k = specular gloss,  n = 6 + 110 gloss^2.
 """
@@ -18,7 +18,7 @@ Colour = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Daylight:
-    """Sun and sky."""
+    """Sun and sky that light a generated scene."""
 
     direction: tuple[float, float, float] = (0.42, -0.62, 0.92)  # (3,) towards the sun; any length
     sun: Colour = (2.3, 2.2, 2.0)  # linear RGB irradiance of a surface facing it
@@ -31,12 +31,12 @@ DAYLIGHT = Daylight()
 
 
 def shading_dot(a: Array, b: Array) -> Array:
-    """Return (M,) dot products of (M, 3) rows with (M, 3) rows or one (3,) vector."""
+    """Return (M,) dot products of the rows of ``a`` (M, 3) with the rows of ``b`` (M, 3) or with one vector (3,)."""
     return np.einsum("nc,nc->n", a, np.broadcast_to(b, a.shape))  # several times faster than a sum over three
 
 
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """Return (M,) cosines to the light, at least 0, and pi times highlight reflectance.
+    """Return, per hit, the cosine to the light, clamped at 0, and pi times the highlight's reflectance.
 
     Directions are unit vectors.
     """
@@ -52,7 +52,7 @@ def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tup
 
 
 def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
-    """Return (M, 3) linear RGB radiance to the eye, per unit irradiance of a surface facing the light."""
+    """Return (M, 3) linear RGB radiance from the hits to the eye, per unit irradiance on a surface facing the light."""
     cosine, highlight = reflectance_lobes(hits, to_eye, to_light)
     return ((hits.albedo + highlight[:, None]) * (cosine / np.float32(np.pi))[:, None]).astype(np.float32)
 
@@ -60,7 +60,7 @@ def reflect_light(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> Array:
 def scene_daylight_radiance(
     scene: Scene, origins: ArrayLike, directions: ArrayLike, light: Daylight = DAYLIGHT
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """Return (N, 3) linear RGB of N rays, zero where nothing is hit, and an (N,) bool hit mask."""
+    """Shade N rays in daylight: return (N, 3) linear RGB, zero without a hit, and an (N,) bool hit mask."""
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)
     to_eye = -d[hits.hit]
@@ -79,7 +79,7 @@ def scene_daylight_radiance(
 def scene_light_visibility(scene: Scene, hits: Hits, to_light: Array, away: ArrayLike) -> NDArray[np.bool_]:
     """Return (M,) bool: whether light from ``to_light`` (M, 3) reaches the hits.
 
-    ``away`` is its distance in lengths of ``to_light``.
+    ``away`` is the distance of the light in lengths of ``to_light``.
     """
     lit: NDArray[np.bool_] = shading_dot(hits.face, to_light) > 0  # what faces away is in its own shadow: no ray needed
     lit[lit] = ~scene.occluded(hits.lifted()[lit], to_light[lit], np.broadcast_to(away, len(lit))[lit])
@@ -87,7 +87,7 @@ def scene_light_visibility(scene: Scene, hits: Hits, to_light: Array, away: Arra
 
 
 def add_scene_surroundings(rgb: Array, hits: Hits, to_eye: Array, sky: Colour, ground: Colour) -> None:
-    """Add to ``rgb`` (M, 3) the reflection of soft light from all around: ``sky`` above, ``ground`` below."""
+    """Add to ``rgb`` (M, 3) the reflected ambient light: radiance ``sky`` from above, ``ground`` from below."""
 
     def surroundings(height: Array) -> Array:
         t = (0.5 + 0.5 * height)[:, None]

@@ -1,4 +1,4 @@
-"""Closed triangle meshes in scene units with outward faces, their normals, and the solids that are built from them."""
+"""Solids of the scene ``solids``: closed triangle meshes with outward faces, in scene units, and their normals."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ Albedo = Callable[[NDArray[np.float32]], NDArray[np.float32]]
 FLOOR = -0.52  # height of the plate's upper side, on which everything stands
 
 _CREASE = np.cos(np.radians(24.0))
-"""Faces that meet at a larger angle keep their own normals: chamfers stay hard, facets of round parts blend."""
+"""Crease angle: faces that meet at a larger angle are not smoothed, so chamfers stay hard, round parts smooth."""
 
 _CORNERS_AT_ONCE = 1 << 18  # bounds the memory for pairs of corners
 
 
 def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh.Trimesh:
-    """An axis-aligned box of edge lengths ``size`` about ``centre``, every edge cut at 45 degrees by ``chamfer``."""
+    """Build a box of edge lengths ``size`` around ``centre``, with edges cut at 45 degrees by ``chamfer``."""
     half = np.asarray(size, dtype=np.float64) / 2
     # Each corner becomes a triangle: one axis at full extent, the other two drawn in. Their hull is the chamfered box.
     pulls = sorted(set(permutations((0.0, chamfer, chamfer))))
@@ -34,7 +34,7 @@ def chamfered_box(size: ArrayLike, centre: ArrayLike, chamfer: float) -> trimesh
 
 
 def pyramid(base: float, height: float, centre: ArrayLike, turn: float) -> trimesh.Trimesh:
-    """A pyramid over a square of edge ``base`` about ``centre`` that is turned by ``turn`` radians about z."""
+    """Build a pyramid on a square base of edge ``base`` around ``centre``, rotated by ``turn`` radians about z."""
     angles = turn + np.pi / 4 + np.pi / 2 * np.arange(4)
     square = np.stack([np.cos(angles), np.sin(angles), np.zeros(4)], axis=1) * base / np.sqrt(2)
     vertices = np.concatenate([square, [[0.0, 0.0, height]]]) + np.asarray(centre, dtype=np.float64)
@@ -42,14 +42,14 @@ def pyramid(base: float, height: float, centre: ArrayLike, turn: float) -> trime
 
 
 def ball(centre: ArrayLike, radius: float, fine: bool = True) -> trimesh.Trimesh:
-    """A sphere of 5,120 (or, not ``fine``, 1,280) triangles."""
+    """Build a sphere of 5,120 triangles, or of 1,280 if not ``fine``."""
     mesh = trimesh.creation.icosphere(subdivisions=4 if fine else 3, radius=radius)
     mesh.apply_translation(centre)
     return mesh
 
 
 def ring(centre: ArrayLike, axis: ArrayLike, major: float, minor: float) -> trimesh.Trimesh:
-    """A torus: circle of radius ``major`` in the plane normal to ``axis``, tube of radius ``minor``."""
+    """Build a torus: circle of radius ``major`` in the plane normal to ``axis``, tube of radius ``minor``."""
     mesh = trimesh.creation.torus(major, minor, major_sections=128, minor_sections=48)
     mesh.apply_transform(trimesh.geometry.align_vectors([0.0, 0.0, 1.0], axis))
     mesh.apply_translation(centre)
@@ -57,7 +57,7 @@ def ring(centre: ArrayLike, axis: ArrayLike, major: float, minor: float) -> trim
 
 
 def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
-    """A thin straight rod with flat ends."""
+    """Build a straight cylinder from ``start`` to ``end`` with flat ends."""
     length = float(np.linalg.norm(np.subtract(end, start)))
     return lathe(start, np.subtract(end, start), [(0.0, radius), (length, radius)], sections=24)
 
@@ -65,7 +65,7 @@ def rod(start: ArrayLike, end: ArrayLike, radius: float) -> trimesh.Trimesh:
 def lathe(
     start: ArrayLike, axis: ArrayLike, profile: Sequence[tuple[float, float]], sections: int = 96
 ) -> trimesh.Trimesh:
-    """A solid of revolution; ``profile`` lists (distance along ``axis`` from ``start``, radius)."""
+    """Build a solid of revolution; ``profile`` lists (distance along ``axis`` from ``start``, radius)."""
     direction = np.asarray(axis, dtype=np.float64)
     direction = direction / np.linalg.norm(direction)
     side = np.cross(direction, np.eye(3)[np.argmin(np.abs(direction))])
@@ -87,8 +87,8 @@ def arc_tube(
 ) -> trimesh.Trimesh:
     """Sweep a tube along a circular arc in the plane of ``first`` (angle 0) and ``second``.
 
-    ``angles`` (n,) are ascending. ``radii`` are (n, 2) half axes in the arc's plane and across it; (n,) or a number
-    for a round cross-section.
+    ``angles`` (n,) are ascending, radians. ``radii`` (n, 2) are the half axes of the elliptic cross-section, in the
+    arc's plane and across it; (n,) or one number for a round cross-section.
     """
     one, two = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     outward = np.cos(angles)[:, None] * one + np.sin(angles)[:, None] * two
@@ -102,7 +102,7 @@ def arc_tube(
 
 
 def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sections: int) -> trimesh.Trimesh:
-    """Build a capped tube of rings about ``path`` (n, 3), in the planes of ``side`` and ``across``."""
+    """Build a capped tube along ``path`` (n, 3); cross-sections lie in the planes of ``side`` and ``across``."""
     turn = 2 * np.pi * np.arange(sections) / sections
     in_plane = (half[:, :1] * np.cos(turn))[..., None] * side[:, None]
     rings = path[:, None] + in_plane + (half[:, 1:] * np.sin(turn))[..., None] * across  # (n, sections, 3)
@@ -120,14 +120,14 @@ def _tube_mesh(path: NDArray, side: NDArray, across: NDArray, half: NDArray, sec
 
 
 def merge_solid_meshes(meshes: Sequence[trimesh.Trimesh]) -> trimesh.Trimesh:
-    """Merge meshes without sharing vertices where they touch, so that each stays closed."""
+    """Merge meshes into one. Touching meshes do not share vertices, so that each remains closed."""
     start = np.cumsum([0, *(len(mesh.vertices) for mesh in meshes)])
     faces = [mesh.faces.view(np.ndarray) + first for mesh, first in zip(meshes, start[:-1], strict=True)]
     return trimesh.Trimesh(np.concatenate([mesh.vertices for mesh in meshes]), np.concatenate(faces), process=False)
 
 
 def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
-    """Return (F, 3, 3) unit corner normals: angle-weighted means of faces within the crease angle."""
+    """Return (F, 3, 3) unit corner normals: angle-weighted means over adjacent faces within the crease angle."""
     faces, flat = mesh.faces.view(np.ndarray), mesh.face_normals.view(np.ndarray)
     corners, angles = faces.size, mesh.face_angles.view(np.ndarray).ravel()
     places = (np.arange(corners), faces.ravel())
@@ -148,7 +148,7 @@ def solid_corner_normals(mesh: trimesh.Trimesh) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class Solid:
-    """One closed body."""
+    """A closed body with its material."""
 
     name: str
     mesh: trimesh.Trimesh  # watertight, scene units
@@ -160,19 +160,19 @@ class Solid:
 
 
 def parse_solid_srgb(code: str) -> NDArray[np.float32]:
-    """Return (3,) linear RGB of a display colour "#rrggbb" (IEC 61966-2-1)."""
+    """Convert an sRGB colour "#rrggbb" to (3,) linear RGB (IEC 61966-2-1)."""
     value = np.array([int(code[i : i + 2], 16) for i in (1, 3, 5)]) / 255.0
     return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float32)
 
 
 def uniform_colour(code: str) -> Albedo:
-    """Return an albedo of one colour everywhere."""
+    """Return an albedo function with one colour everywhere."""
     colour = parse_solid_srgb(code)
     return lambda position: np.broadcast_to(colour, position.shape)
 
 
 def _two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], NDArray[np.bool_]]) -> Albedo:
-    """Return an albedo: ``other`` where ``is_other``, positions (M, 3) -> (M,) bool, else ``code``."""
+    """Return an albedo function: colour ``other`` where ``is_other`` (positions -> bool) is true, else ``code``."""
     first, second = parse_solid_srgb(code), parse_solid_srgb(other)
     return lambda position: np.where(is_other(position)[:, None], second, first)
 
@@ -181,7 +181,7 @@ def _two_tone(code: str, other: str, is_other: Callable[[NDArray[np.float32]], N
 
 
 def build_solids() -> list[Solid]:
-    """Build all solids of the scene, the same at every call."""
+    """Build all solids of the scene ``solids``; every call returns equal solids."""
     # Enlarged about the plate and turned, so that the bit ends over the wire cube.
     pose = trimesh.transformations.rotation_matrix(np.radians(24.0), [0.0, 0.0, 1.0])
     pose[:3, :3] *= 1.16
@@ -196,7 +196,7 @@ def build_solids() -> list[Solid]:
 
 
 def _place_solid(solid: Solid, pose: NDArray[np.float64]) -> Solid:
-    """Return the solid, with its pattern, moved by the (4, 4) similarity ``pose``."""
+    """Return the solid transformed by the (4, 4) similarity ``pose``; its pattern moves along."""
     mesh = solid.mesh.copy()
     mesh.apply_transform(pose)
     back = np.linalg.inv(pose).astype(np.float32)
@@ -218,7 +218,7 @@ def _plate_solid() -> Solid:
 
 
 def _drill_solids() -> list[Solid]:
-    """The drill in its own frame: bit along +x, symmetric in y, standing on its battery."""
+    """Build the drill in local coordinates: bit along +x, symmetric in y, standing on its battery."""
     x, z, axis_z = [1, 0, 0], [0, 0, 1], 0.44
     grip_arc, grip_centre = np.linspace(np.radians(149.0), np.radians(211.0), 64), np.array([0.33, 0.0, -0.05])
     guard_arc = np.linspace(np.radians(-96.0), np.radians(14.0), 64)
@@ -256,7 +256,7 @@ def _drill_solids() -> list[Solid]:
 
 
 def _wire_cube_solids() -> list[Solid]:
-    """Twelve rods and eight knots around a polished ball."""
+    """Build a wire cube: twelve rods and eight knots around a polished ball."""
     side, thick = 0.40, 0.013
     centre = np.array([0.46, 0.46, FLOOR + side / 2 + 2 * thick])
     turn = trimesh.transformations.rotation_matrix(np.radians(20.0), [0, 0, 1])[:3, :3]
@@ -272,7 +272,7 @@ def _wire_cube_solids() -> list[Solid]:
 
 
 def _pin_solids() -> list[Solid]:
-    """A row of ever thinner and taller pins with coloured heads."""
+    """Build a row of ever thinner and taller pins with coloured heads."""
     solids = []
     for i, colour in enumerate(("#e63946", "#ff9f1c", "#ffe14d", "#2ec4b6", "#7b2cbf")):
         foot = np.array([-0.66 + 0.155 * i, 0.64 - 0.02 * i, FLOOR])

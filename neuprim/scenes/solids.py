@@ -1,9 +1,9 @@
-"""The scene ``solids`` on disk, in the NeRF-synthetic (Blender) layout.
+"""Generator of the scene ``solids``, in the NeRF-synthetic (Blender) layout.
 
     transforms_train.json, transforms_test.json    camera_angle_x in radians, camera-to-world matrices with OpenGL axes
     train/r_0.png ..., test/r_0.png ...            RGBA, sRGB, straight alpha, transparent where nothing is hit
 
-Scene, cameras and light are fixed: equal settings give equal files for any seed.
+Scene, cameras and light do not depend on a seed: equal settings give equal files.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True)
 class SolidsSettings:
-    """Settings of ``scene=solids``: image size in pixels, images of each split, and rays per pixel side."""
+    """Settings of ``scene=solids``: image size in pixels, images per split, and rays per pixel side."""
 
     size: ImageSize = 512
     train_views: Annotated[int, Range(1, 10000)] = 80
@@ -68,7 +68,7 @@ class _SolidsView(NamedTuple):
 def generate_solids(
     settings: SolidsSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/solids-KEY``."""
+    """Write the images of ``scene=solids`` unless they exist; return the folder ``cache_dir/solids-KEY``."""
     images = describe_solids_images("solids", settings.key(), settings, lambda: Scene(build_solids()))
     return images.generate(cache_dir, progress)
 
@@ -81,7 +81,7 @@ def describe_solids_images(
     seen: Radiance = scene_daylight_radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
 ) -> SceneImageSet[_SolidsView]:
-    """Describe images of the scene that ``build`` makes, taken by the cameras of the solids."""
+    """Describe an image set of the scene that ``build`` returns, from the cameras of ``scene=solids``."""
 
     def views(split: str, count: int) -> list[_SolidsView]:
         return [_SolidsView(f"r_{i}", pose) for i, pose in enumerate(solids_camera_poses(split, count))]
@@ -104,10 +104,10 @@ def describe_solids_images(
 
 
 def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
-    """Return ``count`` camera-to-world matrices (4, 4), OpenGL axes, looking at the origin from distance 4.
+    """Return ``count`` camera-to-world matrices (4, 4), OpenGL axes, of cameras that face the origin from distance 4.
 
-    "train" is a Fibonacci lattice of equal area from 9 degrees below the horizon to 78 above. "test" turns the other
-    way, from 3 to 64 degrees, so that its views fall between the training views.
+    The cameras of "train" are on an equal-area Fibonacci lattice, from 9 degrees below the horizon to 78 above. The
+    lattice of "test" turns the opposite way, from 3 to 64 degrees, so that its cameras fall between the training ones.
     """
     low, high, phase, turn = (-0.16, 0.98, 0.0, _GOLDEN_ANGLE) if split == "train" else (0.05, 0.9, 1.0, -_GOLDEN_ANGLE)
     cosines = [low + (high - low) * (i + 0.5) / count for i in range(count)]
@@ -119,7 +119,7 @@ def solids_camera_poses(split: str, count: int) -> list[NDArray[np.float64]]:
 def draw_solids(
     scene: Scene, pose: NDArray[np.float64], size: int, supersampling: int, seen: Radiance = scene_daylight_radiance
 ) -> NDArray[np.uint8]:
-    """Render (size, size, 4) uint8 sRGB, straight alpha; rays are averaged premultiplied and linear."""
+    """Render (size, size, 4) uint8 sRGB with straight alpha. Rays are averaged in premultiplied linear light."""
     bands = []
     for directions in scene_ray_bands(pose, FIELD_OF_VIEW, size, supersampling):
         rgb, hit = seen(scene, pose[:3, 3], directions)

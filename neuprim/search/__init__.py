@@ -1,7 +1,6 @@
-"""Searches over trainings and renderings: trade-offs, target sizes, pruning and quantization.
+"""Searches over trainings and render settings: trade-offs, model sizes for a target, pruning and quantization.
 
-``trials`` trains candidates, ``tradeoff_measuring`` measures them, ``tradeoff_record`` records them
-and finds fronts.
-``render_tradeoff`` and ``ablation`` compare finished runs and trained models; ``target`` searches a size; ``pruning``
-and ``compress`` shrink a finished model.
+``trials`` trains candidates, ``tradeoff_measuring`` measures them, ``tradeoff_record`` finds Pareto fronts.
+``render_tradeoff`` varies render settings and ``ablation`` training settings. ``target`` searches the size of a model.
+``pruning`` and ``compress`` make a finished model smaller.
 """

@@ -1,7 +1,7 @@
-"""Trade-offs of training: train a designed set of models, measure them together, and find the Pareto fronts.
+"""Trade-offs of training settings: train a set of models, measure them together, and find the Pareto fronts.
 
-The set holds the *centre*, which the user's overrides define, every setting changed alone, and promising combinations.
-All models train for the same time. The same request continues an earlier set.
+One model of the set, the *centre*, has the user's settings. The others differ from the centre in a single setting, or
+in a promising combination of settings. All models train for the same time. The same request continues an earlier set.
 """
 
 from __future__ import annotations
@@ -63,16 +63,16 @@ TRIALS = "trials"  # folder of the models
 __all__ = ["run_ablation"]
 
 _PACES, _TRAINING = 0.2, 0.5
-"""Shares of the budget for measuring step times, and, of the rest, for training single changes."""
+"""Fraction of the budget for measuring step times; fraction of the rest for training single changes."""
 
 _SINGLES, _TIMES, _COMBINED = 0.58, 0.64, 0.88
-"""Shares of the rest by which single changes are trained, single changes are timed, and combinations are trained."""
+"""Fractions of the rest at which single changes are trained, single changes are timed, and combinations are trained."""
 
 _MAX_COMBINATIONS = 12
 
 
 def format_ablation_run_command(overrides: Sequence[str]) -> str:
-    """Return the command that trains a model."""
+    """Return the ``neuprim run`` command that trains a model with these overrides."""
     return shlex.join(["neuprim", "run", *overrides])
 
 
@@ -82,13 +82,13 @@ def run_ablation(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> tuple[Path, TradeoffRecord]:
-    """Train models with other settings and measure them; write ``tradeoff.json``, ``.html`` and ``front.png``.
+    """Train and measure models with varied settings; write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
 
-    Returns the folder and its record. The same call with a larger budget adds models.
+    Returns the folder of these files, and the record. The same call with a larger budget adds models.
 
     Args:
-        request: its overrides are those of ``neuprim run``.
-        launcher: where models are trained; they are measured here.
+        request: the request; its overrides are those of ``neuprim run``.
+        launcher: where models are trained. This process measures them.
 
     Raises:
         NeuprimError: overrides, settings, data or folder are wrong.
@@ -121,7 +121,7 @@ def run_ablation(
 
 @dataclass(frozen=True)
 class _AblationSet:
-    """A set of models: its folder, the centre's overrides and configuration, and where they are trained."""
+    """A set of models to compare: folder, the centre's overrides and configuration, and where to train models."""
 
     folder: Path
     words: list[str]
@@ -129,14 +129,14 @@ class _AblationSet:
     launcher: LauncherSettings
 
     def identity(self) -> dict[str, Any]:
-        """Return what must be equal to continue a set; JSON-able."""
+        """Return the facts that must be equal to continue an earlier set, as JSON-ready values."""
         own = (*NOT_TRAINED_WITH, "made_by")
         settings = {name: value for name, value in self.centre.to_dict().items() if name not in own}
         return {"centre": settings}
 
 
 class _AblationSession(TradeoffSession):
-    """Train and measure a set within the budget."""
+    """Train and measure the models of a set within the budget."""
 
     def __init__(
         self,
@@ -162,15 +162,15 @@ class _AblationSession(TradeoffSession):
 
     @property
     def spent(self) -> float:
-        """Seconds of the budget so far, with earlier sessions and without compiling."""
+        """Seconds of the budget used so far, including earlier sessions but not the compilation of kernels."""
         return time.monotonic() - self.begun - self._compiling
 
     def seconds_left(self, part: float) -> float:
-        """Return the seconds until a share of what remained after planning is used."""
+        """Return the seconds until the fraction ``part`` of the budget that remained after planning is used."""
         return self._planned_at + part * max(self.request.budget - self._planned_at, 0.0) - self.spent
 
     def run(self, wanted: Sequence[Variant]) -> None:
-        """Train single changes, then combinations, find the fronts and write them."""
+        """Train models with single changes, then with combinations; find the Pareto fronts and write the results."""
         with limit_process_threads(self._threads):  # as many threads as a training has
             wanted = self._measure_step_times(wanted)
         alone = len({variant.knob for variant in wanted}) <= 2  # the centre and one knob: nothing to combine
@@ -197,7 +197,7 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ step times
 
     def _measure_step_times(self, wanted: Sequence[Variant]) -> list[Variant]:
-        """Measure step times and plan the training lengths; return the variants whose step time is known."""
+        """Measure the step times and plan how long to train; return the variants whose step time is known."""
         kept, latest = list[Variant](), self.spent + _PACES * (self.request.budget - self.spent)
         paces = {CENTRE: 1.0} if self._plan is None else dict(self._plan.paces)
         for number, variant in enumerate(wanted):
@@ -220,7 +220,7 @@ class _AblationSession(TradeoffSession):
         return AblationStepTimes(self.centre, self._loaded[0])
 
     def _find_pace(self, variant: Variant, paces: dict[str, float]) -> str | None:
-        """Measure a variant's step time; return why it cannot be trained, None if it can."""
+        """Store a variant's measured time per step in ``paces``; return why it cannot be trained, else None."""
         if not variant.turned:
             paces[variant.name] = 1.0
         if variant.name in paces:
@@ -240,7 +240,9 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ training
 
     def _train(self, wanted: Sequence[Variant], part: float) -> None:
-        """Train and measure missing variants for which there is time; the centre and begun trainings always go on."""
+        """Train and measure the variants that the record lacks, while time is left until ``part`` of the budget. The
+        centre and unfinished trainings are trained in any case.
+        """
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
         for first in range(0, len(todo), self._workers):
@@ -312,7 +314,7 @@ class _AblationSession(TradeoffSession):
             point.centre_ms = statistics.median(self.record.points[0].ms)
 
     def _combinations(self) -> list[Variant]:
-        """Return combinations of earlier sessions, and as many new ones as there is time for."""
+        """Return the combined variants of earlier sessions, and as many new ones as there is time to train."""
         points = self.record.points
         allowed = [Variant(COMBINED, point.turned) for point in points if point.knob == COMBINED]
         rounds = self.seconds_left(_COMBINED) / max(self.plan.seconds, 1e-9)
@@ -339,7 +341,7 @@ def _compose_ablation_set(request: TradeoffRequest, launcher: LauncherSettings) 
 
 
 def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) -> None:
-    """Raise an error if the folder holds something else, or another set."""
+    """Raise an error if the folder holds other files, or a set with another centre."""
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
@@ -354,7 +356,7 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
 def _resume_ablation_set(
     folder: Path, before: TradeoffRecord | None, identity: Mapping[str, Any], tell: Tell
 ) -> TradeoffRecord:
-    """Return the earlier record, without its points if they were measured under other conditions."""
+    """Return the record of an earlier session. Its points are dropped if they were measured under other conditions."""
     record = TradeoffRecord(dict(identity))
     if before is None:
         return record

@@ -1,4 +1,4 @@
-"""Plan an ablation: the variants of a model, how long they train, and which are worth combining."""
+"""Plan an ablation: the variants of a model, how long to train each, and which changes to combine."""
 
 from __future__ import annotations
 
@@ -25,17 +25,19 @@ CENTRE = "centre"  # name of the model that others are compared with
 LENGTH = "train.iterations"  # the knob whose values are shares of the full length
 
 _COUNTS, _LENGTHS = (0.5, 2.0, 0.25, 4.0, 1 / 8, 1 / 16, 1 / 32, 1 / 64), (0.5, 0.25)
-"""Multiples of the centre's primitives and length, in every task."""
+"""Factors on the centre's number of primitives and training length, for every task."""
 
 _MIN_LENGTH, _MIN_STEPS = 1 / 20, 100
-"""Least training of the centre: this share of its steps, or so many steps where its budget is in seconds."""
+"""Shortest training of the centre: a fraction of its steps, or a number of steps if its budget is in seconds."""
 
 _STEPS_PER_TURN, _TURNS = 4, 6  # step times: variant and centre alternate, so that load of the machine affects both
 
 
 @dataclass(frozen=True)
 class Variant:
-    """A model to train: the knob, the overrides over the centre's, and the share of the full training."""
+    """A model to train: the setting that it varies, its overrides on top of the centre's, and the fraction of the full
+    training length.
+    """
 
     knob: str
     turned: tuple[str, ...] = ()
@@ -52,12 +54,12 @@ class Variant:
 
     @property
     def label(self) -> tuple[str, ...]:
-        """Overrides as listed in the record of points that are left out."""
+        """Overrides that name the variant in the record of points that were not measured."""
         return (*self.turned, *((f"{self.length:g} of the length",) if self.length != 1.0 else ()))
 
 
 def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
-    """Return knob -> its variants, those next to the centre's value first."""
+    """Return setting -> variants that change this setting; values next to the centre's value come first."""
     counts = dict.fromkeys(max(1, round(part * centre.model.count)) for part in _COUNTS)
     knob = "model.primitives"
     variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.count]}
@@ -72,20 +74,20 @@ def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]
 
 
 def merge_variant_overrides(words: Sequence[str], over: Sequence[str]) -> list[str]:
-    """Return ``words`` followed by ``over``, without the overrides of ``words`` that ``over`` replaces."""
+    """Return the overrides ``words``, without those whose keys are in ``over``, followed by ``over``."""
     again = {assignment.key for assignment in parse_overrides(over)}
     return [*(a.text for a in parse_overrides(words) if a.key not in again), *over]
 
 
 @dataclass
 class AblationPlan:
-    """Training lengths of a set of models; a continued set keeps them.
+    """How long each model of an ablation trains; a continued ablation uses the same plan.
 
     Attributes:
-        steps: training steps of the centre.
+        steps: training steps of the centre in this ablation.
         seconds: approximate time of a training of full length.
-        whole: steps of the centre's configuration; 0 if its budget is in seconds.
-        paces: name of a variant -> its seconds per step, divided by the centre's.
+        whole: training steps in the centre's configuration; 0 if its budget is in seconds.
+        paces: name of a variant -> its seconds per step, divided by those of the centre.
     """
 
     steps: Annotated[int, Range(at_least=1)]
@@ -94,7 +96,9 @@ class AblationPlan:
     paces: dict[str, Annotated[float, Range(above=0)]] = field(default_factory=lambda: {CENTRE: 1.0})
 
     def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
-        """Return the overrides that train a variant, with as many population interventions as in a full run."""
+        """Return the overrides that train a variant in this plan. Interventions of population control are as many as in
+        a run of the centre's configuration.
+        """
         steps = max(1, round(self.steps * variant.length / self.paces[variant.name]))
         budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
         every, key = centre.train.population.every, "train.population.every"
@@ -111,11 +115,11 @@ class AblationPlan:
 
 
 def plan_training_lengths(centre: RunConfig, pace: float, available: float, lengths: Sequence[float]) -> AblationPlan:
-    """Return the lengths with which trainings fit into the available seconds.
+    """Return the plan with which all trainings fit into the available seconds.
 
     Args:
         pace: seconds per step of the centre.
-        lengths: lengths of all trainings, as shares of the full length.
+        lengths: length of each training, as a fraction of the full length.
     """
     if centre.train.iterations is None:
         assert centre.train.max_seconds is not None, "a configuration has a budget"
@@ -128,7 +132,8 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
 
 
 class AblationStepTimes:
-    """Measurement of step times relative to the centre's, at half of the training, where all colour bands are in use.
+    """Measures the time per step of a variant relative to the centre. Steps are those halfway through the training,
+    where all colour bands are in use.
 
     Attributes:
         seconds: seconds per step of the centre.
@@ -142,7 +147,7 @@ class AblationStepTimes:
         self.seconds = self._run_turns(self._centre)[1] / (_STEPS_PER_TURN * _TURNS)
 
     def measure(self, config: RunConfig) -> float | None:
-        """Return the ratio of a configuration; None if it builds the same model as the centre."""
+        """Return a configuration's time per step over the centre's; None if it builds the same model as the centre."""
         trainer = self._prepare(config)
         if _ablation_model_identity(trainer) == self._identity:
             return None
@@ -161,7 +166,7 @@ class AblationStepTimes:
         return trainer
 
     def _run_turns(self, trainer: Trainer) -> tuple[float, float]:
-        """Return the seconds of a trainer, and of the centre in the same turns."""
+        """Run equally many steps of a trainer and of the centre, in alternating turns; return the seconds of each."""
         total = [0.0, 0.0]
         with use_one_torch_thread_for_run():
             for turn in range(_TURNS + 1):
@@ -180,7 +185,7 @@ def _ablation_model_identity(trainer: Trainer) -> tuple[Any, ...]:
 
 
 def combine_ablation_changes(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
-    """Return at most ``most`` combinations of single changes: towards fewer bytes, less time, and better quality."""
+    """Return at most ``most`` combinations of measured changes, for fewer bytes, less time or better quality."""
     centre = points[0]
     smaller, faster, better = [], [], []
     for point in points[1:]:

@@ -1,4 +1,4 @@
-"""Write a run's model as a quantized file, ``neuprim compress``: the coarsest quantization that images allow."""
+"""``neuprim compress``: write a run's model as a quantized file, as coarsely as the quality of its images allows."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _FIRST_LOSS = 2.0  # loss by rounding before the first round of training, in uni
 _ROUND_STEPS, _MAX_ROUNDS = 500, 3  # least steps of a round, and most rounds; each shows how much training recovers
 
 _SLOPE, _AIM = 0.7, 0.95
-"""dB that a trained model loses per dB lost before training; share of the tolerance that the next round aims at."""
+"""dB lost after fine-tuning per dB lost before it; fraction of the tolerance that the next round aims at."""
 
 _MAX_TRIES = 16
 
@@ -56,16 +56,16 @@ _FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the m
 class CompressRequest:
     """Request for :func:`compress_run`, with the arguments of ``neuprim compress``.
 
-    Without level and bits, the PSNR of training views decides how many bits every number gets, within ``tolerance``.
-    Without the run's data as well, a default level is used.
+    Without level and bits, parameters get as few bits as possible while the PSNR of training views drops by at most
+    ``tolerance``. If the run's data are not available either, a default level is used.
 
     Attributes:
         level: 1 (nearly lossless) to 5 (very small).
-        bits: overrides NAME=BITS of a level.
+        bits: NAME=BITS, bits of single parameters that replace those of the level.
         out: the file to write; None for ``model.neuprim`` in the run directory.
         overwrite: whether an existing file may be replaced.
-        seconds: approximate time of fine-tuning for few bits.
-        steps: steps of fine-tuning instead of ``seconds``; the result is then the same on every machine.
+        seconds: approximate time of fine-tuning the quantized model.
+        steps: number of fine-tuning steps, instead of ``seconds``; the result is then the same on every machine.
         tolerance: PSNR that training views may lose, dB; not together with level or bits.
     """
 
@@ -88,7 +88,7 @@ class CompressRequest:
 
 
 class StoredParameter(NamedTuple):
-    """Size of one parameter in a compressed file."""
+    """Bits and bytes of one parameter in a compressed file."""
 
     name: str  # name of the parameter
     bits: str  # bits per number, as text
@@ -98,7 +98,7 @@ class StoredParameter(NamedTuple):
 
 @dataclass(frozen=True)
 class Compression:
-    """Result of compression."""
+    """Result of :func:`compress_run`."""
 
     file: Path  # the compressed file
     parameters: tuple[StoredParameter, ...]
@@ -113,11 +113,11 @@ class Compression:
 def compress_run(request: CompressRequest, progress: Progress = lambda text, fraction: None) -> Compression:
     """Write a run's model as a compressed file; measure the loss of quality if the run's data are available.
 
-    Fine-tuning renders every image from quantised numbers (straight-through gradients). The file has the fine-tuned
-    model only if its training views are better.
+    Fine-tuning renders every image from quantised parameters (straight-through gradients). The file stores the
+    fine-tuned model only if it renders the training views better than the original model.
 
     Raises:
-        NeuprimError: run, level or parameter do not exist, numbers cannot be stored, or the file exists already.
+        NeuprimError: the run, level or parameter does not exist, values cannot be stored, or the file exists already.
     """
     run_dir = request.run_dir
     if request.tolerance is not None and request.by_level:
@@ -186,7 +186,7 @@ def _search_quantized_model(
 
 
 class TrainingData(NamedTuple):
-    """Configuration, task and data set of fine-tuning."""
+    """What fine-tuning needs: configuration, task and data set."""
 
     config: RunConfig
     task: TaskSpec
@@ -194,7 +194,7 @@ class TrainingData(NamedTuple):
 
 
 class QuantizedModel(NamedTuple):
-    """A canonical model, its quantizers, the steps that it was trained for, and notes for the user."""
+    """A model in canonical order, its quantizers, its number of fine-tuning steps, and notes for the user."""
 
     model: Primitives
     quantizers: Quantizers
@@ -203,13 +203,13 @@ class QuantizedModel(NamedTuple):
 
 
 def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
-    """Return a canonical model with parameters rounded as a compressed file stores them."""
+    """Return a copy of a model with the parameters rounded as in a compressed file. The model is in canonical order."""
     params = {name: value.detach() for name, value in fake_quantize(model.params, quantizers).items()}
     return Primitives(model.density, model.colour, params)
 
 
 class QuantizationSearch:
-    """Search for quantizers by one number: the squared error that rounding may add, as a share of the model's own."""
+    """Search for quantizers by one number, the *error share*: squared error rounding may add over the model's own."""
 
     def __init__(self, model: Primitives, dataset: Dataset, quality: SearchQuality) -> None:
         self.model = canonical_model(model)
@@ -222,7 +222,7 @@ class QuantizationSearch:
         self._error = 10 ** (-quality.image_quality(self.model) / 10) / max(columns, 1)
 
     def with_model(self, trained: Primitives) -> QuantizationSearch:
-        """Return the same search for the model after training."""
+        """Return a search with the same error estimates for the model after fine-tuning."""
         other = copy(self)
         other.model = trained
         return other
@@ -231,17 +231,17 @@ class QuantizationSearch:
         return fit_quantizers_to_error(self.model, self._effects, share * self._error)
 
     def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return the coarsest accepted quantizers, or the finest possible, and their share of the error."""
+        """Return the coarsest quantizers that ``accept`` accepts, else the finest possible, and their error share."""
         fine, _ = self._bisect(accept, start)
         return self.fit(fine), fine
 
     def find_finest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return the finest accepted quantizers, or the coarsest possible, and their share of the error."""
+        """Return the finest quantizers that ``accept`` accepts, else the coarsest possible, and their error share."""
         _, coarse = self._bisect(lambda quantizers: not accept(quantizers), start)
         return self.fit(coarse), coarse
 
     def _bisect(self, is_fine: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
-        """Return two close shares, of which the first is fine enough and the second is not; or both limits."""
+        """Return two close error shares, of which only the first is fine enough; equal ones at either limit."""
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_MAX_TRIES):
             if is_fine(self.fit(share)):
@@ -260,7 +260,9 @@ class QuantizationSearch:
 def finetune_for_table(
     data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
 ) -> QuantizedModel:
-    """Fine-tune a model for a table of bits; return the untrained model if its training views are better."""
+    """Fine-tune a model whose parameters have the bits in ``table``; return the original model if it renders training
+    views better.
+    """
     whole = canonical_model(model)
     quantizers, quality = fit_quantizers(whole, table), SearchQuality.of_run(data.config, data.dataset)
     before = quality(dequantize(whole, quantizers))
@@ -278,10 +280,10 @@ def finetune_for_table(
 def search_fewest_bits(
     data: TrainingData, model: Primitives, tolerance: float, steps: int, progress: Progress
 ) -> QuantizedModel:
-    """Fine-tune and quantize with the fewest bits at which training views lose at most ``tolerance`` dB.
+    """Fine-tune a model and quantize it with as few bits as possible; training views lose at most ``tolerance`` dB.
 
     Args:
-        steps: steps of training; 0 for none.
+        steps: number of fine-tuning steps; 0 for none.
     """
     quality = SearchQuality.of_run(data.config, data.dataset)
     base = quality(model)
@@ -316,12 +318,12 @@ def search_fewest_bits(
 
 
 def _tolerated_error_share(decibels: float) -> float:
-    """Return the increase of the squared error, as a share of it, that costs this many dB."""
+    """Return the relative increase of the squared error that lowers the PSNR by this many dB."""
     return float(min(max(10 ** (decibels / 10) - 1, _FINEST), _COARSEST))
 
 
 def _finetune(data: TrainingData, model: Primitives, quantizers: Quantizers, steps: int) -> Primitives:
-    """Train a canonical model, rendering every image from quantized numbers."""
+    """Fine-tune a model in canonical order; every image is rendered from quantized parameters."""
     trainer = make_run_finetune_trainer(Job(data.config, data.task), data.dataset, model, steps)
     trainer.zero_masks = mask_pruned_numbers(trainer.model)
     on_device = {name: quantizer.to(trainer.device) for name, quantizer in quantizers.items()}

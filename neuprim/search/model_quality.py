@@ -1,4 +1,5 @@
-"""Quality of models that searches compare: on evaluation views, and on training views that decide what to remove."""
+"""Measure the quality of models that searches compare: on test views, or on training views for pruning and
+compression."""
 
 from __future__ import annotations
 
@@ -27,7 +28,7 @@ MAX_PSNR = 200.0  # dB that stand for equal images, as JSON has no infinity
 
 @dataclass(frozen=True)
 class EvalView:
-    """A test view, its ground truth over the background, (H, W, C), and the pixels that count (None: all)."""
+    """A test view, its ground truth over the background, (H, W, C), and a mask of valid pixels (None: all)."""
 
     view: View
     image: Tensor
@@ -43,7 +44,7 @@ class EvalQuality(NamedTuple):
 
 
 def choose_trial_views(dataset: Dataset, views: int) -> list[EvalView]:
-    """Return at most ``views`` of the test views, evenly spread."""
+    """Return at most ``views`` test views, evenly spread."""
     most, chosen = min(views, len(dataset.test)), []
     for i in (k * len(dataset.test) // most for k in range(most)):
         view, pixels = dataset.test.view(i), dataset.test.pixels(i)
@@ -53,14 +54,14 @@ def choose_trial_views(dataset: Dataset, views: int) -> list[EvalView]:
 
 
 def fill_masked(image: Tensor, view: EvalView) -> Tensor:
-    """Replace the pixels that do not count by the ground truth."""
+    """Replace the pixels outside the view's mask by the ground truth."""
     return image if view.mask is None else torch.where(view.mask[..., None], image, view.image.to(image))
 
 
 def measure_trial_views(
     model: Primitives, views: Sequence[EvalView], settings: RenderSettings, background: Tensor
 ) -> EvalQuality:
-    """Render all views and compare them with the ground truth."""
+    """Render all views and compare the images with the ground truth."""
     render_image(model, views[0].view, settings, background)  # the first frame loads and compiles
     rows, seconds = [], []
     for one in views:
@@ -79,20 +80,21 @@ _VIEWS, _QUICK_VIEWS = 24, 8  # views that decide, and how many of them intermed
 _SENSITIVITY_VIEWS = 160  # views for sensitivities, at most; primitives of a short time or a corner are in few views
 
 _FRAMES, _QUICK_FRAMES, _POINTS = 64, 8, 4096
-"""Frames with known extinction, how many of them intermediate evaluations use, and points of each."""
+"""Frames with known extinction, how many of them intermediate evaluations use, and points per frame."""
 
 _DRAWS_PER_FRAME = 6  # number of draws over that of frames; each draw is of a random frame, and these find most
 
 
 class SearchQuality:
-    """Mean PSNR of some training views; of a volume trained on its voxels also the accuracy of its extinction.
+    """Quality measure of a search: mean PSNR of training views, and for a run trained on voxels the error of the
+    extinction.
 
-    Views are chosen at random, as training views are often ordered by camera or time.
+    Views are chosen at random, because training views are often ordered by camera or time.
 
     Attributes:
-        views: views that decide.
-        others: other views, for sensitivities.
-        draws: points of known extinction; empty unless the run was trained on them.
+        views: indices of the training views whose PSNR is measured.
+        others: indices of other training views, used to estimate the effect of parameters on images.
+        draws: points with known extinction; empty unless the run was trained on voxels.
     """
 
     def __init__(self, dataset: Dataset, settings: RenderSettings, inside: bool = False) -> None:
@@ -109,7 +111,9 @@ class SearchQuality:
         return cls(dataset, config.renderer, config.train.supervision != "images")
 
     def __call__(self, model: Primitives, quick: bool = False) -> float:
-        """Return the quality in dB: that of images, or of points if these lost more since the first evaluated model.
+        """Return a model's quality in dB: the PSNR of images, or less if the extinction lost more dB than the images.
+
+        Losses are relative to the first evaluated model.
 
         Args:
             quick: evaluate fewer views and frames.
@@ -123,7 +127,7 @@ class SearchQuality:
         return min(images, inside + self._offset)
 
     def image_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return the mean PSNR of the views."""
+        """Return the mean PSNR of the model's images of :attr:`views`; ``quick`` uses fewer of them."""
         step = max(len(self.views) // _QUICK_VIEWS, 1) if quick else 1
         values = []
         for index in self.views[::step]:
@@ -133,7 +137,7 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return -10 log10 of the mean squared error of the extinction over its scale, dB, as a mean over frames."""
+        """Return -10 log10 of the mean squared error of the extinction over its scale, dB, averaged over frames."""
         values = []
         with torch.no_grad():
             for samples in self.draws[:: max(len(self.draws) // _QUICK_FRAMES, 1) if quick else 1]:
@@ -145,12 +149,12 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_weight(self, model: Primitives) -> float:
-        """Return the weight of changes inside: the squared error of images over that of the extinction."""
+        """Return the weight of extinction errors: squared error of images over squared error of the extinction."""
         return 10 ** ((self.inside_quality(model) - self.image_quality(model)) / 10)
 
 
 def _draw_search_quality_points(points: PointSupervision) -> list[PointSamples]:
-    """Return points of different frames, in the order of the frames' names."""
+    """Draw points with known extinction in different frames, sorted by the frames' names."""
     generator, frames = torch.Generator().manual_seed(0), dict[str, PointSamples]()
     for _ in range(_DRAWS_PER_FRAME * _FRAMES):
         samples = points.draw(_POINTS, generator)

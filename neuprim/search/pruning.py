@@ -1,4 +1,5 @@
-"""Prune a finished run: cut, fine-tune, evaluate, and undo cuts that are too large; write the result as a run."""
+"""``neuprim prune``: remove parameters of a finished run (a *cut*), fine-tune, evaluate, and undo cuts that are too
+large."""
 
 from __future__ import annotations
 
@@ -33,21 +34,21 @@ from neuprim.search.pruning_cuts import (
 )
 
 MAX_ROUNDS, _LONG_ROUND, _MIN_ROUND = 3, 1300, 600
-"""Rounds of fine-tuning, unless a round would be longer than these steps; least steps of a round. Every round ends at
-the rates of the run's end, so that evaluated models are as well trained."""
+"""Largest number of rounds, unless a round would have more than this number of steps; least steps of a round. Every
+round ends at the learning rates of the run's end, so that the models to evaluate are trained equally well."""
 
 __all__ = ["PruneRequest", "Pruning", "prune_run"]
 
 _PATIENCE = 2.0  # a model that lost at most this many tolerances gets another round before its cut is undone
 
 _FIRST_CUT, _GROWTH, _LARGEST_CUT = 6.5, 1.5, 10.0
-"""Loss of the first cut over the tolerance; factor of the next cut; dB up to which a cut without effect is doubled."""
+"""Loss of the first cut over the tolerance; growth of the next cut; dB up to which a cut without effect is doubled."""
 
 _REMAINING, _BROUGHT = 0.3, 0.35
-"""Share of a cut's loss that remains after a round, and share of a round's own gain that the next one repeats."""
+"""Fraction of a cut's loss that remains after a round; fraction of a round's gain that the next round repeats."""
 
 _ENOUGH, _FREE = 0.1, 0.02
-"""Shares of the tolerance: below the first nothing more is cut, and the second counts as no loss."""
+"""Fractions of the tolerance: cuts end when less than the first is left; losses below the second are ignored."""
 
 _TIMED_VIEWS = 12
 
@@ -56,7 +57,9 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PruningStage:
-    """One round: reductions of fields, remaining size, dB after the cut and after training, and whether it is kept."""
+    """One round of pruning: reductions of fields, remaining size, quality after the cut and after fine-tuning (dB), and
+    whether the loss is within the tolerance.
+    """
 
     words: tuple[str, ...]
     primitives: int
@@ -71,10 +74,10 @@ class _PruningState:
     """Intermediate model of pruning.
 
     Attributes:
-        words: all reductions of its fields.
-        bite: intended loss of its last cut before training, dB; cut: quality after that cut, dB.
-        lost: loss since the beginning, dB; rounds: rounds of training since the cut.
-        fields_only: whether the cut only reduced fields.
+        words: all reductions of the model's fields so far.
+        bite: intended loss by the last cut, before fine-tuning, dB; cut: quality after this cut, dB.
+        lost: loss relative to the full model, dB; rounds: rounds of fine-tuning since the last cut.
+        fields_only: whether the last cut only reduced fields.
     """
 
     model: Primitives
@@ -91,19 +94,22 @@ class _PruningState:
 
 
 def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
-    """Return the saved share of a file's values, or of the values per primitive (evaluated every frame) if larger."""
+    """Return the fraction of values that ``smaller`` saves, in the file or per primitive, whichever is larger.
+
+    ``numbers`` is the count of values in the file of ``model``.
+    """
     per_primitive = smaller.parameters_per_primitive / model.parameters_per_primitive
     return max(1 - count_unpruned_numbers(smaller) / numbers, 1 - per_primitive)
 
 
 @dataclass
 class ModelShrinker:
-    """Search the smallest model whose training views lose at most a tolerance.
+    """Search for the smallest model that renders the training views within a tolerance of the full model.
 
     Attributes:
-        tolerance: largest loss, dB.
-        steps: steps of fine-tuning in all rounds together; 0 for none.
-        base: quality of the full model, dB, once evaluated.
+        tolerance: largest loss of PSNR, dB.
+        steps: total number of fine-tuning steps in all rounds; 0 for none.
+        base: quality of the full model, dB; set by :meth:`shrink`.
         stages: the rounds so far, in order.
     """
 
@@ -120,7 +126,7 @@ class ModelShrinker:
         self.quality, self._sensitivity_seed = SearchQuality.of_run(self.config, self.dataset), 0
 
     def shrink(self, model: Primitives) -> tuple[Primitives, tuple[str, ...]]:
-        """Return the smallest model found, and the reductions of its fields."""
+        """Return the smallest model found, and the reductions of its fields as overrides."""
         self.base = self.quality(model)
         best, tried = _PruningState(model), None
         untried: tuple[str, ...] = ()
@@ -158,7 +164,7 @@ class ModelShrinker:
     def _next_state(
         self, best: _PruningState, untried: tuple[str, ...], bite: float, progress: float
     ) -> _PruningState | None:
-        """Return the state to train next; None if nothing more can be cut."""
+        """Return the model to fine-tune next, usually after a cut; None if nothing more can be removed."""
         if untried:  # reductions that failed together with other cuts are tried alone
             return self._reduce_fields(best, untried, bite)
         left = self.tolerance - max(best.lost, 0.0)
@@ -170,13 +176,13 @@ class ModelShrinker:
         return None if state.numbers >= best.numbers else state
 
     def _max_loss(self, before: _PruningState, now: _PruningState, best: _PruningState) -> float:
-        """Return the loss after a round, dB, beyond which a cut is undone: more than another round would recover."""
+        """Return the loss in dB above which a round's cut is undone, because another round would not recover it."""
         if best.rounds and best.lost < 0:  # the model before has room, so a smaller cut saves something
             return self.tolerance
         return self.tolerance * _PATIENCE if now.rounds == 1 else self.tolerance + before.lost - now.lost
 
     def _cut(self, state: _PruningState, bite: float, progress: float) -> _PruningState:
-        """Return the state after a cut that costs about ``bite`` dB before training."""
+        """Return the model after a cut that loses about ``bite`` dB before fine-tuning."""
 
         def quick(model: Primitives) -> float:
             return self.quality(model, quick=bool(self.steps))
@@ -217,7 +223,7 @@ class ModelShrinker:
         return cut_to_loss(model, price_cuts(model, views, inside, self.quality), quality, loss)
 
     def _train(self, state: _PruningState, number: int, rounds: int) -> _PruningState:
-        """Return the state after a round of fine-tuning."""
+        """Return the model after round ``number`` of fine-tuning."""
         model, steps = state.model, self.steps * (number + 1) // rounds - self.steps * number // rounds
         if steps and model.count:
             trainer = make_run_finetune_trainer(Job(self.config, self.task), self.dataset, model, steps)
@@ -242,10 +248,10 @@ class PruneRequest:
     Attributes:
         tolerance: PSNR that training views may lose, dB.
         seconds: approximate time of fine-tuning.
-        steps: steps of fine-tuning instead of ``seconds``; the result is then the same on every machine.
+        steps: number of fine-tuning steps, instead of ``seconds``; the result is then the same on every machine.
         out: the new run directory; None for the run's name with "-pruned".
         overwrite: whether existing files may be replaced.
-        hold_out: n > 1: leave every n-th training view out of training and decisions; 0: none.
+        hold_out: n > 1: use every n-th training view neither for fine-tuning nor for decisions; 0: use all.
     """
 
     run_dir: Path  # the run directory
@@ -259,13 +265,14 @@ class PruneRequest:
 
 @dataclass(frozen=True)
 class Pruning:
-    """Result of pruning; ``pruned.json`` has the same content without ``run_dir``.
+    """Result of :func:`prune_run`; ``pruned.json`` has the same content without ``run_dir``.
 
     Attributes:
-        run_dir: the new run directory; None if nothing could be removed, and nothing was written.
-        before: numbers of the original: primitives, numbers, bytes, psnr and ssim of test views, frames_per_second.
+        run_dir: the new run directory; None if nothing could be removed, so that nothing was written.
+        before: measurements of the original: primitives, numbers (of values), bytes, psnr and ssim of test views,
+            frames_per_second.
         reduced: reductions of fields, as in ``model.reduced``.
-        judged_psnr: PSNR of the deciding training views before and after, dB.
+        judged_psnr: PSNR of the training views that decide, before and after pruning, dB.
     """
 
     run_dir: Path | None
@@ -280,9 +287,10 @@ class Pruning:
 
 
 def prune_run(request: PruneRequest, progress: Progress = lambda text, fraction: None) -> Pruning:
-    """Prune a run with fine-tuning, as far as the PSNR of training views allows; write the result as a new run.
+    """Prune a run's model with fine-tuning, as far as the PSNR of training views allows; write the result as a new run.
 
-    It removes primitives, units such as neurons, and parts of fields. Test views are only measured.
+    Pruning removes primitives, units such as neurons of single primitives, and parts of fields. Test views are only
+    used for measurements.
 
     Raises:
         NeuprimError: the run does not exist, its data cannot be read, or files exist already.
@@ -344,7 +352,7 @@ def _measure_pruned(
 def _fit_pruned(
     config: RunConfig, task: TaskSpec, dataset: Dataset, model: Primitives, words: tuple[str, ...]
 ) -> Fitted:
-    """Return a pruned model as a fitted run, with the overrides that build it."""
+    """Return a pruned model as a trained run, with overrides that build such a model."""
     reduced = [*config.model.reduced, *words]
     own = [f"model.primitives={model.count}"]
     own += [f"model.reduced=[{','.join(map(repr, reduced))}]"] if reduced else []

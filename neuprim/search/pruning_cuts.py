@@ -1,4 +1,4 @@
-"""Choose which primitives, prunable units and parts of fields to remove: the least effect per number first."""
+"""Choose what pruning removes: the primitives, units and parts of fields with the least effect on images per value."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from neuprim.core.train.sensitivity import Sensitivity
 from neuprim.search.model_quality import SearchQuality
 
 _CONTRAST = 0.05
-"""Mean squared difference of a primitive's colour from its background, where :func:`price_cuts` cannot measure it."""
+"""Mean squared difference of a primitive's colour from its background, if :func:`price_cuts` cannot measure it."""
 
 _PROBE = 0.02  # share of the primitives whose removal measures the contrast
 
@@ -28,7 +28,7 @@ def _units(model: Primitives) -> dict[str, PrunableUnit]:
 
 
 def count_unpruned_numbers(model: Primitives) -> int:
-    """Return how many parameter values a file stores: all except those of units that are zero."""
+    """Return how many parameter values a file of the model stores: all except those of units that are zero."""
     zeros = sum(
         count_unit_numbers(unit, model.params) * int((~primitives_with_unit(unit, model.params)).sum())
         for unit in _units(model).values()
@@ -37,7 +37,7 @@ def count_unpruned_numbers(model: Primitives) -> int:
 
 
 def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
-    """Return parameter -> (N, ...) bool mask of the values in units that are zero."""
+    """Return parameter name -> (N, ...) bool mask of the values that belong to units which are zero."""
     masks: dict[str, Tensor] = {}
     for unit in _units(model).values():
         gone = ~primitives_with_unit(unit, model.params)
@@ -49,7 +49,7 @@ def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
 
 
 def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
-    """Return (kind, name, value) of all reductions of whole fields, the largest saving first."""
+    """Return (kind, name, value) of all possible reductions of the model's fields, the largest saving first."""
     fields = (("density", model.density), ("colour", model.colour))
     words = [
         (kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values
@@ -60,13 +60,15 @@ def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
 def price_cuts(
     model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: SearchQuality
 ) -> Sensitivity:
-    """Return the mean squared change of images if a primitive or unit is removed, plus weighted changes inside."""
+    """Return for every primitive and unit the mean squared change of images if it is removed, plus the weighted change
+    of the extinction.
+    """
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
 
 def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQuality) -> float:
-    """Return the mean squared difference of colour, from the cost of removing the least primitives."""
+    """Return the mean squared difference of colour, measured by removing the primitives with the least effect."""
     count = max(int(_PROBE * model.count), 1)
     order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
     kept = order[count:].sort().values
@@ -80,7 +82,9 @@ def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQu
 
 
 class _Sizes(NamedTuple):
-    """Number of nonzero values per primitive, (N,); per unit which primitives have it, (N,) bool, and its values."""
+    """Sizes of what can be removed: nonzero values per primitive, (N,); for each unit, which primitives have it, (N,)
+    bool, and its number of values.
+    """
 
     whole: Tensor
     present: dict[str, Tensor]
@@ -90,10 +94,11 @@ class _Sizes(NamedTuple):
 def cut_to_loss(
     model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
 ) -> Primitives:
-    """Remove primitives and units below the highest price per value at which the model loses at most ``loss`` dB.
+    """Remove the primitives and units with the least effect per value, as many as cost at most ``loss`` dB.
 
     Args:
-        prices: changes of images for this model, see :func:`price_cuts`.
+        prices: effect of every primitive and unit on images, see :func:`price_cuts`.
+        quality: function that returns the quality of a model, dB.
     """
     units = _units(model)
     present = {name: primitives_with_unit(unit, model.params).cpu() for name, unit in units.items()}

@@ -1,6 +1,6 @@
-"""Trade-offs of a finished run: change every setting of rendering alone, then several, and find the Pareto fronts.
+"""Trade-offs of a finished run: vary each render setting alone, then several together, and find the Pareto fronts.
 
-Results go to ``RUN_DIR/tradeoff`` or the folder that was asked for; points that were measured before are kept.
+Results go to ``RUN_DIR/tradeoff`` or a given folder. Points that were measured before are not measured again.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ from neuprim.search.tradeoff_record import (
 )
 
 _IMAGES, _TIMES, _COMBINED = 0.45, 0.65, 0.85
-"""Shares of the budget by which images and times of single changes, and combinations should be done."""
+"""Fractions of the budget at which images and times of single changes, and combinations should be done."""
 
 __all__ = ["measure_tradeoff"]
 
@@ -54,7 +54,7 @@ _COMBINATIONS = 24
 
 
 def format_tradeoff_render_command(run_dir: str, overrides: Sequence[str]) -> str:
-    """Return the command that renders the test views with these overrides."""
+    """Return the ``neuprim render`` command that renders a run's test views with these overrides."""
     return shlex.join(["neuprim", "render", run_dir, "--camera", "test", *overrides])
 
 
@@ -65,11 +65,13 @@ _VALUES: dict[str, tuple[Any, ...]] = {
     "sort": ("center", "entry"),
     "samples": (1, 2, 4),
 }
-"""Settings of the renderer and their values."""
+"""Renderer setting -> values to measure."""
 
 
 def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
-    """Return knob -> the configurations that change it alone; reductions of fields are density.NAME and colour.NAME."""
+    """Return setting -> render configurations that change only this setting. Reductions of fields are the settings
+    density.NAME and colour.NAME.
+    """
     cores, compared = core_count(), [name for name in backends.backend_names() if name != backends.REFERENCE]
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
     values = {**_VALUES, "backend": compared, "threads": threads}
@@ -91,7 +93,8 @@ def measure_tradeoff(
     tell: Tell = lambda text: None,
     progress: Progress = lambda text, fraction: None,
 ) -> TradeoffRecord:
-    """Measure how render settings trade quality for speed; write ``tradeoff.json``, ``.html`` and ``front.png``.
+    """Measure how a run's render settings trade quality for speed; write ``tradeoff.json``, ``tradeoff.html`` and
+    ``front.png``.
 
     Raises:
         NeuprimError: run or setting do not exist, there are no test views, or overrides or the record are wrong.
@@ -118,7 +121,7 @@ def measure_tradeoff(
 
 
 class _RenderTradeoffSession(TradeoffSession):
-    """Measure points of one run within the budget."""
+    """Measure render configurations of one run within the budget."""
 
     def __init__(
         self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress, setup: TradeoffSetup
@@ -130,7 +133,7 @@ class _RenderTradeoffSession(TradeoffSession):
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
-        """Yield (knob, configuration) that can be rendered here and differ; the record lists the others."""
+        """Yield (setting, configuration) that change the reference and can be rendered here; record the others."""
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
             for config in configs:
@@ -141,7 +144,7 @@ class _RenderTradeoffSession(TradeoffSession):
                     yield name, config
 
     def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
-        """Measure images and bytes of the configurations that the record lacks."""
+        """Measure images and bytes of configurations that the record lacks, until ``part`` of the budget is used."""
         for number, (knob, config) in enumerate(wanted):
             words, points = self.setup.overrides(config), self.record.points
             if any(point.words == words for point in points):
@@ -154,12 +157,12 @@ class _RenderTradeoffSession(TradeoffSession):
             self.write_record()
 
     def draws_the_reference(self, point: TradeoffPoint) -> bool:
-        """Return whether a point has the reference's settings and resolution, so that only its bytes differ."""
+        """Return whether a point has the reference's render settings and resolution; then only its model differs."""
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 
     def combinations(self) -> list[RenderConfig]:
-        """Return earlier and new combinations of single changes, for time and for bytes."""
+        """Return earlier and new combinations of single changes that reduce time or bytes."""
         base, *others = self.record.points
         faster, smaller, known = [], [], []
         for point in others:
@@ -181,7 +184,7 @@ class _RenderTradeoffSession(TradeoffSession):
 
 
 def _render_tradeoff_identity(setup: TradeoffSetup) -> dict[str, Any]:
-    """Return what must be equal to keep earlier points; JSON-able."""
+    """Return the facts that must be equal to reuse earlier points, as JSON-ready values."""
     config, conditions = setup.config, describe_tradeoff_conditions(setup.views)
     conditions["machine"]["device"] = setup.backend(setup.reference).computing_on(setup.reference.settings)
     return {
@@ -195,7 +198,7 @@ def _render_tradeoff_identity(setup: TradeoffSetup) -> dict[str, Any]:
 
 
 def _resume_tradeoff_record(path: Path, identity: dict[str, Any], tell: Tell) -> TradeoffRecord:
-    """Return the earlier record if nothing changed, else an empty one."""
+    """Return the earlier record if its facts equal ``identity``, else an empty record."""
     before = read_tradeoff_record(path)
     if before is None:
         return TradeoffRecord(identity)

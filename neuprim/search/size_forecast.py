@@ -1,7 +1,8 @@
-"""Predict quality, bytes and time of full runs of every size from trials, and propose the size to try next.
+"""Predict quality, bytes and time of full runs from short trials, and propose the number of primitives to try next.
 
-Every doubling of the steps gains a share of what the doubling before gained; so does every doubling of primitives
-beyond the sizes tried. Predictions are rough, about 0.6 dB over two doublings, so full runs check them.
+Every doubling of the steps is assumed to gain a fixed fraction of the previous doubling's gain, and so is every
+doubling of primitives beyond the sizes tried. Predictions are off by about 0.6 dB over two doublings, so full runs
+check them. A *margin* is the predicted quality minus the target, in dB.
 """
 
 from __future__ import annotations
@@ -16,12 +17,12 @@ from neuprim.config.command_settings import SearchTarget
 from neuprim.search.target_record import Attempt, Purpose, SettingChange, TargetRecord, forecast_time
 
 ALLOWANCE, MIN_MARGIN = 0.1, 0.05
-"""dB above the target that full runs aim at, and need at least: the cost of quantization."""
+"""Margin above the target, dB, that full runs aim at, and least margin: quantization loses about as much."""
 
 _FULL_FILE = 0.97  # share of the allowed bytes to plan with
 
 _STEP_RATIO, _MIN_RATIO, _MAX_RATIO = 0.75, 0.5, 1.0
-"""Gain of a doubling of steps over that of the doubling before: usual, least and largest measured."""
+"""Gain of a doubling of steps divided by the gain of the previous one: usual, least and largest measured value."""
 
 _SIZE_RATIO = 0.65  # gain of a doubling of primitives over that of the doubling before, beyond the sizes tried
 _FIRST_GAIN, _FIRST_SLOPE = 1.3, 1.0  # dB that a doubling of steps, and of primitives, gains where nothing is known
@@ -33,14 +34,14 @@ sizes of which the second gives no new information."""
 
 
 class Forecast(NamedTuple):
-    """Predicted quality in dB (:func:`to_forecast_decibels`), and half the width of its likely range."""
+    """Predicted quality in dB (:func:`to_forecast_decibels`), and half the width of its uncertainty interval."""
 
     value: float
     doubt: float
 
 
 def to_forecast_decibels(name: str, value: float) -> float:
-    """Return PSNR as it is, and SSIM as -10 log10(1 - ssim), on which equal steps need about equal work."""
+    """Return PSNR unchanged, and SSIM as -10 log10(1 - ssim); on this scale equal gains need about equal effort."""
     return value if name == "psnr" else -10 * math.log10(max(1.0 - value, 1e-6))
 
 
@@ -53,8 +54,8 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
     """Predict the quality after ``steps`` from trials of one configuration.
 
     Args:
-        lengths: steps of a trial -> its quality, dB.
-        gain: dB of the doubling that ends with the trial, where only one length was tried.
+        lengths: steps of each trial -> quality of the trial, dB.
+        gain: assumed gain of the last doubling of steps, dB; used if there is only one trial.
     """
     tried = sorted(lengths)
     gains = [(lengths[b] - lengths[a]) / math.log2(b / a) for a, b in pairwise(tried)]
@@ -70,12 +71,14 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
 
 
 def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
-    """Return gain (ratio + ratio^2 + ...), for a number of doublings that need not be whole."""
+    """Return gain * (ratio + ratio^2 + ...) with ``doublings`` terms, which need not be a whole number."""
     return gain * doublings if ratio == 1 else gain * ratio * (1 - ratio**doublings) / (1 - ratio)
 
 
 def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> tuple[float, float]:
-    """Bisect on a logarithmic scale; return two close numbers of primitives, of which the first ``is_low``."""
+    """Bisect on a logarithmic scale between two numbers of primitives; return two close ones. ``is_low`` holds for the
+    first.
+    """
     for _ in range(60):
         middle = math.sqrt(low * high)
         low, high = (middle, high) if is_low(middle) else (low, middle)
@@ -84,13 +87,13 @@ def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> t
 
 @dataclass(frozen=True)
 class SizeCurve:
-    """Margin (predicted quality less the target, dB) over log2 of the number of primitives; it never falls."""
+    """Margin (predicted quality minus target, dB) as a function of log2 of the primitives; never decreases."""
 
     nodes: tuple[tuple[float, float], ...]
 
     @classmethod
     def fit(cls, tried: Sequence[tuple[int, float]]) -> SizeCurve:
-        """Fit (primitives, margin) pairs; neighbours that would make the curve fall get their mean."""
+        """Fit a curve to (primitives, margin) pairs; neighbours with decreasing margins are replaced by their mean."""
         blocks: list[tuple[list[float], float]] = []
         for count, margin in sorted(tried):
             blocks.append(([math.log2(count)], margin))
@@ -101,7 +104,7 @@ class SizeCurve:
         return cls(tuple((place, value) for places, value in blocks for place in places))
 
     def _end_slope(self, end: int) -> float:
-        """Return dB per doubling at the first (0) or last (-1) node."""
+        """Return the slope, dB per doubling of the primitives, at the first (0) or last (-1) node."""
         place, value = self.nodes[end]
         apart = [node for node in self.nodes if abs(node[0] - place) >= _APART / 2]
         if not apart:
@@ -110,11 +113,11 @@ class SizeCurve:
 
     @property
     def slope(self) -> float:
-        """dB per doubling of the primitives at the largest size."""
+        """Slope at the largest size, dB per doubling of the primitives."""
         return self._end_slope(-1)
 
     def at(self, primitives: float) -> float:
-        """Return the margin of a number of primitives."""
+        """Return the margin for a number of primitives, dB."""
         place = math.log2(primitives)
         (first, low), (last, high) = self.nodes[0], self.nodes[-1]
         if place <= first:
@@ -125,11 +128,11 @@ class SizeCurve:
         return at_b if b == a else at_a + (at_b - at_a) * (place - a) / (b - a)
 
     def slope_at(self, primitives: float) -> float:
-        """Return dB per doubling around a number of primitives."""
+        """Return the slope around a number of primitives, dB per doubling."""
         return self.at(primitives * 2**_APART) - self.at(primitives / 2**_APART)
 
     def find_count(self, wanted: float, highest: int) -> int | None:
-        """Return the least number of primitives with a margin, at most ``highest``; None if there is none."""
+        """Return the least number of primitives, up to ``highest``, with the margin ``wanted``; None if none."""
         if self.at(1) >= wanted:
             return 1
         if self.at(max(highest, 1)) < wanted:
@@ -138,18 +141,21 @@ class SizeCurve:
 
 
 class SizeProposal(NamedTuple):
-    """Next step of a search: try this size, take it, or report the target as unreachable with it as the best."""
+    """Next step of a size search: try ``primitives``, take them as the result, or report the target as unreachable with
+    them as the best.
+    """
 
     kind: Literal["try", "take", "unreachable"]
     primitives: int
 
 
 def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float, doubt: float) -> SizeProposal:
-    """Return the next step towards the least size with a margin.
+    """Return the next step of a search for the smallest size with the margin ``wanted``.
 
     Args:
         tried: (primitives, margin) pairs, one or more.
-        doubt: dB by which margins may be wrong; only a target missed by more is unreachable.
+        highest: largest number of primitives allowed.
+        doubt: uncertainty of margins, dB; a target is only unreachable if it is missed by more.
     """
     curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
     found = curve.find_count(wanted, highest)
@@ -169,7 +175,7 @@ def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float
 
 
 def _move_from_tried_size(tried: int, found: int, highest: int) -> int:
-    """Return ``found``, moved so far from the only size tried that both give a slope."""
+    """Return ``found``, moved far enough away from the only size tried to measure a slope between the two."""
     step = math.log2(found / tried)
     if abs(step) < _APART:
         up, down = round(tried * 2**_APART), round(tried / 2**_APART)
@@ -178,10 +184,11 @@ def _move_from_tried_size(tried: int, found: int, highest: int) -> int:
 
 
 def propose_best_size(tried: Sequence[tuple[int, float]], highest: int, worth: float = 0.1) -> SizeProposal:
-    """Return the next step towards the best quality within ``highest`` primitives.
+    """Return the next step of a search for the best quality with at most ``highest`` primitives.
 
     Args:
-        worth: dB per doubling that more primitives must gain.
+        tried: (primitives, margin) pairs, one or more.
+        worth: least gain, in dB per doubling, that justifies more primitives.
     """
     curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
     if highest < counts[0] / 2**_CLOSE:  # all sizes tried are above the limit
@@ -201,10 +208,10 @@ def propose_best_size(tried: Sequence[tuple[int, float]], highest: int, worth: f
 
 @dataclass(frozen=True)
 class SizePredictor:
-    """Predict the margin of every size from the record of a target search.
+    """Predict margins (quality minus target, dB) of full runs from the record of a target search.
 
     Attributes:
-        steps: primitives -> steps of a full run.
+        steps: function that returns the steps of a full run for a number of primitives.
     """
 
     target: SearchTarget
@@ -213,11 +220,11 @@ class SizePredictor:
 
     @property
     def measures(self) -> tuple[str, ...]:
-        """The target's measures of quality, else PSNR."""
+        """Names of the quality measures that the target sets; ("psnr",) if it sets none."""
         return tuple(self.target.quality) or ("psnr",)
 
     def margin(self, values: Mapping[str, float]) -> float:
-        """Return the least dB above the target; without measures of quality the PSNR itself."""
+        """Return the smallest excess over the target, dB; the PSNR itself if the target has no quality."""
         wanted = self.target.quality
         if not wanted:
             return values["psnr"]
@@ -229,7 +236,7 @@ class SizePredictor:
         return self.margin({name: attempt.measured(name) for name in self.measures})
 
     def forecasts(self) -> dict[int, dict[str, Forecast]]:
-        """Return primitives -> measure -> forecast of a full run with the current settings."""
+        """Return primitives -> measure -> predicted quality of a full run with the current settings."""
         by_name = {name: self._forecast(name) for name in self.measures}
         return {
             count: {name: own[count] for name, own in by_name.items()} for count in sorted(by_name[self.measures[0]])
@@ -258,7 +265,7 @@ class SizePredictor:
         return forecasts | {n: Forecast(value, ALLOWANCE) for n, value in full.items()}
 
     def _relevant(self, *purposes: Purpose) -> list[Attempt]:
-        """Return trainings with the current settings, or with earlier values of the settings changed since."""
+        """Return trainings that have, for every changed setting, the current value or an earlier one."""
         history = self.record.history
         finished = self.record.finished(*purposes)
         return [a for a in finished if all(value in history(key) for key, value in a.words.items())]
@@ -276,10 +283,10 @@ class SizePredictor:
         return to_forecast_decibels(name, attempt.measured(name)) - loss
 
     def margins(self) -> list[tuple[int, float]]:
-        """Return (primitives, margin) of every size.
+        """Return (primitives, margin) for every size that was trained.
 
-        A size that is only forecast is no worse than a smaller full run and no better than a larger one. Between a full
-        run that is too small and one that is large enough, only full runs count.
+        The forecast of a size is limited to the margins of smaller and larger full runs. Between a full run that misses
+        the target and one that meets it, only full runs are returned.
         """
         margins = {
             n: self.margin({name: from_forecast_decibels(name, f.value) for name, f in values.items()})
@@ -300,11 +307,11 @@ class SizePredictor:
 
     @property
     def doubt(self) -> float:
-        """dB by which a margin may be wrong, at the size that is known best."""
+        """Uncertainty of a margin, dB, at the size where it is smallest."""
         return min((max(f.doubt for f in values.values()) for values in self.forecasts().values()), default=1.0)
 
     def predict(self, primitives: int) -> dict[str, list[float]]:
-        """Return measure -> [value, doubt in dB] of a full run."""
+        """Return measure -> [value, uncertainty in dB] of a full run with this number of primitives."""
         forecasts = self.forecasts()
         nearest = min(forecasts, key=lambda n: abs(math.log2(n / primitives)))
         predicted = {}
@@ -314,7 +321,7 @@ class SizePredictor:
         return predicted
 
     def limit(self) -> int | None:
-        """Return the primitives that the limits of bytes and speed allow; None without limits or trials."""
+        """Return the most primitives within the limits of bytes and speed; None without limits or trials."""
         trials = [a for a in self._relevant("size", "full") if a.packed]
         limits: list[tuple[list[tuple[int, float]], float]] = []
         if self.target.megabytes is not None:
@@ -332,7 +339,7 @@ class SizePredictor:
 
 
 def format_target_forecast(name: str, value: float, doubt: float) -> str:
-    """Format a predicted measure, with its doubt (dB) in the measure's unit."""
+    """Format a predicted measure with its uncertainty, which is given in dB and printed in the measure's unit."""
     if name == "psnr":
         return f"{name} {value:.2f} ± {doubt:.2g} dB"
     low, high = (from_forecast_decibels(name, to_forecast_decibels(name, value) + sign * doubt) for sign in (-1, 1))
@@ -340,7 +347,7 @@ def format_target_forecast(name: str, value: float, doubt: float) -> str:
 
 
 def exceeded_limit(target: SearchTarget, attempt: Attempt, packed: int | None = None) -> str | None:
-    """Return which limit of a target a model exceeds; None if none."""
+    """Return a message that says which limit of a target a trained model exceeds; None if none."""
     size = attempt.packed if packed is None else packed
     if target.megabytes is not None and size > 1e6 * target.megabytes:
         return f"{size / 1e6:.3f} MB are more than target.megabytes={target.megabytes:g}"

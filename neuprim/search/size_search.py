@@ -1,6 +1,6 @@
-"""Search the smallest model that meets a target: short trials of several sizes, changed settings, then full runs.
+"""Search for the smallest model that meets a target: short trials of several sizes, trials of settings, then full runs.
 
-Every stage reads the record and requests the next training, so a resumed search makes the same decisions again.
+Every stage derives the next training from the record only, so that a resumed search makes the same decisions again.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ from neuprim.search.target_record import (
 from neuprim.search.trials import get_trial_setting
 
 _MAX_MARGIN, _NEAR = 0.3, 1.08
-"""A full run is good enough within these dB above the target, if at most this factor above the predicted size."""
+"""A full run is good enough up to this margin above the target, dB, and up to this factor above the predicted size."""
 
 _TRIALS, _FULL = 0.33, 0.34  # shares of the budget for trials and for a full run; the rest is for another one
 
 _SHORTER, _PACE_STEPS, _MIN_STEPS = 8, 24, 16
-"""Full runs have this many times the steps of a trial. Steps that measure the pace; least steps of a trial."""
+"""Full runs have this many times the steps of a trial. Steps that are timed at first; least steps of a trial."""
 
 _MAX_SIZES, _MAX_CHANGES, _MAX_FULL = 6, 4, 5
 
@@ -54,7 +54,7 @@ _MIN_SLOPE = 0.8  # dB that twice as many primitives gain in full runs, at least
 _BEYOND, _BELOW = 2.0, 3.0  # a full run has at most this many times the largest, and 1/this of the smallest size tried
 
 _MIN_STEP, _MORE_STEPS = 1.07, 0.75
-"""Least factor between the sizes of two full runs, and least share of the steps of another to compare with it."""
+"""Least factor between the sizes of two full runs, and least fraction of steps with which they can be compared."""
 
 _MORE = 1.25  # factor by which limits must allow more primitives for another full run
 _SLOWER = 1.5  # a full run that becomes this many times slower is cut short
@@ -66,9 +66,10 @@ _MAX_REFUSED = 2  # values of a setting that may fail before the search leaves i
 
 
 def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[SettingValue, ...]]:
-    """Return setting -> values with fewer numbers per primitive, the least first and the current one last.
+    """Return setting -> values that need fewer parameter values per primitive, the smallest first, the current value
+    last.
 
-    The setting with the largest saving comes first.
+    The setting that can save most comes first.
     """
 
     def count_numbers(config: RunConfig) -> int:
@@ -95,9 +96,10 @@ def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -
 def propose_setting_trial(
     values: Mapping[str, Sequence[SettingValue]], turns: Sequence[SettingChange]
 ) -> tuple[str, SettingValue, SettingValue] | None:
-    """Return (setting, current value, value to try); None when all are done.
+    """Return (setting, current value, value to try) of the next trial; None if no trial is left.
 
-    A setting is halved along its values while that pays; where it does not, the value between is tried once.
+    The trial takes the middle of the remaining smaller values. If it was refused, the next trial is closer to the
+    current value.
     """
     for key, ladder in values.items():
         own = [turn for turn in turns if turn.key == key]
@@ -110,12 +112,12 @@ def propose_setting_trial(
 
 
 def setting_change_pays(loss: float, size: float, slope: float) -> bool:
-    """Return whether a model is smaller with a change after primitives make up for the loss.
+    """Return whether a changed setting makes a model of equal quality smaller.
 
     Args:
-        loss: dB at equal primitives.
-        size: bytes of a primitive over those before.
-        slope: dB that twice as many primitives gain.
+        loss: loss of quality at equal primitives, dB.
+        size: bytes per primitive, divided by those before the change.
+        slope: gain of quality by twice as many primitives, dB.
     """
     return bool(size * 2 ** (max(loss, 0.0) / slope) < _PAYS)
 
@@ -125,7 +127,7 @@ def setting_change_pays(loss: float, size: float, slope: float) -> bool:
 
 @dataclass
 class SizeSearch:
-    """Search for the smallest model that meets a target; resumes from its record."""
+    """Search for the smallest model that meets a target. A search resumes from its record."""
 
     config: RunConfig
     target: SearchTarget
@@ -138,7 +140,7 @@ class SizeSearch:
         return self.config.train.iterations or math.inf
 
     def full_steps(self, primitives: int) -> float:
-        """Return the steps of a full run in its share of the budget."""
+        """Return the number of steps for which a full run of this size fits into its part of the budget."""
         return min(self.max_steps, max(_FULL * self.record.asked["budget"] / self.runner.pace(primitives), 1.0))
 
     @property
@@ -146,7 +148,7 @@ class SizeSearch:
         return SizePredictor(self.target, self.record, self.full_steps)
 
     def run(self) -> None:
-        """Run all stages that the record does not have."""
+        """Run all stages of the search that the record does not have yet."""
         kept = sum(a.outcome is not None for a in self.record.attempts)
         if kept:
             self.runner.notify(f"{kept} earlier trainings are kept")
@@ -157,7 +159,7 @@ class SizeSearch:
                 self.record.stage = number
 
     def _measure_pace(self) -> None:
-        """Measure the time of a few steps, and choose the number of steps of a trial from it."""
+        """Measure the time per step in a few steps; from it, choose the number of steps of a trial."""
         if self.record.length:
             return
         (first,) = self.runner.run(Attempt("pace", {}, self.config.model.count, int(min(_PACE_STEPS, self.max_steps))))
@@ -177,7 +179,9 @@ class SizeSearch:
         )
 
     def _highest(self) -> int:
-        """Return the largest number of primitives that limits allow, and whose full run has twice a trial's steps."""
+        """Return the largest number of primitives that is within the limits, and whose full run has at least twice as
+        many steps as a trial.
+        """
         low = high = self.config.model.count
         while self.full_steps(high) > 2 * self.record.length and high < 2**24:
             low, high = high, 2 * high
@@ -189,7 +193,7 @@ class SizeSearch:
         return max(1, min([low, *saturated, *([] if limit is None else [limit])]))
 
     def _try_size(self, primitives: int) -> None:
-        """Train a size for two lengths, so that the gain of more steps is known."""
+        """Train a size for two lengths, to measure the gain by more steps."""
         length, words = self.record.length, self.record.words
         attempts = [Attempt("size", words, primitives, steps) for steps in (length // 2, length)]
         for several in [attempts] if self.runner.parallel else [[attempt] for attempt in attempts]:
@@ -199,7 +203,7 @@ class SizeSearch:
                     self.runner.notify(_describe_attempt(done, self.predictor.predict(done.count)))
 
     def _try_sizes(self) -> None:
-        """Try sizes until the one for the target is known, the share of the budget is used, or nothing helps."""
+        """Try sizes until the one for the target is known, the time for trials is used, or no size promises more."""
         first = min(self.config.model.count, self._highest())
         self._try_size(first)
         lengthened = False
@@ -228,7 +232,7 @@ class SizeSearch:
         return propose_size(predictor.margins(), highest, ALLOWANCE, predictor.doubt)
 
     def _wanted(self) -> int:
-        """Return the size that a full run should have, by what is known now."""
+        """Return the number of primitives for the next full run, from the trainings so far."""
         predictor, highest = self.predictor, self._highest()
         margins = predictor.margins()
         if not self.target.quality:
@@ -257,9 +261,9 @@ class SizeSearch:
         return max(found, 1)
 
     def _least_useful(self) -> int:
-        """Return the smallest useful size of another full run, while all full runs exceed the target.
+        """Return the smallest number of primitives worth another full run, while all full runs exceed the target.
 
-        Short trials of different sizes are often alike, and full runs are not.
+        Short trials of different sizes often have similar quality, unlike full runs.
         """
         full = [(a.count, self.predictor.margin_of(a)) for a in self.record.finished("full")]
         if not full or min(margin for _, margin in full) < MIN_MARGIN:
@@ -268,7 +272,7 @@ class SizeSearch:
         return round(count / 2 ** ((margin - MIN_MARGIN) / _MIN_SLOPE))
 
     def _report_reach(self) -> None:
-        """Report a target that is out of reach as soon as trials show it."""
+        """Report that the target cannot be reached, as soon as trials show it."""
         if not self.target.quality:
             return
         predictor, best = self.predictor, self._wanted()
@@ -284,7 +288,7 @@ class SizeSearch:
         self.runner.notify(self.record.out_of_reach)
 
     def _change_settings(self) -> None:
-        """Try settings that save bytes, at the size nearest to the wanted one."""
+        """Try settings that save bytes, at the size tried that is closest to :meth:`_wanted`."""
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return
         values = list_smaller_settings(self.config, load_config_task(self.config), self.dataset)
@@ -320,7 +324,7 @@ class SizeSearch:
     # ------------------------------------------------------------ full runs
 
     def _run_full(self) -> None:
-        """Make a full run, and others while the target is missed or met by too much, and time is left."""
+        """Train full runs while the target is missed or exceeded by too much, and time is left."""
         for _ in range(_MAX_FULL - (len(self.record.finished("full")) - self.record.before)):
             unfinished = [a for a in self.record.attempts if a.purpose == "full" and a.outcome is None]
             if not unfinished and any(self._is_good(a) for a in self.record.finished("full")):
@@ -334,7 +338,7 @@ class SizeSearch:
             self.runner.notify(_describe_attempt(self.runner.run(attempt)[0], {}))
 
     def _is_good(self, attempt: Attempt) -> bool:
-        """Return whether a full run is about as good as another could be."""
+        """Return whether another full run is unlikely to be better than this one."""
         if exceeded_limit(self.target, attempt) is not None:
             return False
         if not self.target.quality:
@@ -343,7 +347,7 @@ class SizeSearch:
         return MIN_MARGIN <= margin <= _MAX_MARGIN and attempt.count <= _NEAR * self._wanted()
 
     def _plan_full(self) -> Attempt | None:
-        """Return the next full run; None if there is no time for it or it would not differ."""
+        """Return the next full run; None if there is no time for it, or it would hardly differ from an earlier one."""
         finished, wanted, budget = self.record.finished("full"), self._wanted(), self.record.asked["budget"]
         pace, left = self.runner.pace(wanted), self.runner.seconds_left - self._reserve(wanted)
         share = left if finished else max(left / 2, min(left, _FULL * budget))
@@ -360,7 +364,7 @@ class SizeSearch:
         return Attempt("full", self.record.words, wanted, steps, seconds, self.predictor.predict(wanted))
 
     def _reserve(self, primitives: int) -> float:
-        """Return the seconds for what follows a full run: evaluation, pictures, quantization."""
+        """Return the seconds to reserve for the steps after a full run: evaluation, pictures, quantization."""
         trials = self.record.finished("size", "full")
         frame = forecast_time([(a.count, a.measured("ms_per_frame")) for a in trials], primitives) / 1e3
         held_out = min(VIEWS, len(self.dataset.train) // self.record.hold_out)

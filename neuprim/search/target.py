@@ -1,7 +1,7 @@
 """``neuprim run target.psnr=30 budget=10m``: find and train the smallest model that meets a target.
 
-Trials and full runs find the size; the chosen full run becomes the run directory; pruning and quantization then make
-its model smaller. Only training views decide, some of which are held out.
+Trials and full runs find the number of primitives. The chosen full run becomes the run directory. Pruning and
+quantization then make its model smaller. Only training views, some of them held out, are used for decisions.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ __all__ = ["run_target"]
 _FIRST_SHARE = 0.05  # share of the squared error at which the search for coarse numbers begins
 
 _MAX_TUNING, _MIN_TUNING = 3, 600
-"""Largest number of fine-tuning steps over those of the full run; least number of steps to prune a model."""
+"""Largest number of fine-tuning steps divided by the steps of the full run; least number of steps to prune a model."""
 
 _KEPT = ("model.safetensors", "checkpoint.safetensors", "metrics.jsonl")
 
@@ -74,9 +74,9 @@ def run_target(
     The directory of ``config`` becomes a run directory with ``target.json`` and ``model.neuprim``.
 
     Args:
-        config: the run; its primitives are the first size to try, its iterations the upper bound.
+        config: the run. Its number of primitives is the first size to try; its iterations are the largest number.
         target: quality to reach, and limits of size and speed.
-        budget: seconds of search, training and measuring; compiling kernels does not count.
+        budget: seconds for search, training and measuring; compiling kernels does not count.
         clock: function that returns monotonic seconds.
         launcher: where to train.
 
@@ -112,7 +112,7 @@ def run_target(
 
 
 def choose_target_hold_out(dataset: Dataset) -> int:
-    """Return n, where every n-th training view is held out: 8, or fewer (2 at least) below 64 training views."""
+    """Return n to hold out every n-th training view: 8, or fewer (at least 2) below 64 training views."""
     count = len(dataset.train)
     if count < 4:
         raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out")
@@ -135,7 +135,9 @@ def _check_target_config(config: RunConfig) -> None:
 
 
 def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
-    """Return the earlier record. Another target or budget keeps the trainings and starts its seconds anew."""
+    """Return the record of the earlier search. With another target or budget its trainings are reused, and the time
+    used restarts at 0.
+    """
     folder, own = config.output_dir, (*NOT_TRAINED_WITH, "made_by")
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
     before = read_target_record(folder) if config.resume else None
@@ -158,13 +160,13 @@ def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetR
 
 @dataclass(frozen=True)
 class _TargetResult:
-    """Result of the search after a stage.
+    """Result of a target search, before or after pruning and quantization.
 
     Attributes:
-        run_dir: the run directory, or that of the pruned model in it.
-        held, test: PSNR and SSIM of held-out and of test views.
-        packed: bytes of the smallest file.
-        facts: what the stages add to the record.
+        run_dir: the run directory, or the directory of the pruned model in it.
+        held, test: PSNR and SSIM of held-out training views and of test views.
+        packed: bytes of the smallest model file.
+        facts: entries that these steps add to the record.
     """
 
     run_dir: Path
@@ -175,7 +177,9 @@ class _TargetResult:
 
 
 def choose_full_run(predictor: SizePredictor) -> Attempt:
-    """Return the smallest full run that meets the target, with room for quantization if possible; else the best."""
+    """Return the full run with the smallest file that meets the target, with room for quantization if possible; else
+    the best.
+    """
     finished = predictor.record.finished("full")
     within = [a for a in finished if exceeded_limit(predictor.target, a) is None] or finished
     for room in (MIN_MARGIN, 0.0):
@@ -186,7 +190,7 @@ def choose_full_run(predictor: SizePredictor) -> Attempt:
 
 
 def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None:
-    """Write the run directory of the best full run, prune and quantize its model, and record what is achieved."""
+    """Write the run directory of the best full run, prune and quantize its model, and record what was achieved."""
     record, target = runner.record, predictor.target
     attempt = choose_full_run(predictor)
     record.chosen = attempt.folder
@@ -217,7 +221,7 @@ def _finish_target_search(runner: TrialRunner, predictor: SizePredictor) -> None
 
 
 def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult:
-    """Write the run directory from the directory of the chosen full run; measure test views."""
+    """Write the run directory from the folder of the chosen full run, and measure its test views."""
     config, folder = runner.configure(attempt), runner.config.output_dir
     runner.events(Finishing("measuring test views"))
     resumed = replace(config, resume=True)
@@ -234,7 +238,7 @@ def _write_target_result(runner: TrialRunner, attempt: Attempt) -> _TargetResult
 
 
 def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str, float]:
-    """Return PSNR and SSIM of the held-out views that evaluated the trainings."""
+    """Return PSNR and SSIM of the held-out training views with which the search compares trainings."""
     dataset, settings = hold_out_views(runner.dataset, runner.record.hold_out), runner.config.renderer
     views = choose_trial_views(dataset, VIEWS)
     with torch.no_grad():
@@ -246,7 +250,7 @@ def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str
 def _prune_full_run(
     runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _TargetResult
 ) -> _TargetResult:
-    """Prune as far as the target allows, in half of the time left; return ``before`` if that does not help."""
+    """Prune the model as far as the target allows, in half of the time left; return ``before`` if useless."""
     record, margin = runner.record, predictor.margin(before.held)
     if not predictor.target.quality or margin < 0:
         return before
@@ -277,9 +281,8 @@ def _prune_full_run(
 
 
 def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
-    """Quantize as coarsely as the target allows; if it is missed anyway, lose at most :data:`ALLOWANCE` dB more.
-
-    With a limit of bytes alone, quantize as finely as that limit allows.
+    """Quantize the model as coarsely as the target allows. If the target is missed anyway, lose at most
+    :data:`ALLOWANCE` dB more. If there is only a limit of bytes, quantize as finely as the limit allows.
     """
     target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model_checkpoint(before.run_dir / "model.safetensors", task)

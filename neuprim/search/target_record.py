@@ -1,4 +1,4 @@
-"""Trainings of a target search: their record ``target.json``, from which a search resumes, and their runner."""
+"""Record and runner of a target search: ``target.json`` lists its trainings, so that the search can resume."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ SettingValue = int | float | str
 
 @dataclass
 class Attempt:
-    """One training of the search.
+    """One training of a target search.
 
     Attributes:
-        purpose: what it measures; "full" is a candidate for the result.
-        words: changed settings beside the number of primitives, e.g. {"model.sh_degree": 1}.
-        primitives, steps: as requested.
-        max_seconds: limit of a full run; None for trials.
-        predicted: measure -> [value, doubt], predicted before a full run.
+        purpose: what the training measures; "full" is a candidate for the result.
+        words: changed settings except the number of primitives, e.g. {"model.sh_degree": 1}.
+        primitives, steps: requested numbers of primitives and training steps.
+        max_seconds: time limit of a full run; None for trials.
+        predicted: measure -> [value, uncertainty in dB], predicted before a full run.
         outcome: fields of :class:`neuprim.search.trials.Outcome`, on held-out training views.
-        packed: bytes of the model compressed at the default level.
-        seconds: time of the whole attempt, by the search's clock.
+        packed: bytes of the model when compressed at the default level.
+        seconds: time of training and evaluation together, by the search's clock.
     """
 
     purpose: Purpose
@@ -65,29 +65,29 @@ class Attempt:
         return "_".join([first, *changes, f"{self.steps}-steps", *limit])
 
     def measured(self, name: str) -> float:
-        """Return a number of the outcome."""
+        """Return the measurement ``name`` of the outcome."""
         assert self.outcome is not None
         return float(self.outcome[name])
 
     @property
     def count(self) -> int:
-        """Number of primitives at the end of the training."""
+        """Number of primitives when the training ended."""
         return int(self.measured("primitives"))
 
     def repeats(self, other: Attempt) -> bool:
-        """Return whether both are the same training."""
+        """Return whether ``other`` is the same training: equal settings, sizes, steps and time limit."""
         mine, its = ((a.purpose == "full", a.words, a.primitives, a.steps, a.max_seconds) for a in (self, other))
         return mine == its
 
 
 @dataclass
 class SettingChange:
-    """A setting that was changed to save bytes.
+    """A setting that a target search changed to save bytes.
 
     Attributes:
-        loss: measure -> dB that it costs at equal primitives.
-        size: bytes of a primitive, divided by those before the change.
-        adopted: whether the model is smaller with it, with the primitives that make up for the loss.
+        loss: measure -> loss by the change at equal primitives, dB.
+        size: bytes per primitive, divided by those before the change.
+        adopted: whether the change makes a model of equal quality smaller.
     """
 
     key: str
@@ -103,14 +103,14 @@ class TargetRecord:
     """Content of ``target.json``.
 
     Attributes:
-        asked: the target and its budget, seconds.
-        same: configuration that must be equal to keep trainings.
-        hold_out: every n-th training view is held out and evaluates trainings.
+        asked: the requested target and budget in seconds.
+        same: configuration that must be equal to reuse the trainings.
+        hold_out: n: every n-th training view is held out and used to evaluate trainings.
         stage: number of finished stages of the search.
-        length: steps of a trial; 0 until the step time is known.
-        spent: seconds of the budget.
-        before: full runs made for an earlier target.
-        turns: changed settings.
+        length: steps of a trial; 0 until the time per step is known.
+        spent: seconds of the budget used so far.
+        before: number of full runs made for an earlier target.
+        turns: settings that were tried to save bytes.
         chosen: folder of the chosen full run.
         achieved: result: quality of test and held-out views, bytes, frames per second.
         out_of_reach: the message that the target is out of reach, if trials show it.
@@ -134,16 +134,16 @@ class TargetRecord:
 
     @property
     def words(self) -> dict[str, SettingValue]:
-        """Settings changed so far."""
+        """Setting -> value of the changes adopted so far."""
         return {turn.key: turn.after for turn in self.turns if turn.adopted}
 
     def history(self, key: str) -> list[SettingValue]:
-        """Return the values of a changed setting from the first to the current one."""
+        """Return the adopted values of a setting, from the first to the current one."""
         own = [turn for turn in self.turns if turn.adopted and turn.key == key]
         return [own[0].before, *(turn.after for turn in own)] if own else []
 
     def finished(self, *purposes: Purpose) -> list[Attempt]:
-        """Return the finished trainings of these purposes, in their order."""
+        """Return the finished trainings with one of these purposes, in the order of the record."""
         return [a for a in self.attempts if a.purpose in purposes and a.outcome is not None]
 
     def add_reason(self, text: str) -> None:
@@ -156,7 +156,7 @@ class TargetRecord:
 
 
 def read_target_record(folder: Path) -> TargetRecord | None:
-    """Read the record of a run directory; None where there is none.
+    """Read the record of a target search from its run directory; None if there is none.
 
     Raises:
         DataError: the file is damaged.
@@ -179,7 +179,10 @@ def _parse_target_record(data: Mapping[str, Any]) -> TargetRecord:
 
 
 def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> float:
-    """Return a time at a number of primitives, by a least-squares line that neither falls nor starts below zero."""
+    """Predict the time for a number of primitives from (primitives, time) pairs, by a least-squares line.
+
+    The line neither decreases nor is negative at 0 primitives.
+    """
     counts, times = [float(n) for n, _ in known], [t for _, t in known]
     mean_n, mean_t = sum(counts) / len(counts), sum(times) / len(times)
     spread = sum((n - mean_n) ** 2 for n in counts)
@@ -192,11 +195,11 @@ def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> floa
 
 @dataclass
 class TrialRunner:
-    """Runner that trains what a search requests, unless its record has the outcome.
+    """Runs the trainings that a target search requests, except those whose outcome is in the record.
 
     Attributes:
         config: configuration from which the search starts; dataset: the whole scene.
-        clock: seconds, monotonic; begun: its value at the start of the budget.
+        clock: function that returns monotonic seconds; begun: its value at the start of the budget.
     """
 
     config: RunConfig
@@ -209,7 +212,7 @@ class TrialRunner:
 
     @property
     def parallel(self) -> bool:
-        """Whether trainings requested together run together."""
+        """Whether trainings that are requested together run at the same time."""
         return self.launcher.name != "inline"
 
     @property
@@ -228,9 +231,9 @@ class TrialRunner:
         self.events(Note(text))
 
     def configure(self, attempt: Attempt) -> RunConfig:
-        """Return the configuration of a training, in its folder.
+        """Return the configuration of a training, with the training's own folder.
 
-        It has as many interventions into the population as a full run: with fewer, short trials are half a dB worse.
+        Population control intervenes as often as in a full run: with fewer interventions short trials lose 0.5 dB.
         """
         whole, every = self.config.train.iterations, self.config.train.population.every
         if whole is not None and attempt.steps < whole:
@@ -249,9 +252,9 @@ class TrialRunner:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)
 
     def run(self, *wanted: Attempt) -> list[Attempt]:
-        """Train the attempts that the record does not have; return all with outcomes.
+        """Train the attempts that the record does not have; return all attempts with their outcomes.
 
-        KeyboardInterrupt leaves an attempt unfinished in the record; it resumes from its checkpoint.
+        After KeyboardInterrupt an attempt is unfinished in the record; the same call resumes it from its checkpoint.
         """
         attempts = [next((a for a in self.record.attempts if a.repeats(one)), one) for one in wanted]
         todo = [attempt for attempt in attempts if attempt.outcome is None]
@@ -299,18 +302,18 @@ class TrialRunner:
         self.write_record()
 
     def pace(self, primitives: float) -> float:
-        """Return the expected seconds of a step."""
+        """Return the expected seconds per training step with this number of primitives."""
         # The few steps of the first attempt are the poorest estimate.
         trained = self.record.finished("size", "full") or self.record.finished("pace")
         return forecast_time(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
 
     def overhead(self) -> float:
-        """Return the seconds of a trial without its steps: initialization, evaluation."""
+        """Return the seconds of a trial besides its training steps: initialization and evaluation."""
         finished = self.record.finished("size") or self.record.finished("pace")
         return max([0.0, *(a.seconds - a.measured("pace") * a.steps for a in finished[-3:])])
 
     def fits(self, primitives: int, steps: float, share: float) -> bool:
-        """Return whether a trial ends within a share of the budget."""
+        """Return whether a trial would end before the fraction ``share`` of the budget is used."""
         seconds = self.pace(primitives) * steps + self.overhead()
         return self.seconds_spent + seconds <= share * self.record.asked["budget"]
 

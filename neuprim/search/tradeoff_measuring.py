@@ -1,4 +1,4 @@
-"""Measure the points of a trade-off: images against ground truth, file size, frame times in rounds."""
+"""Measure the points of a trade-off: image quality, file size, and frame times, which are measured in rounds."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ T = TypeVar("T")
 
 @dataclass
 class TradeoffSetup:
-    """A run's model, its evaluation views, and the reference configuration of rendering."""
+    """A run's model, its evaluation views, and its reference render configuration, with which others are compared."""
 
     config: RunConfig
     model: Primitives
@@ -58,14 +58,14 @@ class TradeoffSetup:
     _prepared: dict[tuple[object, ...], Primitives] = field(default_factory=dict)
 
     def overrides(self, config: RenderConfig) -> tuple[str, ...]:
-        """Return the overrides with which ``neuprim render`` reproduces a configuration."""
+        """Return the overrides of ``neuprim render`` that give a configuration."""
         return config.to_overrides(self.config.renderer)
 
     def parse(self, overrides: Sequence[str]) -> RenderConfig:
         return parse_run_rendering(overrides, self.config.renderer, self.model)
 
     def prepare_model(self, config: RenderConfig) -> Primitives:
-        """Return the model for a configuration, on the configuration's device; recent models are cached."""
+        """Return the model reduced for a configuration, on the configuration's device; recent models are cached."""
         key = (tuple(config.reduced.items()), config.settings.backend, config.settings.device)
         if key not in self._prepared:
             model = move_to_render_device(config.prepare_model(self.model), config.settings, self.views[0].view)
@@ -76,13 +76,13 @@ class TradeoffSetup:
         return self._prepared[key]
 
     def backend(self, config: RenderConfig) -> backends.Backend:
-        """Return the backend that draws a configuration."""
+        """Return the backend that renders a configuration."""
         model, view = self.prepare_model(config), config.scale_view(self.views[0].view)
         lowered = model.lower(view.camera, view.conditions, shaded=False)
         return backends.choose_backend(lowered, config.settings, view.camera)
 
     def unsupported(self, config: RenderConfig) -> str | None:
-        """Return why a configuration cannot be drawn here; None if it can."""
+        """Return why a configuration cannot be rendered on this machine; None if it can."""
         try:
             backends.check_backend_device(config.settings)
             self.backend(config)
@@ -91,12 +91,12 @@ class TradeoffSetup:
         return None
 
     def renderer(self, config: RenderConfig) -> Renderer:
-        """Return a function that renders a view with a configuration, whose model it prepares beforehand."""
+        """Prepare the model for a configuration, and return a function that renders a view with it."""
         model = self.prepare_model(config)
         return lambda view: config.render_view(model, view, self.dataset.background)
 
     def display(self, image: Tensor) -> Tensor:
-        """Return displayed values within [0, 1]."""
+        """Convert an image to displayed values within [0, 1]."""
         return self.channels.display(image).clamp(0.0, 1.0)
 
 
@@ -107,16 +107,16 @@ def load_tradeoff_setup(
     lpips: str | Path | None = None,
     loaded: tuple[Dataset, list[EvalView]] | None = None,
 ) -> TradeoffSetup:
-    """Load a finished run for measuring.
+    """Load a finished run to measure its quality and speed.
 
     Args:
-        overrides: overrides of the reference configuration, on top of the run's render settings.
-        views: number of evaluation views, evenly spread.
+        overrides: render settings of the reference configuration, on top of the run's.
+        views: number of evaluation views, evenly spread over the test views.
         lpips: weights for LPIPS; None for those of the run.
         loaded: data set and evaluation views, if they are loaded already.
 
     Raises:
-        NeuprimError: no such run, no test views, or invalid overrides.
+        NeuprimError: the run does not exist, has no test views, or overrides are invalid.
     """
     run = load_run(run_dir)
     config, task, model = run.config, run.task, run.model
@@ -134,7 +134,7 @@ def load_tradeoff_setup(
 
 
 def describe_tradeoff_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
-    """Return views, machine and versions of measurements, which must be equal to keep them."""
+    """Return the views, machine and versions of measurements, which must be equal to reuse the measurements."""
     camera = views[0].view.camera
     return {
         "views": [one.view.name for one in views],
@@ -150,7 +150,7 @@ def describe_tradeoff_conditions(views: Sequence[EvalView]) -> dict[str, Any]:
 
 
 def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
-    """Return facts of a measured run, for readers of the record."""
+    """Return facts about the measured run, which are stored in the record for its readers."""
     return {
         "task": setup.config.task,
         "scene": setup.config.scene_name,
@@ -165,7 +165,9 @@ def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
 
 
 def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> TradeoffPoint:
-    """Measure a configuration: image metrics as means over the views, and bytes of the model file."""
+    """Measure a render configuration, which changes the setting ``knob``: mean image metrics over the views, and bytes
+    of the model file.
+    """
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
     for view in setup.views:
@@ -186,7 +188,7 @@ def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> Trad
 
 
 class TimedPoint(NamedTuple):
-    """A point to time, and a function that returns its renderer."""
+    """A trade-off's point whose frame times are to be measured, and a function that returns its renderer."""
 
     point: TradeoffPoint
     renderer: Callable[[], Renderer]
@@ -199,15 +201,15 @@ def time_tradeoff_points(
     deadline: float,
     done: Callable[[int, int], None],
 ) -> None:
-    """Time points in rounds. The first is the reference, which is drawn several times in every round.
+    """Measure frame times of points in rounds. The first point is the reference, rendered several times in every round.
 
-    In a round every due point draws every view, in random order. Each frame is drawn twice and the second is timed, so
-    that its model is in the caches. A round adds to each point its mean milliseconds per frame, and a ratio: the median
-    over views of its time over the reference's in the same view, so that brief load of the machine has no effect.
+    In a round, every point that lacks rounds renders every view, in random order. Each frame is rendered twice and
+    the second time counts, with the model in the caches. A round adds to a point its mean milliseconds per frame, and
+    a ratio: the median over views of its time divided by the reference's. Brief load of the machine has no effect.
 
     Args:
-        repeats: number of rounds that each point should have, including those that it has already.
-        deadline: value of :func:`time.monotonic`; a round after the first must be expected to end before it.
+        repeats: number of rounds that each point should have, including earlier ones.
+        deadline: value of :func:`time.monotonic`; a round after the first only starts if it should end before.
         done: called with (round, number of rounds) after each round.
     """
     order = torch.Generator().manual_seed(len(timed[0].point.ms))
@@ -249,13 +251,14 @@ class TradeoffRequest:
     """Request for a trade-off, with the arguments of ``neuprim tradeoff``.
 
     Attributes:
-        words: overrides of the reference: render settings of a run, or all settings of models to train.
+        words: overrides of the reference: render settings of a finished run, or settings of ``neuprim run`` for models
+            to train.
         budget: approximate seconds; measurements that do not fit are left out.
         views: number of held-out views to measure, evenly spread.
-        repeats: number of timings.
+        repeats: number of rounds of timing.
         knobs: names of the settings to vary; empty for all.
         lpips: weights for LPIPS; None for those of the run.
-        out: folder of the results; None for the one that follows from the run, or from task and scene.
+        out: folder for the results; None for a default name made from the run directory, or from task and scene.
     """
 
     words: Sequence[str] = ()
@@ -268,10 +271,10 @@ class TradeoffRequest:
 
 
 class TradeoffSession:
-    """Measure points within a budget, find the fronts, and write record and page.
+    """Measure the points of a trade-off within a budget, find the Pareto fronts, and write record and page.
 
     Args:
-        folder: folder of the record and its pages.
+        folder: folder for ``tradeoff.json`` and its page.
     """
 
     def __init__(self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress) -> None:
@@ -279,23 +282,23 @@ class TradeoffSession:
         self.begun = time.monotonic()
 
     def point_setup(self, number: int) -> tuple[TradeoffSetup, RenderConfig]:
-        """Return the setup of a point's model, and the configuration that draws the point."""
+        """Return the setup with the model of point ``number``, and the render configuration of the point."""
         raise NotImplementedError
 
     def seconds_left(self, part: float) -> float:
-        """Return the seconds until a share of the budget is used."""
+        """Return the seconds until the fraction ``part`` of the budget is used."""
         return self.begun + part * self.request.budget - time.monotonic()
 
     @property
     def no_time(self) -> str:
-        """Reason in the record for points that are not measured, as no time is left."""
+        """Reason, for the record, why a point is not measured when no time is left."""
         return f"no time left of the budget of {self.request.budget:g} s"
 
     def write_record(self) -> None:
         self.record.write(self.folder / TRADEOFF_FILE)
 
     def choose_knobs(self, knobs: Mapping[str, list[T]]) -> dict[str, list[T]]:
-        """Return the values of the requested knobs; the record says which have no other value."""
+        """Return the values of the settings that the request names; record settings without another value."""
         chosen = {name: own for name, own in knobs.items() if not self.request.knobs or name in self.request.knobs}
         for name, own in chosen.items():
             if not own:
@@ -303,7 +306,7 @@ class TradeoffSession:
         return chosen
 
     def take_times(self, part: float) -> None:
-        """Time all points that lack rounds, until a share of the budget is used."""
+        """Measure frame times of all points that lack rounds, until the fraction ``part`` of the budget is used."""
         timed = []
         for number, point in enumerate(self.record.points):
             setup, config = self.point_setup(number)
@@ -317,13 +320,13 @@ class TradeoffSession:
         time_tradeoff_points(timed, self.request.repeats, views, deadline, note_round)
 
     def write_results(self, command: Callable[[Sequence[str]], str]) -> None:
-        """Write record, page and chart of the fronts; ``command`` returns the command that makes a point."""
+        """Write record, page and chart of the fronts; ``command`` returns the command that reproduces a point."""
         self.write_record()
         self.progress("pictures of the front", 0.0)
         write_tradeoff_page(self.folder, self.record.to_dict(), self._render_front_pictures(), command)
 
     def _render_front_pictures(self) -> dict[int, TradeoffPicture]:
-        """Return pictures of the fronts' points, of the view with most contrast, and the ground truth under -1."""
+        """Return point number -> picture of the points on the fronts, in the view with most contrast; -1: truth."""
         setup, _ = self.point_setup(0)
         view = max(setup.views, key=lambda one: float(setup.channels.display(one.image).var()))
         truth = setup.display(view.image)
@@ -338,7 +341,7 @@ class TradeoffSession:
 
 
 def check_knobs(request: TradeoffRequest, known: Iterable[str], owner: str) -> None:
-    """Raise ConfigError for a requested knob that is not ``known``; ``owner`` names the run or model that lacks it."""
+    """Raise ConfigError if the request names a setting that is not ``known``; ``owner`` is for the message."""
     for name in request.knobs:
         if name not in (names := list(known)):
             raise ConfigError(f"--vary {name}: no such setting of {owner}{nearest(name, names)}")

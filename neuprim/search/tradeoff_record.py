@@ -1,4 +1,4 @@
-"""Points of a trade-off, their Pareto fronts and combinations, and their record ``tradeoff.json``."""
+"""Points of a trade-off, their Pareto fronts, combinations of single changes, and the record ``tradeoff.json``."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ TRADEOFF_FILE, TRADEOFF_FOLDER = "tradeoff.json", "tradeoff"
 """Name of the record, and its folder in the directory of a finished run."""
 
 REFERENCE, COMBINED = "reference", "combined"
-"""Values of ``knob`` of the point that others are compared with, and of points that change several knobs."""
+"""Values of ``knob``: the point that others are compared with, and points that change several settings."""
 
 _DIGITS = 2  # decimals of PSNR that count on a front
 
@@ -29,7 +29,7 @@ _TRAINED = (
     *("turned", "length", "primitives", "parameters_per_primitive", "steps", "seconds"),
     *("centre_ms", "run_dir"),
 )
-"""Fields that the file has of every point, and more fields of trained models."""
+"""Fields of every point in the file, and additional fields of trained models."""
 
 _Positive = Annotated[float, Range(above=0)]
 T = TypeVar("T")
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 class Objectives(NamedTuple):
-    """Cost (less is better), quality (more is better), and the uncertainty of the cost."""
+    """Cost of a point (less is better), quality (more is better), and the uncertainty of the cost."""
 
     cost: float
     quality: float
@@ -47,10 +47,10 @@ class Objectives(NamedTuple):
 
 
 def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> list[T]:
-    """Return the Pareto front, best quality first.
+    """Return the points on the Pareto front of cost and quality, best quality first.
 
     Measured costs of equal points differ by chance. A point must therefore be cheaper than the next better one by more
-    than the uncertainty of both. Of equally good points the first stays, unless another is cheaper by as much.
+    than the sum of both uncertainties. The same holds for a point of equal quality to replace an earlier one.
     """
     known = [(o, p) for p in points if not math.isnan((o := objectives(p)).cost) and not math.isnan(o.quality)]
     front: list[tuple[Objectives, T]] = []
@@ -66,7 +66,9 @@ def pareto_front(points: Sequence[T], objectives: Callable[[T], Objectives]) -> 
 
 
 class ParetoStep(NamedTuple):
-    """A single change: the knob, its override, the gain (log of the cost's reduction) and the loss of quality."""
+    """A change of a single setting (``knob``): its override, its gain (log of the factor by which the cost drops), and
+    its loss of quality.
+    """
 
     knob: str
     override: str
@@ -75,10 +77,10 @@ class ParetoStep(NamedTuple):
 
 
 def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> list[tuple[str, ...]]:
-    """Return combinations of overrides along the expected front, one override per knob, two or more each.
+    """Return combinations of overrides that are expected on the Pareto front: two or more settings, one override each.
 
-    Gains and losses are assumed to add up; measuring the combinations corrects that. The next step is always the one
-    with the least loss per gain, of another knob or further along the same.
+    Gains and losses are assumed to add up; the combinations are measured later. Each combination adds to the previous
+    one the step with the least loss per gain, which changes another setting or changes the same setting further.
     """
     state: dict[str, ParetoStep] = {}
     chain: list[tuple[str, ...]] = []
@@ -99,7 +101,7 @@ def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> l
 def combine_pareto_steps(
     directions: Sequence[Sequence[ParetoStep]], known: Sequence[Sequence[str]], most: int
 ) -> list[tuple[str, ...]]:
-    """Return at most ``most`` new combinations, alternating between directions and evenly spread along each."""
+    """Return at most ``most`` new combinations, evenly spread along each direction's chain, taken in turn."""
     taken = {frozenset(overrides) for overrides in known}
     chains = [[way for way in chain_pareto_steps(steps) if frozenset(way) not in taken] for steps in directions]
     chosen: dict[frozenset[str], tuple[str, ...]] = {}
@@ -110,7 +112,7 @@ def combine_pareto_steps(
 
 
 def thin_pareto_chain(items: Sequence[T], most: int) -> list[T]:
-    """Return at most ``most`` of the items, evenly spread."""
+    """Return at most ``most`` items, evenly spread."""
     if len(items) <= most or most < 1:
         return list(items[: max(most, 0)])
     if most == 1:
@@ -123,15 +125,15 @@ def thin_pareto_chain(items: Sequence[T], most: int) -> list[T]:
 
 @dataclass
 class TradeoffPoint:
-    """A measured point: a way to draw a finished model, or a trained model.
+    """A measured point of a trade-off: a render configuration of a finished model, or a trained model.
 
     Attributes:
-        knob: the setting that it changes, or :data:`REFERENCE` or :data:`COMBINED`.
-        words: overrides that reproduce it.
-        quality: psnr, ssim, ssim_3dgs; lpips and lpips_3dgs where there are weights.
+        knob: the setting that the point changes, or :data:`REFERENCE` or :data:`COMBINED`.
+        words: overrides that reproduce the point.
+        quality: psnr, ssim, ssim_3dgs; lpips and lpips_3dgs if there are weights.
         bytes: size of the model file.
-        ms: mean milliseconds per frame in each round of timing; ratios: frame time over the reference's in each round.
-        turned, length: for trained models: overrides in addition to the centre's, and share of the full training.
+        ms: mean milliseconds per frame in each round; ratios: frame time divided by the reference's in each round.
+        turned, length: for trained models: overrides on top of the centre's, and fraction of the full training.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         run_dir: run directory, relative to the record's folder; empty unless trained.
     """
@@ -159,12 +161,12 @@ class TradeoffPoint:
 
     @property
     def ratio(self) -> float:
-        """Median frame time over the reference's."""
+        """Frame time divided by the reference's, median over rounds."""
         return statistics.median(self.ratios) if self.ratios else float("nan")
 
     @property
     def time(self) -> float:
-        """Milliseconds per frame; for trained models the centre's times the ratio, as rounds differ in load."""
+        """Milliseconds per frame; for trained models the centre's times the ratio, because load varies by round."""
         if self.centre_ms:
             return self.ratio * self.centre_ms
         return statistics.median(self.ms) if self.ms else float("nan")
@@ -175,7 +177,7 @@ class TradeoffPoint:
 
     @property
     def spread(self) -> float | None:
-        """Half of the interquartile range of the ratios; None for fewer than three ratios."""
+        """Half of the interquartile range of the ratios over rounds; None for fewer than three rounds."""
         if len(self.ratios) < 3:
             return None
         low, _, high = statistics.quantiles(self.ratios, n=4, method="inclusive")
@@ -183,13 +185,13 @@ class TradeoffPoint:
 
     @property
     def doubt(self) -> float:
-        """Uncertainty of the median ratio (McGill's notches); the ratio itself for fewer than three ratios."""
+        """Uncertainty of the median ratio (McGill's notches); the ratio itself for fewer than three rounds."""
         if self.spread is None:
             return self.ratio if self.ratios else 0.0
         return 3.14 * self.spread / len(self.ratios) ** 0.5
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values; times are derived, for readers of the file."""
+        """Return JSON-ready values, with derived times for readers of the file."""
         fields = asdict(self)
         quality = {
             key: entry for name, value in self.quality.items() for key, entry in metric_to_json(name, value).items()
@@ -204,7 +206,7 @@ class TradeoffPoint:
 
     @classmethod
     def from_dict(cls, data: Mapping[str, Any]) -> TradeoffPoint:
-        """Invert :meth:`to_dict`; raises KeyError, TypeError, ValueError or ConfigError for anything else."""
+        """Invert :meth:`to_dict`; raises KeyError, TypeError, ValueError or ConfigError for invalid values."""
         names = [name.removesuffix("_infinite") for name in data["quality"]]
         quality = {name: value for name in names if (value := metric_from_json(data["quality"], name)) is not None}
         own = {name: data[name] for name in (*_DRAWN, *(_TRAINED if data.get("run_dir") else ()))}
@@ -212,14 +214,14 @@ class TradeoffPoint:
 
 
 def name_variant(turned: Sequence[str], length: float) -> str:
-    """Return a readable name of a trained model."""
+    """Return a readable name of a trained model, made of its changed settings and training length."""
     words = [word.removeprefix("model.") for word in turned]
     return " ".join([*words, *([f"{length:g} of the length"] if length != 1.0 else [])]) or "centre"
 
 
 @dataclass(frozen=True)
 class LeftOutPoint:
-    """A point that was not measured, and why."""
+    """A point of a trade-off that was not measured, and the reason."""
 
     knob: str
     words: tuple[str, ...]
@@ -231,10 +233,11 @@ class TradeoffRecord:
     """Content of ``tradeoff.json``.
 
     Attributes:
-        same: what must be equal to keep points: model or configuration, settings, views, versions, machine.
+        same: facts that must be equal to reuse points: model or configuration, settings, views, versions, machine.
         facts: further facts for readers: the run, its data.
-        points: the reference first.
-        speed, size: numbers of the points on the fronts of time and of bytes against PSNR, best quality first.
+        points: measured points, the reference first.
+        speed, size: indices of the points on the Pareto fronts of PSNR against time and against bytes, best quality
+            first.
     """
 
     same: dict[str, Any]
@@ -245,17 +248,17 @@ class TradeoffRecord:
     size: list[int] = field(default_factory=list)
 
     def changes(self, same: Mapping[str, Any]) -> list[str]:
-        """Return the names whose values differ from those in ``same``."""
+        """Return the names of facts in the record that differ from those in ``same``."""
         return [name for name in same if self.same.get(name) != same[name]]
 
     def leave_out(self, knob: str, words: Sequence[str], reason: str) -> None:
-        """Note that a point is not measured; replaces an earlier note."""
+        """Note why a point is not measured; replaces an earlier note on the same point."""
         words = tuple(words)
         others = [one for one in self.left_out if (one.knob, one.words) != (knob, words)]
         self.left_out = [*others, LeftOutPoint(knob, words, reason)]
 
     def find_fronts(self, in_size: Callable[[TradeoffPoint], bool] = lambda point: True) -> None:
-        """Compute both fronts; that of size only considers points for which ``in_size`` is true."""
+        """Compute both Pareto fronts. The front of bytes only uses points for which ``in_size`` is true."""
         costs = [
             (Objectives(p.ratio, psnr := round(p.quality["psnr"], _DIGITS), p.doubt), Objectives(float(p.bytes), psnr))
             for p in self.points
@@ -265,7 +268,7 @@ class TradeoffRecord:
         self.size = pareto_front([i for i, p in enumerate(self.points) if in_size(p)], lambda i: costs[i][1])
 
     def to_dict(self) -> dict[str, Any]:
-        """Return JSON-able values."""
+        """Return JSON-ready values."""
         return {
             "format": _FORMAT,
             "same": self.same,
@@ -280,7 +283,7 @@ class TradeoffRecord:
 
 
 def read_tradeoff_record(path: Path) -> TradeoffRecord | None:
-    """Read ``tradeoff.json``; None where there is none.
+    """Read ``tradeoff.json``; None if it does not exist.
 
     Raises:
         DataError: the file is damaged.

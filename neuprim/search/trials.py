@@ -1,8 +1,8 @@
 """Short trainings that searches compare, in this process or as jobs of a launcher.
 
-A trial's folder is a run directory without report and pictures. Its ``trial.json`` holds the request and, once known,
-the outcome. A finished trial is read back, an interrupted one resumes from its checkpoint, and one that was made with
-other settings is trained anew.
+A trial's folder is a run directory without report and pictures. Its ``trial.json`` stores the request and, at the end,
+the outcome. A finished trial is not repeated, an interrupted one resumes from its checkpoint, and one with other
+settings is trained anew.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ from neuprim.search.model_quality import choose_trial_views, measure_trial_views
 TRIAL_FILE, _FORMAT = "trial.json", 1
 
 NOT_TRAINED_WITH = ("output_dir", "resume", "overrides", "non_default")
-"""Parts of a configuration that do not change the training."""
+"""Entries of a configuration that do not change the training."""
 
 _FEW_STEPS = 64  # with fewer steps, a single slow one would spoil the mean of their times
 
 
 @dataclass(frozen=True)
 class Trial:
-    """A training to make, in the ``output_dir`` of its configuration.
+    """Request for a short training, in the ``output_dir`` of its configuration.
 
     Attributes:
-        hold_out: n > 1: evaluate on every n-th training view, which is not trained on; 0: on the test views.
+        hold_out: n > 1: hold out every n-th training view for evaluation; 0: evaluate on the test views.
         views: evaluate at most this many views, evenly spread.
     """
 
@@ -53,7 +53,7 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a trial.
+    """Result of a trial, a short training.
 
     Attributes:
         psnr, ssim: means over the evaluation views, in the data set's colour space.
@@ -75,7 +75,7 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """Content of ``trial.json``: requested settings, largest number of evaluation views, and outcome."""
+    """Content of ``trial.json``: requested settings, largest number of evaluation views, outcome if finished."""
 
     asked: dict[str, Any]
     views: int
@@ -83,11 +83,11 @@ class TrialRecord:
 
 
 class TrialFailed(NeuprimError):
-    """A launched trial failed; the text says why."""
+    """A launched trial failed; the message says why."""
 
 
 def read_trial(folder: Path) -> TrialRecord | None:
-    """Return the record of the trial in a folder; None where there is none.
+    """Read the record of the trial in a folder; None if there is none.
 
     Raises:
         DataError: ``trial.json`` is damaged.
@@ -110,7 +110,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
     Raises:
         DataError: the folder holds another run, or a damaged ``trial.json``.
-        NeuprimError: as :func:`neuprim.runs.run.run`.
+        NeuprimError: the errors of :func:`neuprim.runs.run.run`.
     """
     config, folder = trial.config, trial.config.output_dir
     with lock_run_directory(folder, "trial"):
@@ -164,7 +164,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
 
 def _trial_request(trial: Trial) -> dict[str, Any]:
-    """Return the settings that must be equal to reuse a folder, as JSON reads them back."""
+    """Return the settings that must be equal to reuse a trial's folder, as they look after reading them from JSON."""
     config = replace(trial.config, made_by=current_config_provenance(trial.config, load_config_task(trial.config)))
     settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))
@@ -177,7 +177,7 @@ _trial_datasets: dict[str, Dataset] = {}  # scene of this worker's last trial; a
 
 
 def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outcome:
-    """Run the trial of a job; ``trial.json`` decides whether it resumes."""
+    """Run a trial as a launcher's job. The trial resumes if its ``trial.json`` has the same request."""
     config = RunConfig.from_dict(data["config"])
     key = json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True)
     if key not in _trial_datasets:
@@ -189,14 +189,14 @@ def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outc
 def launch_trials(
     trials: Sequence[Trial], settings: LauncherSettings, folder: Path, progress: Callable[[float], None]
 ) -> list[JobResult]:
-    """Run trials as jobs in the folder of a search; returns results with outcomes, or why one failed, in their order.
+    """Run trials as launcher jobs in the folder of a search; return for each its outcome, or why it failed.
 
     Args:
         progress: called with the finished fraction.
 
     Raises:
-        KeyboardInterrupt: after Ctrl-C; finished work is kept.
-        RuntimeError: a bug in a job, with its traceback.
+        KeyboardInterrupt: after Ctrl-C; finished trials stay on disk, unfinished ones have checkpoints.
+        RuntimeError: a job failed because of a bug; the message has its traceback.
     """
     call, jobs = f"{run_trial_job.__module__}:{run_trial_job.__name__}", []
     for number, trial in enumerate(trials):
@@ -222,7 +222,7 @@ def launch_trials(
 
 
 def get_trial_setting(config: RunConfig, key: str) -> Any:
-    """Return a setting by its key on the command line; None where the configuration lacks it."""
+    """Return the value of a setting by its key on the command line; None if the configuration lacks it."""
     node: Any = config.to_dict()
     for part in key.split("."):
         node = node.get(part) if isinstance(node, Mapping) else None

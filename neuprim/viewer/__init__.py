@@ -1,1 +1,1 @@
-"""Live viewer: shows a model in a browser, after or during its training; drawn here, in a page made with viser."""
+"""Live viewer: render a model in this process and show the images in a browser page, after or during the training."""

@@ -1,4 +1,4 @@
-"""The open pages of a viewer and their controls: conditions, render settings, held-out views, primitives."""
+"""The controls of a viewer's page (conditions, render settings, held-out views, primitives), and its open pages."""
 
 from __future__ import annotations
 
@@ -38,13 +38,15 @@ _YELLOW = np.array([[255, 210, 0]], np.uint8)
 
 
 def format_viewer_condition(spec: ConditionSpec, value: Tensor, world: World) -> str:
-    """Write a condition's value as ``neuprim render`` takes it."""
+    """Return a condition's value as text, in the form that ``neuprim render`` takes."""
     digits = 4 if spec.place is None or world.identity else 10
     return ",".join(f"{x:.{digits}g}" for x in spec.given(value, world).flatten().tolist())
 
 
 class ConditionControls:
-    """Controls of each condition: text, slider if its range is bounded, handle if it is a position, play button."""
+    """Controls of each condition: a text field and a play button, a slider if the condition's range is bounded, and a
+    draggable handle if the condition is a position.
+    """
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -53,7 +55,7 @@ class ConditionControls:
             self._add_condition(spec)
 
     def refresh_conditions(self) -> None:
-        """Show the session's conditions in the controls."""
+        """Show the current conditions of the page's session in the controls."""
         for name, update in self._updaters.items():
             update(self.session.conditions[name])
 
@@ -91,7 +93,7 @@ class ConditionControls:
         return format_viewer_condition(spec, self.session.conditions[spec.name], self.session.scene.world)
 
     def _add_handle(self, spec: ConditionSpec) -> Any:
-        """Add a draggable handle for a position in the scene."""
+        """Add a draggable handle to the 3D scene for a condition that is a position."""
         if spec.shape != (3,) or "scene units" not in spec.unit:
             return None
         value, scene = self.session.conditions[spec.name], self.session.client.scene
@@ -126,7 +128,7 @@ class ConditionControls:
             self._updaters[spec.name](value, typed)
 
     def _play(self, spec: ConditionSpec, text: str, box: Any) -> None:
-        """Animate the condition until the box is cleared."""
+        """Animate the condition until the user clears the checkbox."""
         session = self.session
         try:
             values = self._parse(spec, text)
@@ -154,7 +156,7 @@ class ConditionControls:
 
 
 class RenderControls:
-    """Controls of the quantity, the resolution and the render settings."""
+    """Controls of the rendered quantity, the resolution and the render settings."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -188,7 +190,7 @@ class RenderControls:
 
 
 class ViewControls:
-    """A list of held-out views. Choosing one moves the camera there and shows ground truth, rendering and PSNR."""
+    """List of held-out views. Choosing one moves the camera there and shows ground truth, rendering and PSNR."""
 
     def __init__(self, session: Session, on_jump: Callable[[], None]) -> None:
         self.session, self._on_jump = session, on_jump
@@ -232,7 +234,7 @@ class ViewControls:
 
 
 class PrimitiveControls:
-    """Controls that draw ellipsoids over the image and describe a chosen primitive."""
+    """Controls that draw the primitives' ellipsoids over the image and describe a chosen primitive."""
 
     def __init__(self, session: Session) -> None:
         self.session = session
@@ -318,7 +320,7 @@ class PrimitiveControls:
 
 
 class SessionManager:
-    """Create a session for each opened page, and drop it when the page closes; ``sessions`` has those of open pages."""
+    """Create a session for each opened page and drop it when the page closes; ``sessions`` has the open ones."""
 
     def __init__(
         self,
@@ -331,7 +333,7 @@ class SessionManager:
 
         Args:
             server: a :class:`~neuprim.viewer.server.ViewerServer`.
-            add_training: function that fills the tab of a training.
+            add_training: function that adds the controls of a running training to a page.
         """
         self.server, self.scene, self.queue, self._add_training = server, scene, queue, add_training
         self.sessions: dict[int, Session] = {}

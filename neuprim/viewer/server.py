@@ -1,11 +1,11 @@
-"""The viewer's web server: viser behind a check of its visitors and of their messages.
+"""The viewer's web server: viser with checks of every request and every message.
 
 viser accepts every client, including any web page open in the user's browser, because browsers let pages open
-WebSockets to this machine. So a visitor needs a secret token, the server's own host name, and its own page as origin.
-The printed address holds the token; the page receives it as a cookie, which other sites' pages cannot send.
+WebSockets to this machine. So a request needs a secret token, the server's own host name, and the viewer's page as
+origin. The printed address contains the token. The page gets it as a cookie, which other sites' pages cannot send.
 
-viser does not check messages either. A message passes only if the page's own code sends such messages, and a control's
-value only if the control, as it was created, can take it. Every message goes through :class:`ViewerConnection`.
+viser does not check messages either. :class:`ViewerConnection` passes a message only if the page's own code sends
+messages of this type. It passes a control's value only if the control can take this value.
 
 Importing this module raises BackendUnavailable if viser is missing.
 """
@@ -53,11 +53,11 @@ _POLICY = (
 
 
 class TokenAuth:
-    """Check requests to one server that listens on ``host``.
+    """Check of the requests to one viser server, by a secret token.
 
     Attributes:
-        token: random, 43 characters.
-        installed: whether a server has started behind the check.
+        token: random text of 43 characters.
+        installed: whether a server with this check has started.
     """
 
     def __init__(self, host: str) -> None:
@@ -68,17 +68,17 @@ class TokenAuth:
         self._hosts = tuple(dict.fromkeys(x.lower() for x in ("localhost", "127.0.0.1", "[::1]", *own, listens)))
 
     def page_address(self, host: str, port: int) -> str:
-        """Return the address to open in a browser."""
+        """Return the address to open in a browser, with the token."""
         return f"http://{f'[{host}]' if ':' in host else host}:{port}/?token={self.token}"
 
     @contextlib.contextmanager
     def guard_server(
         self, check_message: Callable[[Any], str | None], on_refusal: Callable[[Any, str], None]
     ) -> Iterator[None]:
-        """Put the checks before every viser server started inside; see :attr:`installed` afterwards.
+        """Context manager: add the checks to every viser server started inside; then read :attr:`installed`.
 
-        viser passes its own request hook to ``websockets.asyncio.server.serve`` and offers no way to add one. So
-        ``serve`` is replaced while viser starts. A proxy in front would leave viser's own port open to every page.
+        viser passes its own request hook to ``websockets.asyncio.server.serve`` and offers no way to add another hook.
+        Therefore ``serve`` is replaced while viser starts. A proxy would leave viser's own port open to every page.
         The arguments are those of :class:`ViewerConnection`.
         """
         original = websocket_server.serve
@@ -96,7 +96,7 @@ class TokenAuth:
             websocket_server.serve = original  # type: ignore[misc]
 
     def guard_requests(self, inner: Callable[..., Any] | None) -> Callable[[Any, Any], Any]:
-        """Wrap a websockets request hook (connection, request) in the check."""
+        """Return a websockets request hook (connection, request) that checks the request and then calls ``inner``."""
 
         def check(connection: Any, request: Any) -> Any:
             reason = self.refuse_request(request.path, request.headers)
@@ -115,7 +115,7 @@ class TokenAuth:
         return check
 
     def refuse_request(self, path: str, headers: Any) -> str | None:
-        """Return why a request (its path with the query, websockets ``Headers``) is refused, None if it is allowed."""
+        """Return why a request (path with query, websockets ``Headers``) is refused; None if it is allowed."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             return "no host, or several"
@@ -133,7 +133,7 @@ class TokenAuth:
     def _is_own_name(self, host: str) -> bool:
         """Return whether ``host`` is a name of this server.
 
-        A server that listens on every address also answers to any IP address, which nobody can rebind.
+        A server that listens on all addresses accepts any IP address as its name, because DNS rebinding needs a name.
         """
         name = re.sub(r":\d+$", "", host).lower()
         return name in self._hosts or (_is_unspecified_viewer_host(self._hosts[-1]) and _parse_ip(name) is not None)
@@ -152,7 +152,7 @@ def _is_unspecified_viewer_host(host: str) -> bool:
 
 
 def _cookie_name(host: str) -> str:
-    """Return the cookie's name. It contains the port, because browsers send cookies to all ports of a host."""
+    """Return the cookie's name. The name contains the port, because browsers send cookies to all ports of a host."""
     return f"neuprim-{host.rpartition(':')[2] if re.search(r':[0-9]+$', host) else '80'}"
 
 
@@ -169,7 +169,7 @@ _Name = Annotated[str, Meta(max_length=1024)]
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """Base class of the messages that the page needs. viser has more: uploads, commands, tunnels that share a page."""
+    """Base class of the messages that the page needs. viser has more, e.g. uploads, commands, shared pages."""
 
 
 class ViewerCameraMessage(_Message):
@@ -223,7 +223,9 @@ _DECODER = msgspec.msgpack.Decoder(_KINDS)
 
 
 class ViewerConnection(websocket_server.ServerConnection):
-    """Connection that drops messages if ``check_message`` returns a reason, and calls ``on_refusal(self, reason)``."""
+    """WebSocket connection that drops every message for which ``check_message`` returns a reason, and then calls
+    ``on_refusal(self, reason)``.
+    """
 
     def __init__(
         self,
@@ -242,7 +244,7 @@ class ViewerConnection(websocket_server.ServerConnection):
 
 
 def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> str | None:
-    """Return why a message is dropped, None if it passes; ``find_control`` returns viser's handle of an id or None."""
+    """Return why a message must be dropped, else None; ``find_control`` returns viser's handle of a control id."""
     if not isinstance(message, bytes):
         return "a message in text; expected msgpack"
     try:
@@ -262,7 +264,7 @@ def refuse_message(message: bytes | str, find_control: Callable[[str], Any]) -> 
 
 
 def refuse_control_value(handle: Any, value: Any) -> str | None:
-    """Return why a control cannot take a value, by the type, choices and bounds that it was created with."""
+    """Return why a control cannot take a value; None if it can. The control's type, choices and bounds decide."""
     now, props = handle._impl.value, handle._impl.props
     options, low, high, step = (getattr(props, name, None) for name in ("options", "min", "max", "step"))
     if getattr(props, "disabled", False):
@@ -289,21 +291,21 @@ def refuse_control_value(handle: Any, value: Any) -> str | None:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only this machine can reach a server on this host."""
+    """Return whether a server that listens on this host can only be reached from this machine."""
     address = _parse_ip(host)
     return host == "localhost" or (address is not None and address.is_loopback)
 
 
 class ViewerServer:
-    """A running viser server.
+    """A running viser server whose requests and messages are checked.
 
     Attributes:
         viser: the ``ViserServer``.
         address: address of the page, with the token.
 
     Raises:
-        ConfigError: host or port are unavailable.
-        BackendUnavailable: a version of viser that cannot be checked.
+        ConfigError: the host or port is not available.
+        BackendUnavailable: the installed version of viser does not support the checks.
     """
 
     def __init__(self, settings: ViewerSettings, title: str) -> None:
@@ -332,7 +334,9 @@ class ViewerServer:
     def on_client(
         self, connect: Callable[[Any], None], disconnect: Callable[[Any], None], refuse: Callable[[int, str], None]
     ) -> None:
-        """Set callbacks for opened and closed pages (``viser.ClientHandle``) and refused messages (id, reason)."""
+        """Set callbacks for opened and closed pages (called with ``viser.ClientHandle``) and for refused messages
+        (called with the page's id and the reason).
+        """
         self._on_refusal = refuse
         self.viser.on_client_connect(connect)
         self.viser.on_client_disconnect(disconnect)
@@ -353,7 +357,7 @@ class ViewerServer:
 
 
 def _free_viewer_port(host: str, port: int) -> int:
-    """Return a free port: this one, or any for 0."""
+    """Return ``port`` if it is free, or any free port for 0."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, number, _, address = found[0]

@@ -1,6 +1,7 @@
-"""One open page: its camera, what it shows, the images that it is sent, and the queue of jobs that draw them.
+"""One open page of the viewer: its camera, conditions and settings, and the queue of jobs that render its images.
 
-A still image is drawn fully. While something moves, the resolution is as high as time allows.
+While camera or conditions change, images have the resolution that can be rendered smoothly. When the changes stop, the
+image is rendered at full resolution.
 """
 
 from __future__ import annotations
@@ -39,9 +40,9 @@ class _Job(NamedTuple):
 
 
 class RenderQueue:
-    """Queue of jobs by key. A new job replaces a waiting job of its key, so a moving camera leaves no backlog.
+    """Queue of render jobs. A new job replaces a waiting job with the same key, so a moving camera causes no backlog.
 
-    All methods are thread-safe. Jobs run on the one thread that may use the model, which calls :meth:`work`.
+    All methods are thread-safe. Only one thread may use the model; it calls :meth:`work` to run the jobs.
     """
 
     def __init__(self) -> None:
@@ -56,13 +57,14 @@ class RenderQueue:
         delay: float = 0.0,
         replace: bool = True,
     ) -> None:
-        """Queue a job.
+        """Add a job to the queue.
 
         Args:
             key: (client, kind of work).
+            run: the job.
             on_error: called with the exception that ends the job.
-            delay: seconds to wait at least.
-            replace: False keeps a waiting job of the same key instead.
+            delay: least number of seconds before the job runs.
+            replace: False: if a job with the same key waits, keep that job and drop the new one.
         """
         with self._changed:
             if replace or key not in self._jobs:
@@ -70,17 +72,17 @@ class RenderQueue:
                 self._changed.notify_all()
 
     def drop_client(self, client: Hashable) -> None:
-        """Remove all jobs of a client."""
+        """Remove all waiting jobs of a client."""
         with self._changed:
             self._jobs = {key: job for key, job in self._jobs.items() if key[0] != client}
 
     @property
     def pending(self) -> bool:
-        """Whether any job waits, due or not."""
+        """Whether any job waits in the queue, even if its delay has not passed."""
         return bool(self._jobs)
 
     def work(self, timeout: float) -> bool:
-        """Run one due job, waiting up to ``timeout`` seconds for it; return whether there was one."""
+        """Run one job whose delay has passed; wait up to ``timeout`` seconds for one. Return whether a job ran."""
         job = self._take(timeout)
         if job is None:
             return False
@@ -91,7 +93,7 @@ class RenderQueue:
         return True
 
     def _take(self, timeout: float) -> _Job | None:
-        """Remove and return the job that has been due longest."""
+        """Remove and return the waiting job whose delay passed first; None if none is due within ``timeout``."""
         end = time.monotonic() + timeout
         with self._changed:
             while True:
@@ -105,7 +107,7 @@ class RenderQueue:
 
 
 def next_resolution(resolution: float, seconds: float) -> float:
-    """Return the fraction of the resolution for the next image during motion, from the time of the last image."""
+    """Return the resolution factor of the next image during motion, from factor and time of the last image."""
     if seconds > _SMOOTH_SECONDS:
         return max(resolution / 2, _MIN_RESOLUTION)
     return min(resolution * 2, 1.0) if seconds < _SMOOTH_SECONDS / 4 else resolution
@@ -113,7 +115,7 @@ def next_resolution(resolution: float, seconds: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class ViewerPose:
-    """A page's camera without the size of its window.
+    """A page's camera without an image size: pose and field of view.
 
     Attributes:
         wxyz: (4,) unit quaternion, camera to world, OpenCV axes (x right, y down, z forward).
@@ -127,7 +129,7 @@ class ViewerPose:
 
     @classmethod
     def from_camera(cls, camera: Camera) -> ViewerPose:
-        """Convert a camera; its principal point is lost."""
+        """Convert a camera; its principal point is dropped."""
         view = camera.viewmat.detach().double().cpu().numpy()
         x, y, z, w = Rotation.from_matrix(view[:3, :3].T).as_quat()
         position, fov = -view[:3, :3].T @ view[:3, 3], 2 * math.atan(0.5 * camera.height / camera.fy)
@@ -135,12 +137,12 @@ class ViewerPose:
 
     @property
     def rotation(self) -> np.ndarray:
-        """(3, 3) camera to world."""
+        """Rotation matrix from camera to world, (3, 3)."""
         w, x, y, z = self.wxyz
         return np.asarray(Rotation.from_quat([x, y, z, w]).as_matrix())
 
     def to_camera(self, width: int, height: int) -> Camera:
-        """Return the pinhole camera of a window of this size, with a centred principal point."""
+        """Return the pinhole camera for a window of this size, with a centred principal point."""
         viewmat = torch.eye(4, dtype=torch.float64)
         viewmat[:3, :3] = torch.from_numpy(self.rotation.T)
         viewmat[:3, 3] = torch.from_numpy(-self.rotation.T @ np.asarray(self.position, np.float64))
@@ -149,27 +151,27 @@ class ViewerPose:
 
 
 def fit_viewer_size(size: Sequence[int], longest: float) -> tuple[int, int]:
-    """Scale (width, height) down to at most ``longest`` pixels a side, at least 1."""
+    """Scale (width, height) down so that the longer side has at most ``longest`` pixels; each side keeps at least 1."""
     scale = min(1.0, longest / max(*size, 1))
     return max(1, round(scale * size[0])), max(1, round(scale * size[1]))
 
 
 class Session:
-    """State of one page. Methods are thread-safe; whatever uses the model goes through the queue.
+    """State of one open page. Methods are thread-safe; every use of the model is a job in the queue.
 
     Attributes:
         client: a ``viser.ClientHandle``.
-        training: whether the model changes by itself.
+        training: whether a training changes the model.
         closed: whether the page was closed.
         quantity: one of :func:`~neuprim.viewer.viewer_scene.list_viewer_quantities`.
         conditions: every condition of the task.
         settings: render settings of the image.
-        longest: pixels on the longer side of the full image.
-        on_full_image: called after every full image, on the thread that has the model.
+        longest: pixels on the longer side of the image at full resolution.
+        on_full_image: called after every full-resolution image, on the thread that may use the model.
     """
 
     def __init__(self, client: Any, scene: ViewerScene, queue: RenderQueue, training: bool = False) -> None:
-        """Show the scene's start view, then follow the page's camera."""
+        """Move the page's camera to the scene's start view, then follow the camera."""
         self.client, self.scene, self.queue, self.training = client, scene, queue, training
         self.closed = False
         self.quantity, self.longest = COLOUR, DEFAULT_LONGEST
@@ -184,22 +186,22 @@ class Session:
         self.redraw()
 
     def close(self) -> None:
-        """Drop the jobs of a closed page."""
+        """Drop the waiting jobs of the page, which was closed."""
         self.closed = True
         self.queue.drop_client(self.client.client_id)
 
     def set_status(self, text: str) -> None:
-        """Show one line of text in the page."""
+        """Show one line of status text in the page."""
         if not self.closed:
             self._status.value = text
 
     def notify(self, text: str, colour: str = "blue") -> None:
-        """Show a notification that stays until it is closed."""
+        """Show a notification in the page that stays until the user closes it."""
         if not self.closed:
             self.client.add_notification("neuprim", " ".join(text.split()), color=colour, with_close_button=True)
 
     def report_error(self, error: Exception) -> None:
-        """Show an error in the page, and the traceback of an unexpected one on the console."""
+        """Show an error in the page; print the traceback of an unexpected error on the console."""
         if isinstance(error, NeuprimError | OSError):
             self.notify(str(error), "red")
         else:
@@ -207,8 +209,8 @@ class Session:
             self.notify(f"{type(error).__name__}: {error}", "red")
 
     def set_camera(self, pose: ViewerPose) -> None:
-        """Move the page's camera. Dragging then turns it around the point ahead that is closest to the scene's
-        centre."""
+        """Move the page's camera. Dragging then turns the camera around the point on its viewing axis that is closest
+        to the scene's centre."""
         forward = pose.rotation[:, 2]
         offset = self.scene.center - pose.position
         ahead = max(float(forward @ offset), 1e-2 * float(np.linalg.norm(offset))) or 1.0
@@ -220,7 +222,7 @@ class Session:
             camera.fov = pose.fov
 
     def viewpoint(self, resolution: float = 1.0) -> Viewpoint:
-        """Return the viewpoint that the page shows now, at a fraction of its resolution."""
+        """Return the page's current viewpoint, at a fraction of its resolution."""
         camera = self.client.camera
         pose = ViewerPose(camera.wxyz.copy(), camera.position.copy(), float(camera.fov))
         size = fit_viewer_size((camera.image_width or 1, camera.image_height or 1), self.longest)
@@ -228,28 +230,32 @@ class Session:
         return Viewpoint(pose.to_camera(*reduced), dict(self.conditions), self.quantity)
 
     def set_conditions(self, values: Mapping[str, Tensor]) -> None:
-        """Change conditions and redraw."""
+        """Change values of conditions, e.g. the time, and render the page's image again."""
         self.conditions.update(values)
         self.redraw()
 
     def set_settings(self, settings: RenderSettings) -> None:
-        """Change the render settings and redraw."""
+        """Change the render settings and render the page's image again."""
         self.settings = settings
         self.redraw()
 
     def submit(self, kind: str, run: Callable[[], None], delay: float = 0.0, replace: bool = True) -> None:
-        """Queue a job for the thread that has the model; its errors appear in the page."""
+        """Queue a job for the thread that may use the model. Errors of the job appear in the page."""
         self.queue.submit((self.client.client_id, kind), run, self.report_error, delay, replace)
 
     def redraw(self) -> None:
-        """Queue an image at the resolution that time allows, and then the full image if nothing changes any more."""
+        """Queue an image at a resolution that keeps motion smooth, then a full-resolution image when nothing
+        changes."""
         self.submit("picture", self._draw_fast)
 
     def draw(self, full: bool = False) -> bool:
-        """Draw and send an image, by default at a resolution that is smooth; only for the thread that has the model.
+        """Render an image and send it to the page. Only call this on the thread that may use the model.
+
+        Args:
+            full: render at full resolution, instead of one that keeps motion smooth.
 
         Returns:
-            Whether it had the full resolution.
+            Whether the image had full resolution.
         """
         resolution = 1.0 if full else self._resolution
         picture = self.scene.draw(self.viewpoint(resolution), self.settings)

@@ -1,7 +1,8 @@
 """Viewers of a finished run, ``neuprim view``, and of a running training.
 
-A training is drawn between two steps, on its own thread. The model is bit-identical to one trained without a viewer.
-Time spent here does not count towards the budget. Without open pages a step costs one check of the queue.
+During a training, images are rendered between two training steps, on the training thread. The trained model is
+bit-identical to one trained without a viewer. Rendering time does not count towards the budget. Without open pages the
+viewer only checks its queue once per step.
 """
 
 from __future__ import annotations
@@ -42,13 +43,13 @@ def view_run(
     progress: Callable[[str, float], None] = lambda text, fraction: None,
     end: threading.Event | None = None,
 ) -> None:
-    """Show a finished run in the browser until ``end`` is set or Ctrl-C.
+    """Show a finished run in the browser until ``end`` is set or the user presses Ctrl-C.
 
     Args:
         on_open: function that is called with the address of the page, including its token.
 
     Raises:
-        CheckpointError: a file is missing or damaged.
+        CheckpointError: a file of the run is missing or damaged.
         ConfigError: a setting is wrong.
     """
     end = end or threading.Event()
@@ -70,10 +71,10 @@ def view_run(
 
 
 class TrainingProgress:
-    """Event listener that collects a run's progress for its pages.
+    """Event listener that collects a training's progress for the viewer's pages.
 
     Attributes:
-        fraction: used part of the budget, 0..1.
+        fraction: used fraction of the budget, 0..1.
         text: what the run does now.
         curves: finite (step, PSNR in dB) of the training views, smoothed, and of the held-out views.
     """
@@ -100,7 +101,7 @@ class TrainingProgress:
 
 
 class TrainingControls:
-    """Progress, buttons and PSNR curves of one page."""
+    """Controls of a running training in one page: progress, buttons and PSNR curves."""
 
     def __init__(self, session: Session, training: LiveTraining) -> None:
         self.session, self.training = session, training
@@ -118,7 +119,7 @@ class TrainingControls:
         self._folder = gui.add_folder("PSNR, dB")
 
     def refresh_progress(self) -> None:
-        """Show the current numbers."""
+        """Show the current progress and PSNR curves."""
         progress = self.training.progress
         self._text.value, self._bar.value = progress.text, 100 * progress.fraction
         if self._pause.value != self.training.paused:
@@ -148,16 +149,18 @@ class TrainingControls:
 
 
 class LiveTraining:
-    """Context manager around a run: an event listener whose :meth:`between` is called between steps.
+    """Viewer of a running training: a context manager around the run, and a listener for its events.
+
+    The training calls :meth:`between` between its steps.
 
     Raises:
-        ConfigError, BackendUnavailable: as :class:`~neuprim.viewer.server.ViewerServer`.
+        ConfigError, BackendUnavailable: those of :class:`~neuprim.viewer.server.ViewerServer`.
     """
 
     def __init__(
         self, settings: ViewerSettings, config: RunConfig, on_open: Callable[[str], None], events: Events
     ) -> None:
-        """Start the server; call ``on_open`` with its address. Every event is passed on to ``events``."""
+        """Start the server; call ``on_open`` with its address. Every event is also passed to ``events``."""
         self.config, self.events = config, events
         self.queue, self.progress, self.paused = RenderQueue(), TrainingProgress(), False
         self._steps, self._save, self._stop = 0, False, False
@@ -191,7 +194,7 @@ class LiveTraining:
         self.paused = paused
 
     def step_once(self) -> None:
-        """Run one step of a paused training."""
+        """Run one training step while the training is paused."""
         self.pause(True)
         self._steps += 1
 
@@ -200,13 +203,13 @@ class LiveTraining:
         self._save = True
 
     def stop(self) -> None:
-        """End the training as Ctrl-C does: evaluated, reported and resumable."""
+        """End the training like Ctrl-C: the run is evaluated, gets a report, and can be resumed."""
         self._stop = True
 
     # Called by the training.
 
     def between(self, fitted: Fitted, stop: threading.Event) -> None:
-        """Serve the pages; see :data:`~neuprim.runs.training.BetweenSteps`."""
+        """Render images and carry out requests of the pages; see :data:`~neuprim.runs.training.BetweenSteps`."""
         if self._sessions is None:
             scene = self._make_scene(fitted)
             self._sessions = SessionManager(
@@ -221,7 +224,7 @@ class LiveTraining:
             self._update_pages()
 
     def _carry_out_orders(self, fitted: Fitted, stop: threading.Event) -> bool:
-        """Carry out what pages requested (stop, save, one step); return whether the training stays paused."""
+        """Carry out what pages requested (stop, save, one step); return whether the training is still paused."""
         if self._stop:
             stop.set()
         if self._save:

@@ -1,4 +1,4 @@
-"""The model that a viewer shows: drawing it from a viewpoint, held-out views, and its primitives."""
+"""The model that a viewer shows: render it from a viewpoint, compare held-out views, and list its primitives."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ _MAX_NUMBERS = 24  # values of a parameter that are written out
 
 @dataclass(frozen=True, eq=False)
 class Viewpoint:
-    """Viewpoint of a page: camera, every condition of the task, and one of :func:`list_viewer_quantities`."""
+    """What a page shows: camera, values of the task's conditions, and a quantity of :func:`list_viewer_quantities`."""
 
     camera: Camera
     conditions: Mapping[str, Tensor] = field(default_factory=dict)
@@ -54,7 +54,7 @@ class Viewpoint:
 
 
 class Picture(NamedTuple):
-    """A drawn image, (H, W, 3) uint8 sRGB; the meaning of its colours, may be empty; and the time that it took."""
+    """A rendered image, (H, W, 3) uint8 sRGB; a caption for its colours, may be empty; and the render time."""
 
     image: np.ndarray
     caption: str
@@ -62,23 +62,23 @@ class Picture(NamedTuple):
 
 
 def list_viewer_quantities(channels: Channels) -> list[str]:
-    """Return the names of the quantities to show: colour, alpha, depth, and each channel if there are several."""
+    """Return the quantities that a page can show: colour, alpha, depth, and each channel if there are several."""
     return [COLOUR, ALPHA, DEPTH, *(f"channel {name}" for name in channels.names if channels.count > 1)]
 
 
 @dataclass(eq=False)
 class ViewerScene:
-    """A model to show, with facts from its task and data. One thread at a time may call the methods.
+    """A model to show, with facts from its task and data. Only one thread at a time may call the methods.
 
     Attributes:
         name: name of the run.
-        model: returns the current model.
+        model: function that returns the current model.
         settings: render settings of the run.
         background: (C,) colour behind everything.
         up: (3,) upward direction.
         center: (3,) point that a camera turns around, scene units.
         world: coordinates in which positions are typed and shown.
-        dataset: for held-out views; None if its files are gone.
+        dataset: data set with the held-out views; None if its files cannot be read.
     """
 
     name: str
@@ -93,12 +93,12 @@ class ViewerScene:
     dataset: Dataset | None = None
 
     def draw(self, viewpoint: Viewpoint, settings: RenderSettings) -> Picture:
-        """Draw the current model.
+        """Render the current model from a viewpoint.
 
-        Depth is camera z, averaged along each ray, shown from its 2nd to its 98th percentile.
+        Depth is the camera's z, averaged along each ray. Its colours range from the 2nd to the 98th percentile.
 
         Raises:
-            NeuprimError: the renderer refuses.
+            NeuprimError: the backend cannot render the model with these settings.
         """
         start = time.perf_counter()
         camera, channels = viewpoint.camera, self.channels
@@ -124,22 +124,22 @@ class ViewerScene:
 
     @cached_property
     def view_indices(self) -> Mapping[str, int]:
-        """Name -> index of the held-out views with a pinhole camera."""
+        """View name -> index, for the held-out views with a pinhole camera."""
         if self.dataset is None:
             return {}
         views = self.dataset.test
         return {view.name: i for i in range(len(views)) if isinstance((view := views.view(i)).camera, Camera)}
 
     def load_view(self, name: str) -> View:
-        """Return a held-out view of :attr:`view_indices`."""
+        """Return the held-out view with this name, see :attr:`view_indices`."""
         assert self.dataset is not None
         return self.dataset.test.view(self.view_indices[name])
 
     def compare_view(self, name: str) -> tuple[np.ndarray, np.ndarray, float]:
-        """Draw a held-out view and compare it with its ground truth, as ``metrics.json`` does.
+        """Render a held-out view and compare it with its ground truth, like ``metrics.json``.
 
         Returns:
-            Ground truth and rendering, (H, W, 3) uint8 sRGB, and their PSNR in dB.
+            Ground truth and rendering, (H, W, 3) uint8 sRGB, and the PSNR of the rendering in dB.
         """
         assert self.dataset is not None
         view, pixels = self.load_view(name), self.dataset.test.pixels(self.view_indices[name])
@@ -150,7 +150,7 @@ class ViewerScene:
 
     @cached_property
     def start_view(self) -> View:
-        """Initial view: the held-out view with most contrast, else the whole model from the side."""
+        """First view of a page: the held-out view with most contrast, else the whole model from the side."""
         if self.dataset is not None:
             views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES)
             if views:
@@ -172,10 +172,10 @@ class ViewerScene:
 def open_viewer_scene(
     run_dir: Path, warn: Callable[[str], None], progress: Callable[[str, float], None]
 ) -> ViewerScene:
-    """Open a finished run. If its data cannot be read there are no held-out views, with a warning.
+    """Load a finished run for a viewer. If its data cannot be read, warn and offer no held-out views.
 
     Raises:
-        CheckpointError, ConfigError: naming the file that is missing or damaged.
+        CheckpointError, ConfigError: a file of the run is missing or damaged.
     """
     run = load_run(run_dir)
     task, model, header = run.task, run.model, run.header
@@ -209,7 +209,7 @@ def _to_viewer_grey(values: Tensor) -> np.ndarray:
 
 
 def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarray, str]:
-    """Return depth as (H, W, 3) uint8 colours, bright where near and black where empty, and a caption."""
+    """Convert depth to (H, W, 3) uint8 colours, bright where near and black where empty; also return a caption."""
     solid = alpha > _MIN_ALPHA
     image = np.zeros((*depth.shape, 3), np.uint8)
     if not solid.any():
@@ -224,12 +224,12 @@ def _colour_viewer_depth(depth: np.ndarray, alpha: np.ndarray) -> tuple[np.ndarr
 
 
 class FrameEllipsoids(NamedTuple):
-    """M ellipsoids of a frame, float32, scene units.
+    """The ellipsoids of M primitives from one viewpoint, float32, scene units.
 
     Attributes:
-        rows: (M,) rows of the model.
-        positions: (M, 3); wxyz: (M, 4) unit quaternions; scales: (M, 3) semi-axes.
-        colours: (M, 3) uint8 sRGB at their centres, as seen from the frame's camera.
+        rows: (M,) indices of the primitives in the model.
+        positions: (M, 3) centres; wxyz: (M, 4) unit quaternions; scales: (M, 3) semi-axes.
+        colours: (M, 3) uint8 sRGB, colours at the centres, seen from the viewpoint's camera.
     """
 
     rows: np.ndarray
@@ -242,7 +242,7 @@ class FrameEllipsoids(NamedTuple):
 def list_viewer_ellipsoids(
     model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int, row: int | None = None
 ) -> FrameEllipsoids:
-    """Return the ellipsoids of a frame: at most ``limit``, those that absorb most; or that of one ``row``, if any."""
+    """Return the ellipsoids at a viewpoint: the ``limit`` that absorb most, or only that of primitive ``row``."""
     with torch.no_grad():
         lowered = model.lower(viewpoint.camera, viewpoint.conditions)
         geometry = lowered.geometry
@@ -261,10 +261,10 @@ def list_viewer_ellipsoids(
 def pick_primitive(
     model: Primitives, viewpoint: Viewpoint, direction: np.ndarray, settings: RenderSettings
 ) -> int | None:
-    """Return the row of the primitive with the largest weight along a ray from the camera; None if the ray is empty.
+    """Return the index of the primitive with the largest weight along a ray from the camera; None if the ray hits none.
 
     Args:
-        direction: (3,) of the ray, scene axes, any norm.
+        direction: (3,) direction of the ray in scene coordinates, any length.
     """
     camera = viewpoint.camera
     x, y, z = (camera.viewmat[:3, :3].double() @ torch.as_tensor(np.asarray(direction, np.float64))).tolist()
@@ -280,7 +280,7 @@ def pick_primitive(
 
 
 def describe_viewer_primitive(model: Primitives, row: int) -> str:
-    """Return a primitive's semi-axes and parameters, one a line.
+    """Return a text with a primitive's semi-axes and parameters, one per line.
 
     Raises:
         ConfigError: the model has no such primitive.

@@ -1,4 +1,5 @@
-"""One HTML file of a model: its parameters, cameras and images of its scene, and the scripts that draw it."""
+"""Make one HTML file that shows a model: parameters, cameras and images of its scene, and the scripts that render
+it."""
 
 from __future__ import annotations
 
@@ -49,7 +50,7 @@ DrawView = Callable[[Primitives, Camera, Mapping[str, Tensor]], Tensor]
 
 
 class Condition(NamedTuple):
-    """A condition of the task, and its initial value."""
+    """A condition of the task, e.g. time, and its initial value on the page."""
 
     spec: ConditionSpec
     value: Tensor
@@ -57,7 +58,7 @@ class Condition(NamedTuple):
 
 @dataclass(frozen=True)
 class PageView:
-    """A camera to jump to; ``truth`` is its image as ``data:image/...``, or "" without one."""
+    """A camera that the page can jump to; ``truth`` is its image as ``data:image/...``, or "" without an image."""
 
     name: str
     camera: Camera
@@ -67,14 +68,14 @@ class PageView:
 
 @dataclass(frozen=True)
 class PageScene:
-    """Scene of a page: background, upward axis, conditions and views, in addition to the model.
+    """What a page needs in addition to the model: background, upward axis, conditions and views.
 
     Attributes:
         background: (C,) in the model's colour space.
-        linear: whether colours are linear light, which the page converts to sRGB.
-        views: the page begins with the first one.
-        still: image to show where the page cannot draw, as ``data:image/...``.
-        world: the coordinates of the user's files. All numbers of a page are the model's own.
+        linear: whether colours are linear light; if so, the page converts them to sRGB.
+        views: cameras of the page, which opens with the first one.
+        still: image to show if the browser cannot render the model, as ``data:image/...``.
+        world: the coordinates of the user's files. The page itself uses the model's coordinates.
     """
 
     subtitle: str = ""
@@ -89,12 +90,12 @@ class PageScene:
 
 @dataclass(frozen=True)
 class WebPage:
-    """A finished page.
+    """A finished page that renders a model.
 
     Attributes:
         text: content of the HTML file.
-        model: the model with its parameters as the page stores them.
-        nonce: identifies its scripts in its security policy, for a page that embeds it.
+        model: the model with the parameter values that the page stores.
+        nonce: nonce of the page's scripts in its content security policy; a page that embeds this page must allow it.
     """
 
     text: str
@@ -110,16 +111,16 @@ def make_model_webpage(
     scene: PageScene,
     level: int = 0,
 ) -> WebPage:
-    """Make the page of a model.
+    """Make a page that renders a model.
 
     Args:
-        rgb: which of the model's channels are red, green and blue.
+        rgb: indices of the model's channels that are red, green and blue.
         settings: render settings; only ``alpha_min``, ``alpha_max`` and the near plane are used.
         level: see :func:`pack_webpage_model`.
 
     Raises:
-        ConfigError: a field without a script for browsers, or no such level.
-        CheckpointError: numbers that cannot be stored.
+        ConfigError: a field has no script for browsers, or the level does not exist.
+        CheckpointError: a parameter has values that cannot be stored.
     """
     scripts = {"density": _field_script("density", model.density), "colour": _field_script("colour", model.colour)}
     packed = pack_webpage_model(model, level)
@@ -169,7 +170,7 @@ def make_model_webpage(
 
 
 def _field_script(kind: str, field: Field) -> str:
-    """Return the field's expression for browsers, without its comment."""
+    """Return the script with which a browser evaluates the field, without its comment."""
     text = field.script()
     if text is None:
         raise ConfigError(f"{kind} field {type(field).__name__} has no script for browsers; a page cannot show it")
@@ -183,7 +184,7 @@ def _field_script(kind: str, field: Field) -> str:
 
 
 def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int) -> list[PageView]:
-    """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; first the one with most contrast."""
+    """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; the one with most contrast first."""
     count = min(limit, len(dataset.test))
     views, contrasts = [], []
     for index in (k * len(dataset.test) // count for k in range(count)):
@@ -201,7 +202,9 @@ def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int) -> 
 def initial_webpage_conditions(
     specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
 ) -> list[Condition]:
-    """Return float64 conditions: those given, else of the first view, else the middle of a bounded range, else 1."""
+    """Return the initial value of each condition, float64: the given value, else that of the first view, else the
+    middle of a bounded range, else 1.
+    """
     shown = {**(views[0].conditions if views else {}), **given}
     found = []
     for spec in specs:
@@ -212,7 +215,7 @@ def initial_webpage_conditions(
 
 
 def webpage_subtitle(task: str, data_source: str) -> str:
-    """Return the name of the task, and the kind of data unless they are real."""
+    """Return a page's subtitle: the name of the task, and the kind of data if they are not real."""
     return task if data_source == "real" else f"{task}, {data_source} data"
 
 
@@ -225,11 +228,12 @@ def scene_page(
     scene: PageScene,
     level: int = 1,
 ) -> WebPage:
-    """Make the page of a scene; this sets its colour space and its still image, which ``draw`` renders.
+    """Make a page that renders a model. The page's colour space comes from ``channels``; ``draw`` renders the still
+    image.
 
     Raises:
-        ConfigError: channels that are not red, green and blue, or a field without a script for browsers.
-        CheckpointError: numbers that cannot be stored.
+        ConfigError: the channels are not red, green and blue, or a field has no script for browsers.
+        CheckpointError: a parameter has values that cannot be stored.
     """
     if channels.own is not None or channels.rgb is None:
         raise ConfigError(
@@ -245,7 +249,7 @@ def scene_page(
 
 
 def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
-    """Return the upward direction (3,) in a model's header; +z unless it holds three finite numbers, not all 0."""
+    """Return the upward direction (3,) in a model's header; +z unless it has three finite numbers, not all 0."""
     data = header.get("data")
     up = data.get("up") if isinstance(data, Mapping) else None
     if not isinstance(up, list) or len(up) != 3 or not all(isinstance(x, int | float) and math.isfinite(x) for x in up):
@@ -254,7 +258,7 @@ def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
-    """Return the initial conditions; if no primitive is active there, vary one condition until most are active."""
+    """Return the initial conditions. If no primitive is active there, vary one condition so that most are active."""
     start = {condition.spec.name: condition.value for condition in conditions}
     if model.active(start).geometry.count:
         return start
@@ -269,7 +273,7 @@ def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition
 
 @torch.no_grad()
 def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
-    """Return middle and radius of what is drawn, and the 95 % quantile of the extinction at the centres."""
+    """Return centre and radius of the active primitives, and the 95 % quantile of their extinction at the centres."""
     active = model.active(conditions)
     if not active.geometry.count:
         return [0.0, 0.0, 0.0], 1.0, 1.0
@@ -282,13 +286,15 @@ def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor])
 
 
 def _make_webpage_camera(middle: Sequence[float], radius: float, up: Sequence[float]) -> Camera:
-    """Make a camera that sees all of a scene, from the side and a little above."""
+    """Make a camera that sees a sphere of this centre (``middle``) and radius, from the side and slightly above."""
     template = Camera(torch.eye(4, dtype=torch.float64), 717.0, 717.0, 256, 256, 512, 512)
     return orbit(template, torch.tensor(middle), torch.tensor(up), 3.2 * radius, 0.4, 1)[0]
 
 
 def webpage_camera_numbers(camera: Camera) -> dict[str, Any]:
-    """Return a camera as the scripts take it: world-to-camera R (row by row) and t, OpenCV axes; intrinsics, pixels."""
+    """Return a camera in the form of the page's scripts: world-to-camera R (row by row) and t, OpenCV axes; intrinsics
+    in pixels.
+    """
     view = camera.viewmat.detach().double().cpu()
     numbers = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "width", "height")}
     return {"R": view[:3, :3].flatten().tolist(), "t": view[:3, 3].tolist(), **numbers}
@@ -305,7 +311,7 @@ def _view_json(view: PageView) -> dict[str, Any]:
 
 
 def _condition_json(condition: Condition) -> dict[str, Any]:
-    """Describe a condition for its controls. A range that is too long for a slider becomes short."""
+    """Describe a condition for the page's controls. A range that is too long for a slider is shortened."""
     spec = condition.spec
     low, high = (min(max(float(end), -_JSON_INFINITY), _JSON_INFINITY) for end in spec.range)
     if spec.shape == () and high - low > _MAX_SLIDER_RANGE:
@@ -323,9 +329,10 @@ _QUADRATURE_POINTS = 16  # for chords that the near plane cuts; with 8 of them e
 
 
 def shader_constants(edge: int) -> dict[str, list[float]]:
-    """Return polynomials in z = v^2, highest power first, |v| <= 1/2 turns, and the positive half of a Gauss rule.
+    """Return constants of the page's shader: polynomials in z = v^2 and the positive half of a Gauss rule.
 
-    ``cos`` is cos(2 pi v), ``sinc`` sin(2 pi v)/(2 pi v), ``edge`` B_p(2 pi v) of :mod:`neuprim.core.model.edge`.
+    The polynomials, highest power first, hold for |v| <= 1/2: ``cos`` is cos(2 pi v), ``sinc`` is
+    sin(2 pi v)/(2 pi v), and ``edge`` is B_p(2 pi v) of :mod:`neuprim.core.model.edge`.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     turn = 2 * math.pi
@@ -349,12 +356,12 @@ def _fit_webpage_polynomial(function: Callable[[np.ndarray], np.ndarray]) -> lis
 
 
 class PackedModel(NamedTuple):
-    """A model as a page holds it; ``assets/codec.js`` reads it.
+    """A model in the binary form that a page stores; ``assets/codec.js`` decodes it.
 
     Attributes:
-        parts: how each parameter is coded, in the order of ``data``.
-        data: byte planes, gzipped.
-        model: the decoded model.
+        parts: encoding of each parameter, in the order of ``data``.
+        data: byte planes of all parameters, gzipped.
+        model: the model that decoding gives.
     """
 
     parts: tuple[dict[str, Any], ...]
@@ -363,11 +370,11 @@ class PackedModel(NamedTuple):
 
 
 def pack_webpage_model(model: Primitives, level: int) -> PackedModel:
-    """Pack all parameters: every bit at level 0, else quantised as ``neuprim compress --level`` 1 to 5 does.
+    """Pack all parameters: without loss at level 0, else quantised like ``neuprim compress --level`` 1 to 5.
 
     Raises:
-        ConfigError: no such level.
-        CheckpointError: numbers that cannot be stored.
+        ConfigError: the level does not exist.
+        CheckpointError: a parameter has values that cannot be stored.
     """
     packed = _pack_exact_for_webpage(model) if level == 0 else _pack_quantized_for_webpage(model, level)
     data = gzip.compress(b"".join(planes for _, planes, _ in packed), 9, mtime=0)

@@ -1,4 +1,4 @@
-"""Cameras: pinholes, other central projections, and files of them."""
+"""Cameras (pinholes and other central projections), and readers of camera files."""
 
 from neuprim.core.cameras.pinhole import (
     AnyCamera,

@@ -1,6 +1,6 @@
 """Read cameras from files: JSON with frames or a camera path, USD stages and COLMAP models.
 
-Pixar's library reads stages in a process of its own, with limits of time and memory.
+Pixar's library reads USD stages in a separate process, with limits of time and memory.
 """
 
 from __future__ import annotations
@@ -49,10 +49,11 @@ _VIEWER_NOTE = (
 def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraViews:
     """Read the cameras of a JSON file, a USD stage or a COLMAP model.
 
-    JSON files have ``frames``, or ``camera_path`` of nerfstudio's viewer. ``FILE#/PRIM`` chooses one camera of a stage.
+    JSON files have ``frames``, or the ``camera_path`` of nerfstudio's viewer. ``FILE#/PRIM`` chooses one camera of a
+    USD stage.
 
     Args:
-        size: (width, height) for files that do not have it.
+        size: (width, height) in pixels, for files that do not state an image size.
 
     Raises:
         DataError: a field is missing or wrong.
@@ -102,12 +103,12 @@ def _read_camera_image_size(record: JsonReader, keys: tuple[str, str], size: tup
 
 
 def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
-    """Return the times of all cameras; None unless all have one."""
+    """Return the times of all cameras of a file; None unless every camera has a time."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
 def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
-    """Return ``fps``, else ``count`` frames over ``seconds``; None without either."""
+    """Return the frames per second of a file: its ``fps``, else ``count`` / ``seconds``; None without either."""
     for key in ("fps", "seconds"):
         if document.has(key):
             value = document.number(key, "a number above 0", 0.0)
@@ -167,7 +168,7 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
 
 
 def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
-    """Read (4, 4) from 16 numbers row by row, or from rows."""
+    """Read a (4, 4) matrix from 16 numbers row by row, or from four rows."""
     value = record.values.get(key)
     if isinstance(value, list) and len(value) == 16:
         return JsonReader({key: [value[i : i + 4] for i in (0, 4, 8, 12)]}, record.where).matrix(key)
@@ -192,11 +193,12 @@ def is_usd(path: Path) -> bool:
 
 
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
-    """Read the camera of a stage (``prim``, where there are several), at every whole time code where it moves.
+    """Read one camera of a USD stage; a moving camera is read at every whole time code.
 
-    Axes and units are the stage's; ``size`` is in pixels, None for the stage's own. The image shows the whole aperture
-    ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic or sheared cameras, or no
-    size.
+    ``prim`` is the path of the camera, required if the stage has several. Axes and units are those of the stage.
+    ``size`` is (width, height) in pixels, None for that of the stage. The image shows the whole aperture
+    ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic or sheared cameras, or if no
+    size is known.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
@@ -267,7 +269,7 @@ def _usd_camera(record: JsonReader, size: tuple[int, int]) -> Camera:
 
 
 def _remove_pose_scale(matrix: Tensor, where: str) -> Tensor:
-    """Return the pose without its uniform scale, on which a camera's image does not depend; else raise DataError."""
+    """Return a camera pose without its uniform scale; raise DataError if the axes differ in scale."""
     lengths = matrix[:3, :3].norm(dim=0)
     mean = lengths.mean()
     if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _UNEQUAL_SCALES:

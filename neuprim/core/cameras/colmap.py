@@ -1,4 +1,4 @@
-"""COLMAP's sparse models, read by pycolmap. As it hangs on damaged counts, binary files are checked first."""
+"""Read COLMAP's sparse models with pycolmap. Binary files are checked first, as pycolmap hangs on damaged counts."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _PARTS = ("cameras", "images", "points3D", "rigs", "frames")
 
 
 def import_pycolmap() -> Any:
-    """Import the package; raise :class:`BackendUnavailable` if it is missing."""
+    """Return the imported package pycolmap; raise :class:`BackendUnavailable` if it is missing."""
     try:
         import pycolmap
     except ImportError as error:
@@ -60,7 +60,7 @@ def read_colmap_model(folder: Path) -> Any:
 
 
 def _restore_colmap_image_names(model: Any, path: Path) -> None:
-    """Restore the names of ``images.txt`` that contain blanks, at which COLMAP cuts them off."""
+    """Restore image names of ``images.txt`` that contain blanks; COLMAP cuts names off at the first blank."""
     lines = iter(path.read_text(encoding="utf-8", errors="surrogateescape").split("\n"))
     for line in lines:
         fields = line.strip().split(maxsplit=9)
@@ -102,7 +102,7 @@ def colmap_viewmat(image: Any) -> Tensor:
 
 
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
-    """Return the model with most images in a project's ``sparse`` (or None) and a line for the user."""
+    """Return the folder of the model with most images in a project's ``sparse``, or None, and a line for the user."""
     place = project / "sparse"
     models = sorted(
         (p for p in place.glob("*") if _colmap_model_suffix(p) is not None), key=lambda p: (len(p.name), p.name)
@@ -130,7 +130,7 @@ def _count_colmap_images(model: Path) -> int:
 
 
 def find_colmap_model(path: Path) -> Path | None:
-    """Return the model folder that a path means: itself, one of its files, or a project; else None."""
+    """Return the folder of the COLMAP model if ``path`` is that folder, one of its files, or a project; else None."""
     if path.is_dir():
         return path if _colmap_model_suffix(path) is not None else largest_colmap_model(path)[0]
     is_part = path.suffix in (".txt", ".bin") and path.stem in _PARTS
@@ -138,7 +138,7 @@ def find_colmap_model(path: Path) -> Path | None:
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Return (name without suffix, camera) of all posed images, by name, and lines for the user."""
+    """Return (image name without suffix, camera) for all posed images, sorted by name, and lines for the user."""
     reconstruction = _read_colmap_cameras_only(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     if not images:
@@ -184,7 +184,7 @@ _MAX_PARAMS = 64  # most parameters of a camera model
 
 
 class _ColmapRecordReader:
-    """Read position in a file; running past its end raises DataError."""
+    """Reader of a binary file that keeps the position; running past the end of the file raises DataError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -212,7 +212,7 @@ class _ColmapRecordReader:
 
 
 def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
-    """Check all ``.bin`` files of a model record by record.
+    """Check all ``.bin`` files of a model record by record; raise DataError for a damaged file.
 
     ``parameter_count``: function (number of a camera model) -> number of its parameters, -1 if unknown.
     """

@@ -1,12 +1,14 @@
-"""Intrinsics, lenses and other keys of ``transforms.json`` files, for data loaders and camera files.
+"""Read intrinsics, lenses and other keys of ``transforms.json`` files, for data loaders and camera files.
 
 Focal lengths: ``fl_x fl_y`` in pixels, ``camera_angle_x camera_angle_y`` in radians, ``x_fov y_fov`` in degrees, or
 ``camera_intrinsics`` [cx, cy, fx, fy]. Principal point: ``cx cy``. Size: ``w h``. Lens: ``camera_model``,
 ``is_fisheye``, ``k1 k2 k3 k4 p1 p2``.
 
-* Each group of keys comes whole from the frame, or else whole from the file.
-* Keys of one record that state the same number must agree within 1 %.
-* Lengths in pixels belong to the size in their own record. They are scaled to images that are resized copies.
+A *record* is the JSON object of a frame or of the file.
+
+* All keys of a group come from the frame if it has any of them, else from the file.
+* Keys of one record that state the same quantity must agree within 1 %.
+* Lengths in pixels refer to the image size in their own record. They are scaled if the image is a resized copy.
 * A key that changes the picture is read or refused by name. Unknown keys are named once in a warning.
 """
 
@@ -38,12 +40,12 @@ Say = Callable[[str], None]
 
 @dataclass(frozen=True)
 class CameraTarget:
-    """Image for which a camera is read: an image file, or an image to render."""
+    """The image for which a camera is read: an image file, or an image to render."""
 
     width: int
     height: int
-    image: str = ""  # the file; empty for an image to render
-    hint: str = ""  # end of messages about the size
+    image: str = ""  # path of the image file; empty for an image to render
+    hint: str = ""  # text to append to messages about the image size
 
     @property
     def size(self) -> tuple[int, int]:
@@ -52,7 +54,7 @@ class CameraTarget:
 
 @dataclass(frozen=True)
 class _IntrinsicsSource:
-    """Fields of a frame or file, and the size in pixels that its lengths belong to."""
+    """Fields of a frame or file, and the image size that its lengths in pixels refer to."""
 
     record: JsonReader
     size: tuple[int, int]
@@ -92,7 +94,7 @@ def read_camera(
     viewmat: Tensor | None = None,
     say: Say = lambda text: None,
 ) -> Camera:
-    """Read the pinhole of a frame; the ``file`` provides what the frame leaves out.
+    """Read the pinhole camera of a frame; keys that the frame lacks are read from ``file``.
 
     ``viewmat`` (4, 4) is world to camera, OpenCV axes; None reads ``transform_matrix``. ``say`` receives lines for the
     user. Raises DataError for missing or wrong fields, or fields that contradict each other or the image.
@@ -117,7 +119,7 @@ def read_camera(
 
 
 def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
-    """Return the size that a record states, completed from ``default``."""
+    """Return the image size that a record states; a missing width or height comes from ``default``."""
     return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
 
 
@@ -285,7 +287,10 @@ def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, flo
 
 
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
-    """Return whether the lens is OpenCV's fisheye; refuses models that are no pinhole, offering ``others`` too."""
+    """Return whether the lens is OpenCV's fisheye; raise DataError for a lens model that is neither that nor a pinhole.
+
+    ``others``: further models that the message offers.
+    """
     record = _record_with_camera_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
     if model == "OPENCV_FISHEYE" or record.values.get("is_fisheye") is True:

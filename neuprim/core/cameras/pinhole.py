@@ -44,12 +44,12 @@ class Camera:
         return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def reduced(self, factor: int) -> Camera:
-        """Return the camera with pixels ``factor`` times as large; remainders at right and bottom are cut off."""
+        """Return the camera with pixels ``factor`` times as large; remaining columns and rows are cut off."""
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
     def strided(self, stride: int, column: int, row: int) -> Camera:
-        """Return the camera of every ``stride``-th pixel in x and y, from (``column``, ``row``) on; same rays."""
+        """Return a camera with the rays of every ``stride``-th pixel in x and y, from (``column``, ``row``) on."""
         cx, cy = ((c - first - 0.5) / stride + 0.5 for c, first in ((self.cx, column), (self.cy, row)))
         width, height = -(-(self.width - column) // stride), -(-(self.height - row) // stride)
         return Camera(self.viewmat, self.fx / stride, self.fy / stride, cx, cy, width, height)
@@ -66,7 +66,7 @@ class Camera:
         return (z > 0) & (pixels >= 0).all(1) & (pixels < torch.tensor([self.width, self.height])).all(1)
 
     def validate(self, where: str) -> Camera:
-        """Return self; raise DataError naming ``where`` for non-finite, singular, scaled or mirrored cameras."""
+        """Return this camera; raise DataError naming ``where`` if it is non-finite, singular, scaled or mirrored."""
         numbers = torch.tensor([self.fx, self.fy, self.cx, self.cy], dtype=torch.float64)
         if not (torch.isfinite(numbers).all() and self.fx > 0 and self.fy > 0):
             found = f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
@@ -142,7 +142,7 @@ FRAME_RATES = (0.1, 240.0)  # least and most frames per second of a film, as ``-
 
 @dataclass(frozen=True)
 class CameraViews:
-    """Cameras of a file, in order."""
+    """The cameras that a file contains, in order."""
 
     named: tuple[tuple[str, Camera], ...]  # (name, camera) pairs
     times: tuple[float, ...] | None = None  # time of each camera, in the file's own unit
@@ -153,10 +153,10 @@ class CameraViews:
 def camera_exr_attributes(camera: Camera, near: float) -> dict[str, Any]:
     """Return the standard camera attributes of an OpenEXR file by name.
 
-    These are ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth``. They multiply row
-    vectors, in a left-handed space with y up and z forward; device coordinates run from (0, 0) at the upper left to
-    (1, 1). Added are ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength`` and ``neuprim:principalPoint``
-    (x, y, pixels), and ``neuprim:near``.
+    The attributes are ``worldToCamera``, ``worldToNDC``, ``screenWindowCenter`` and ``screenWindowWidth``. The matrices
+    multiply row vectors, in a left-handed space with y up and z forward; device coordinates run from (0, 0) at the
+    upper left to (1, 1). neuprim adds ``neuprim:worldToCamera`` in float64, ``neuprim:focalLength`` and
+    ``neuprim:principalPoint`` (x, y, pixels), and ``neuprim:near``.
     """
     view = camera.viewmat.detach().double().cpu().numpy()
     up = np.diag([1.0, -1.0, 1.0, 1.0])
@@ -192,7 +192,7 @@ class RayCamera:
 
     All rays start at one point; they may point backwards (z < 0). Distances along the rays replace depths: for
     ``near``, depth images and the order of primitives. Images therefore differ from those of a pinhole where a near
-    plane cuts chords. Raises DataError for no rigid transform, or directions not of unit length.
+    plane cuts chords. Raises DataError if ``viewmat`` is not rigid, or directions are not of unit length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes

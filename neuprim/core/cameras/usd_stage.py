@@ -1,6 +1,6 @@
-"""Read the camera of a USD stage and print it as JSON, in a process of its own without any import of neuprim.
+"""Script that prints the camera of a USD stage as JSON; runs in a separate process, without any import of neuprim.
 
-Arguments: file, the camera's prim or nothing, and the most frames; a line on standard error says what is wrong.
+Arguments: file, the camera's prim or nothing, and the largest number of frames. Errors are one line on standard error.
 """
 
 from __future__ import annotations
@@ -46,7 +46,8 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
 
 
 def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
-    """Return every whole time code from start to end if the camera moves; else the start, or the earliest time."""
+    """Return every whole time code from the stage's start to its end if the camera moves; else one time, the start or
+    the earliest."""
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
         moves, prim = (

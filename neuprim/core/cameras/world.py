@@ -24,10 +24,10 @@ _Camera = TypeVar("_Camera", Camera, RayCamera)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Transform between the world of the user's files and the scene: a rotation, one scale and an offset.
+    """Transform between world coordinates, those of the user's files, and scene coordinates, those of the model.
 
-    Models are in scene units, mostly float32. Coordinates that users give or get (cameras, lights, boxes, exported
-    positions) are world coordinates in float64.
+    The transform is a rotation, one scale and an offset. Models are in scene units, mostly float32. Coordinates that
+    users give or get (cameras, lights, boxes, exported positions) are world coordinates in float64.
     """
 
     scene_from_world: Tensor = field(default_factory=lambda: torch.eye(4, dtype=torch.float64))  # (4, 4) float64
@@ -58,7 +58,7 @@ class World:
 
     @cached_property
     def inverse(self) -> World:
-        """The inverse transform: its "scene" is this world."""
+        """The inverse transform: its scene coordinates are the world coordinates of this one, and vice versa."""
         back = torch.eye(4, dtype=torch.float64)
         back[:3, :3] = torch.linalg.inv(self.scene_from_world[:3, :3])
         back[:3, 3] = -back[:3, :3] @ self.scene_from_world[:3, 3]
@@ -94,11 +94,11 @@ class World:
         return self.inverse.scene_camera(camera)
 
     def world_box(self, box: np.ndarray) -> np.ndarray:
-        """Return the (2, 3) box on the world's axes around a box of the scene."""
+        """Return the smallest (2, 3) box along the world axes around a ``box`` (2, 3) in scene coordinates."""
         return self.inverse.scene_box(box)
 
     def scene_box(self, box: np.ndarray) -> np.ndarray:
-        """Return the (2, 3) box on the scene's axes around a box of the world."""
+        """Return the smallest (2, 3) box along the scene axes around a ``box`` (2, 3) in world coordinates."""
         if self.identity:
             return box
         corners = np.stack(np.meshgrid(*np.asarray(box, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
@@ -106,12 +106,12 @@ class World:
         return np.stack([moved.min(0), moved.max(0)])
 
     def to_json(self) -> dict[str, Any]:
-        """Return the entry "world" of a model's header, exact when read back."""
+        """Return the transform as the entry "world" of a model's header; :meth:`of` restores it exactly."""
         return {"scene_from_world": self.scene_from_world.tolist()}
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """Return the world of a model's header, the identity with +z up if it has none; raise DataError if damaged."""
+        """Return the transform in a model's header, by default the identity, +z up; raise DataError if damaged."""
         record, facts = header.get("world"), header.get("data")
         world = World()
         if isinstance(facts, dict) and "up" in facts:
@@ -129,7 +129,7 @@ class World:
             raise DataError(f"{where} is damaged ({type(error).__name__})") from None
 
     def validate(self, where: str) -> World:
-        """Return self; raise DataError naming ``where`` unless this is a rotation, one scale and an offset."""
+        """Return this transform; raise DataError naming ``where`` unless it is a rotation, one scale and an offset."""
         matrix = self.scene_from_world
         fits = isinstance(matrix, Tensor) and matrix.shape == (4, 4) and matrix.dtype == torch.float64
         if fits and bool(matrix.isfinite().all()) and matrix[3].tolist() == [0, 0, 0, 1]:

@@ -1,4 +1,4 @@
-"""Encode a model, ``Primitives`` -> quantizers -> codes -> sections of bytes, and quantize parameters in training."""
+"""Encode a model for a file, ``Primitives`` -> quantizers -> codes -> sections, and quantize it in training."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Quantizers = dict[str, ColumnQuantizer | RotationQuantizer]  # parameter -> its 
 
 @dataclass(frozen=True)
 class StoredSize:
-    """Size of a parameter in a file: bits per number, as text, and bytes."""
+    """Size of a parameter in a file: ``bits`` per number, as text such as "7", and ``size`` in bytes."""
 
     bits: str
     size: int
@@ -58,9 +58,9 @@ _POSITION_STEPS = 50.0  # smallest number of position steps in the median of the
 
 
 def canonical_model(model: Primitives) -> Primitives:
-    """Return an equivalent model whose parameters are canonical, as files store them; detached, on the CPU.
+    """Return an equivalent model with canonical parameters, the form that files store; detached, on the CPU.
 
-    Raises CheckpointError for numbers that cannot be stored, FormError for what a field's own code returned.
+    Raises CheckpointError for values that a file cannot store, FormError if a field returns invalid parameters.
     """
     params = {name: value.detach().cpu() for name, value in model.params.items()}
     for field in (model.density, model.colour):
@@ -87,7 +87,7 @@ def canonical_model(model: Primitives) -> Primitives:
 
 
 def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
-    """Return quantizers of a canonical model: ranges from its numbers, bits from the table."""
+    """Return a quantizer for each parameter of a canonical model: ranges from its values, bits from the table."""
     found: Quantizers = {}
     sparse = _sparse_quantized_parameters(model)
     for spec in model.specs:
@@ -111,15 +111,15 @@ def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
 
 
 def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Quantizers:
-    """Return quantizers of a canonical model with which every column adds the same error.
+    """Return quantizers of a canonical model such that every column (number per primitive) adds the same error.
 
     Rounding to steps of length s has a mean squared error of s^2 / 12. Equal errors spend bits best (reverse water
     filling).
 
     Args:
-        effects: parameter -> (C,) mean squared change of images per variance of its numbers
+        effects: parameter -> (C,) mean squared change of images per variance of each column
             (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
-        error: mean squared change that one column may add.
+        error: mean squared change of images that one column may add.
     """
     found: Quantizers = {}
     sparse = _sparse_quantized_parameters(model)
@@ -145,7 +145,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
 
 
 def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
-    """Return :func:`columns_of_step` with equal bits for all axes."""
+    """Return a quantizer of positions by :func:`columns_of_step`, with equal bits for all axes."""
     own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
     low = own.low.double()
@@ -154,7 +154,7 @@ def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
 
 
 def _sparse_quantized_parameters(model: Primitives) -> set[str]:
-    """Return the parameters of units that are zero in some primitives; their zeros must stay zeros."""
+    """Return the parameters of prunable units that are zero in some primitives; these zeros must stay exact."""
     pieces = prunable_units_of_model(model.density, model.colour).values()
     return {
         name for piece in pieces if not bool(primitives_with_unit(piece, model.params).all()) for name in piece.places
@@ -162,7 +162,7 @@ def _sparse_quantized_parameters(model: Primitives) -> set[str]:
 
 
 def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
-    """Return the quantizer of positions, without clipping; distant primitives raise the bits of all."""
+    """Return a quantizer of positions that clips none; distant primitives raise the number of bits for all."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
@@ -172,7 +172,7 @@ def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool
 
 
 def storage_order(model: Primitives, made: Quantizers) -> Tensor:
-    """Return the (N,) int64 rows of a canonical model in file order: along a Z curve through the positions' codes."""
+    """Return the (N,) int64 order in which a file stores primitives: along a Z curve through the positions' codes."""
     places = made["means"]
     assert isinstance(places, ColumnQuantizer)
     return torch.from_numpy(
@@ -181,7 +181,7 @@ def storage_order(model: Primitives, made: Quantizers) -> Tensor:
 
 
 def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSection]:
-    """Return the sections of a canonical model, in file order."""
+    """Encode a canonical model into sections, in file order."""
     order = storage_order(model, made)
     codes = {
         spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order])
@@ -203,7 +203,7 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSecti
 def _sparse_column_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Return bit masks of units that are zero in some primitives, and parameter -> mask number by column (0: none)."""
+    """Return masks of units that are zero in some primitives, and parameter -> mask number per column (0: none)."""
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])
@@ -228,7 +228,7 @@ def _sparse_column_masks(
 
 
 def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, Tensor]:
-    """Quantize and dequantize tensors, with straight-through gradients; numbers beyond a range are clamped."""
+    """Quantize and dequantize parameters, with straight-through gradients; values beyond a range are clamped."""
     return {
         name: made[name].fake_quantize(x.reshape(len(x), math.prod(x.shape[1:]))).reshape(x.shape)
         for name, x in params.items()
@@ -236,6 +236,6 @@ def fake_quantize(params: Mapping[str, Tensor], made: Quantizers) -> dict[str, T
 
 
 def format_quantizer_bits(scheme: ColumnQuantizer | RotationQuantizer) -> str:
-    """Return ``"7"``, or ``"6 to 8"`` where columns differ."""
+    """Return the bits of a quantizer as text: ``"7"``, or ``"6 to 8"`` if columns differ."""
     bits = sorted({scheme.bits} if isinstance(scheme, RotationQuantizer) else set(scheme.bits.tolist()))
     return " to ".join(map(str, bits if len(bits) < 2 else (bits[0], bits[-1])))

@@ -1,7 +1,7 @@
 """Read and write ``.neuprim`` files: a JSON header, a table of sections, and their bytes compressed by zstd.
 
-Little-endian; docs/data_formats.md describes every byte. Files may be hostile: every size is checked against the file's
-own before memory is allocated, and the expansion is limited (:data:`MAX_EXPANSION`).
+Little-endian; docs/data_formats.md describes every byte. Files may be hostile: every size is checked against the file
+size before memory is allocated, and :data:`MAX_EXPANSION` limits decompression.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ _MAX_SECTIONS, _MAX_DIMENSIONS, _MAX_COLUMNS, _MAX_PRIMITIVES = 4096, 4, 2**20, 
 
 @dataclass(frozen=True)
 class _TableEntry:
-    """A row of the table: a section without content, bytes of its planes, packing, stored bytes, their checksum."""
+    """Table row: a section without content, bytes of its planes, packing, number of stored bytes, their checksum."""
 
     section: CompressedSection
     content: int
@@ -77,9 +77,9 @@ class _FileHead:
 def write_compressed(
     path: Path, header: Mapping[str, Any], count: int, sections: Sequence[CompressedSection]
 ) -> dict[str, int]:
-    """Write a file atomically; returns the bytes of each section, whose names must be unique.
+    """Write a ``.neuprim`` file atomically; return the bytes of each section by name. Names must be unique.
 
-    Raises CheckpointError where the file could not be written.
+    Raises CheckpointError if the file cannot be written.
     """
     text = json.dumps(header, allow_nan=False).encode()
     if len(text) > _MAX_HEADER:
@@ -129,7 +129,7 @@ def _decompression_allowed(numbers: int, size: int) -> bool:
 
 
 def is_compressed(path: Path) -> bool:
-    """Return whether the file starts with :data:`MAGIC`, whatever its name is."""
+    """Return whether the file starts with the :data:`MAGIC` of ``.neuprim`` files, whatever its name is."""
     try:
         with open(path, "rb") as file:
             return file.read(len(MAGIC)) == MAGIC
@@ -138,13 +138,13 @@ def is_compressed(path: Path) -> bool:
 
 
 def read_model_header(path: Path) -> dict[str, Any]:
-    """Return the header without reading a section, or raise CheckpointError."""
+    """Return the JSON header of a ``.neuprim`` file without reading a section; raises CheckpointError."""
     with _open_compressed_file(path) as file:
         return _read_compressed_head(path, file).header
 
 
 def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str | None]:
-    """Return header, float32 tensors by name and the run's configuration (or None), or raise CheckpointError."""
+    """Return header, float32 tensors by name and configuration (or None) of a file; raises CheckpointError."""
     with _open_compressed_file(path) as file:
         head = _read_compressed_head(path, file)
         tensors: dict[str, Tensor] = {}
@@ -291,7 +291,7 @@ def _checked_codec_section(name: str, coding: int, shape: tuple[int, ...]) -> Co
 
 
 def _check_entry_sizes(entry: _TableEntry, count: int) -> None:
-    """Check the sizes of a table row."""
+    """Check the sizes that a table row claims for ``count`` primitives."""
     section, head = entry.section, entry.section.head_size
     most = MAX_TEXT if section.coding == TEXT else _MAX_PLANES * count * section.columns
     if entry.content > most:

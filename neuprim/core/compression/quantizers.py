@@ -1,6 +1,7 @@
-"""Quantizers: numbers to integer codes of a few bits and back; bits per parameter, by level or by name.
+"""Quantizers, which convert numbers to integer codes of a few bits and back, and tables of bits per parameter.
 
-A column of a parameter has even steps between two float32 ends. With m = 2^bits - 1, in double precision,
+A column (one number per primitive) has even steps between two float32 values, ``low`` and ``high``.
+With m = 2^bits - 1, in double precision,
 
     value = float32((low (m - code) + high code) / m)
 
@@ -35,7 +36,7 @@ CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 
 @dataclass(frozen=True)
 class ColumnQuantizer:
-    """Uniform quantizer of C columns: ``bits`` (C,) int64, first and last value ``low`` and ``high`` (C,) float32."""
+    """Uniform quantizer of C columns. ``bits``: (C,) int64; ``low``, ``high``: (C,) float32, first and last value."""
 
     bits: Tensor
     low: Tensor
@@ -43,17 +44,17 @@ class ColumnQuantizer:
 
     @property
     def last(self) -> Tensor:
-        """Largest codes, (C,) int64."""
+        """Largest code of each column, (C,) int64."""
         return (1 << self.bits) - 1
 
     def codes(self, x: Tensor) -> Tensor:
-        """Return the (N, C) int64 codes of the values nearest to x (N, C)."""
+        """Quantize x (N, C): return the (N, C) int64 codes of the nearest values."""
         low, width = self.low.double(), self.high.double() - self.low.double()
         scale = torch.where(width > 0, self.last / width, 0.0)
         return torch.minimum(((x.detach().double() - low) * scale).round().clamp_min(0), self.last.double()).long()
 
     def values(self, codes: Tensor) -> Tensor:
-        """Return the (N, C) float32 values of codes (N, C)."""
+        """Dequantize codes (N, C): return the (N, C) float32 values."""
         m, c = self.last.double(), codes.double()
         return ((self.low.double() * (m - c) + self.high.double() * c) / m).float()
 
@@ -66,9 +67,9 @@ class ColumnQuantizer:
 
 
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
-    """Fit the ends of every column of x (N, C), finite, on the CPU.
+    """Fit ``low`` and ``high`` of each column to x (N, C), which must be finite and on the CPU.
 
-    ``clips``: candidate shares of the column's values to clip at either end; the first wins a tie.
+    ``clips``: candidate fractions of the values to clip at each end; the least error wins, the first of a tie.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
     best = ColumnQuantizer(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
@@ -87,10 +88,9 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
 
 
 def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> ColumnQuantizer:
-    """Return columns of step ``steps`` (C,) that reach all of x (N, C), finite, on the CPU.
+    """Return a quantizer with step lengths ``steps`` (C,) that covers all of x (N, C), finite, on the CPU.
 
-    Steps grow where they would need more than :data:`MAX_BITS`. ``through``: (C,) or a number that is one of the
-    values.
+    A step that needs more than :data:`MAX_BITS` grows. ``through``: (C,) or a number; becomes one of the values.
     """
     if not x.numel():
         return fit_columns(x, [1] * x.shape[1])
@@ -107,7 +107,7 @@ def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> Column
 
 
 def snap_to_zero(columns: ColumnQuantizer) -> ColumnQuantizer:
-    """Move the ends inwards, by two steps at most, so that 0 is one of the values and decodes to exactly 0."""
+    """Move ``low`` and ``high`` inwards, by at most two steps, so that 0 has a code that decodes to exactly 0."""
     low, high, last = columns.low.double().clamp(max=0.0), columns.high.double().clamp(min=0.0), columns.last.double()
     width = high - low
     place = -low / torch.where(width > 0, width, 1.0) * last  # position of zero, between two codes
@@ -123,7 +123,7 @@ def snap_to_zero(columns: ColumnQuantizer) -> ColumnQuantizer:
 
 
 def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
-    """Return a quantile of sorted columns (N, C), by linear interpolation."""
+    """Return the ``q`` quantile of each of C sorted columns (N, C), by linear interpolation."""
     place = q * (len(ordered) - 1)
     below = int(place)
     above, share = min(below + 1, len(ordered) - 1), place - below
@@ -131,7 +131,7 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
-    """Return the (C,) root mean squared errors over those of uniform steps from -1 to 1 standard deviation."""
+    """Return (C,) root mean squared errors, divided by those of even steps from -1 to 1 standard deviation."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
     usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
@@ -140,24 +140,25 @@ def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
 
 @dataclass(frozen=True)
 class RotationQuantizer:
-    """Quantizer of unit quaternions: the three smallest components, ``bits`` each (:data:`MIN_BITS` to 16).
+    """Quantizer of unit quaternions by their three smallest components, ``bits`` each (:data:`MIN_BITS` to 16).
 
-    With h = 2^(bits-1) - 1, the three are u / (h sqrt 2) for whole u from -h to h, in their order. The largest is
-    sqrt(2 h^2 - u1^2 - u2^2 - u3^2) / (h sqrt 2), positive. Sums are of whole numbers, root and quotient are rounded
-    once: the same bits everywhere. The identity decodes exactly.
+    With h = 2^(bits-1) - 1, the three components are u / (h sqrt 2) with integers u from -h to h, in order. The largest
+    is sqrt(2 h^2 - u1^2 - u2^2 - u3^2) / (h sqrt 2), positive. Sums are of integers, root and quotient are rounded
+    once, so all machines get the same bits. The identity decodes exactly.
     """
 
     bits: int
 
     @property
     def half(self) -> int:
-        """Return h: codes are u + h, 0 to 2 h."""
+        """The h of the formulas above: codes are u + h, from 0 to 2 h."""
         return (1 << (self.bits - 1)) - 1
 
     def codes(self, quats: Tensor) -> Tensor:
         """Return (N, 4) int64 codes of wxyz (N, 4): index of the largest component, codes of the others.
 
-        Where rounding makes another component as large as the largest, it is reduced, so that codes are stable.
+        If rounding makes another component as large as the largest, that component is reduced, so that codes are
+        stable.
         """
         q = quats.detach().double()
         q = q / q.abs().amax(1, keepdim=True)  # the square of a tiny norm would underflow
@@ -175,7 +176,7 @@ class RotationQuantizer:
             )
 
     def values(self, codes: Tensor) -> Tensor:
-        """Return the (N, 4) float32 unit quaternions wxyz of codes (N, 4)."""
+        """Dequantize codes (N, 4): return (N, 4) float32 unit quaternions wxyz."""
         u = codes[:, 1:] - self.half
         norm = torch.tensor(2 * self.half * self.half, dtype=torch.float64, device=codes.device).sqrt()
         made = torch.empty(len(codes), 4, dtype=torch.float64, device=codes.device)
@@ -184,14 +185,14 @@ class RotationQuantizer:
         return made.float()
 
     def fake_quantize(self, quats: Tensor) -> Tensor:
-        """Quantize and dequantize, keeping norm and sign, with straight-through gradients."""
+        """Quantize and dequantize quaternions, keeping norm and sign, with straight-through gradients."""
         q = quats.detach()
         back = self.values(self.codes(q)).to(q)
         back = back * q.norm(dim=1, keepdim=True) * torch.where((back * q).sum(1, keepdim=True) < 0, -1.0, 1.0).to(q)
         return back + (quats - q)
 
     def to(self, device: torch.device) -> RotationQuantizer:
-        """Return itself; it has no tensors."""
+        """Return this quantizer, which has no tensors to move."""
         return self
 
     def _left(self, u: Tensor) -> Tensor:
@@ -199,7 +200,7 @@ class RotationQuantizer:
 
     @staticmethod
     def _others(largest: Tensor) -> Tensor:
-        """Return the (N, 3) indices of the other components, ascending."""
+        """Return the (N, 3) indices of the three smaller components, ascending."""
         first = torch.arange(3, device=largest.device).expand(len(largest), 3)
         return first + (first >= largest[:, None])
 
@@ -209,7 +210,7 @@ OTHERS = "others"
 
 @dataclass(frozen=True)
 class BitTable:
-    """Bits per number, by parameter."""
+    """Number of bits of each quantized number, by parameter name."""
 
     # parameter -> bits. Several values are for the degrees 1, 2, ... of spherical harmonics (in the order of 3D
     # Gaussian splatting); the last holds for all higher degrees
@@ -219,7 +220,7 @@ class BitTable:
     exact: frozenset[str] = frozenset()
 
     def of(self, name: str, shape: tuple[int, ...]) -> list[int]:
-        """Return the bits of each column of a parameter of this shape."""
+        """Return the bits of each column of the parameter ``name``; ``shape``: of one primitive."""
         bits = self.named.get(name, (self.others,))
         if len(bits) == 1 or len(shape) < 2:
             return [bits[0]] * math.prod(shape)
@@ -248,7 +249,7 @@ DEFAULT_LEVEL = 3
 
 
 def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
-    """Return a level's table with ``NAME=BITS`` overrides (a parameter or ``others``), or raise ConfigError."""
+    """Return the table of a level with overrides ``NAME=BITS``, NAME a parameter or ``others``; raises ConfigError."""
     if level not in LEVELS:
         raise ConfigError(f"--level {level}: expected one of {', '.join(map(str, LEVELS))}")
     table, names = LEVELS[level], [spec.name for spec in specs]

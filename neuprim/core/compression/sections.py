@@ -1,4 +1,4 @@
-"""Pack codes into byte planes, and unpack and validate them; little-endian (docs/data_formats.md)."""
+"""Pack the codes of quantizers into byte planes, and unpack and validate them; little-endian (docs/data_formats.md)."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ _MASK_NUMBER = struct.Struct("<H")
 
 
 class CorruptSection(Exception):
-    """Invalid content of a section; the message lacks the names of file and section."""
+    """A section has invalid content; the message does not name file and section."""
 
 
 @dataclass(frozen=True)
 class CompressedSection:
-    """A section of a file: a parameter, the bit masks, or the text of the configuration."""
+    """A section of a ``.neuprim`` file: one parameter, the bit masks, or the configuration as text."""
 
     name: str
     coding: int  # one of CODINGS
@@ -50,12 +50,12 @@ class CompressedSection:
 
     @property
     def columns(self) -> int:
-        """Numbers per primitive."""
+        """Number of columns, that is, of values per primitive."""
         return math.prod(self.shape)
 
     @property
     def head_size(self) -> int:
-        """Bytes of the head, from coding and shape."""
+        """Number of bytes of ``head``, from coding and shape."""
         record = _RECORD.size + (_MASK_NUMBER.size if self.coding == SPARSE else 0)
         return {TEXT: 0, MASKS: 0, ROTATIONS: 1}.get(self.coding, record * self.columns)
 
@@ -63,7 +63,7 @@ class CompressedSection:
 def pack_section(
     name: str, shape: tuple[int, ...], scheme: ColumnQuantizer | RotationQuantizer, codes: np.ndarray, coding: int
 ) -> CompressedSection:
-    """Return the section of codes (N, C). Positions must be in file order."""
+    """Return a section that holds codes (N, C). Codes of positions must be in file order."""
     if isinstance(scheme, RotationQuantizer):
         planes = [
             *_byte_planes(codes[:, 0], 2),
@@ -79,7 +79,7 @@ def pack_section(
 
 
 def pack_codec_masks(masks: Sequence[np.ndarray]) -> CompressedSection:
-    """Return the section of (N,) bool masks, a bit per primitive, the lowest first."""
+    """Return a section that holds (N,) bool masks, one bit per primitive, the lowest bit first."""
     return CompressedSection(
         MASKS_NAME, MASKS, (len(masks),), planes=tuple(np.packbits(mask, bitorder="little").tobytes() for mask in masks)
     )
@@ -93,7 +93,7 @@ def pack_sparse_columns(
     mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
 ) -> CompressedSection:
-    """Return the section of codes (N, C); column i has the rows of mask ``mask_of[i] - 1``, or all rows for 0."""
+    """Return a section of codes (N, C); column i stores only the rows in mask ``mask_of[i] - 1``, or all for 0."""
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
     return CompressedSection(
@@ -120,7 +120,7 @@ def _code_byte_count(bits: int) -> int:
 
 
 def section_content_size(section: CompressedSection, count: int, masks: Sequence[np.ndarray] = ()) -> int:
-    """Return the bytes of a section's planes, from its head, or raise CorruptSection."""
+    """Return how many bytes the planes of a section have, from its head; raises CorruptSection."""
     if section.coding == MASKS:
         return section.columns * ((count + 7) // 8)
     if section.coding == ROTATIONS:
@@ -134,7 +134,7 @@ def section_content_size(section: CompressedSection, count: int, masks: Sequence
 
 
 def unpack_codec_masks(section: CompressedSection, content: bytes, count: int) -> list[np.ndarray]:
-    """Return the (count,) bool masks of a section, or raise CorruptSection."""
+    """Decode the (count,) bool masks of a section; raises CorruptSection."""
     bits = np.unpackbits(
         np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little"
     )
@@ -144,7 +144,7 @@ def unpack_codec_masks(section: CompressedSection, content: bytes, count: int) -
 
 
 def unpack_section(section: CompressedSection, content: bytes, count: int, masks: Sequence[np.ndarray] = ()) -> Tensor:
-    """Decode (count, *shape) float32 of ``content``, :func:`section_content_size` bytes, or raise CorruptSection."""
+    """Decode ``content``, the bytes of a section's planes, to (count, *shape) float32; raises CorruptSection."""
     planes = _PlaneReader(content)
     if section.coding == ROTATIONS:
         scheme = _rotations(section)
@@ -167,7 +167,7 @@ def unpack_section(section: CompressedSection, content: bytes, count: int, masks
 
 
 def _column_mask_numbers(section: CompressedSection) -> list[int]:
-    """Return the mask number of each column, 0 for all primitives."""
+    """Return the mask number of each column; 0 means that the column stores all primitives."""
     if section.coding != SPARSE:
         return [0] * section.columns
     return [of for (of,) in _MASK_NUMBER.iter_unpack(section.head[_RECORD.size * section.columns :])]
@@ -212,7 +212,7 @@ def _position_cells(planes: _PlaneReader, count: int, bits: int) -> np.ndarray:
 
 
 class _PlaneReader:
-    """Reader of byte planes."""
+    """Reads the codes of successive columns from byte planes."""
 
     def __init__(self, content: bytes) -> None:
         self._bytes, self._at = np.frombuffer(content, np.uint8), 0
@@ -230,7 +230,7 @@ class _PlaneReader:
 
 
 def morton_encode(cells: np.ndarray, bits: int) -> np.ndarray:
-    """Return (N,) uint64 places of ``cells`` (N, 3) on a Z curve (Morton 1966): bit 3 b + axis is bit b of the axis."""
+    """Return (N,) uint64 Z-curve keys (Morton 1966) of ``cells`` (N, 3): key bit 3 b + axis is bit b of that axis."""
     wide = cells.astype(np.uint64)
     keys = np.zeros(len(wide), np.uint64)
     for bit in range(bits):
@@ -240,7 +240,7 @@ def morton_encode(cells: np.ndarray, bits: int) -> np.ndarray:
 
 
 def morton_decode(keys: np.ndarray, bits: int) -> np.ndarray:
-    """Invert :func:`morton_encode`: (N, 3) int64."""
+    """Return the (N, 3) int64 cells of Z-curve keys: the inverse of :func:`morton_encode`."""
     cells = np.zeros((len(keys), 3), np.uint64)
     for bit in range(bits):
         for axis in range(3):
@@ -249,9 +249,9 @@ def morton_decode(keys: np.ndarray, bits: int) -> np.ndarray:
 
 
 def compress_code_planes(planes: Sequence[bytes]) -> bytes:
-    """Return the smallest of several zstd frames, or the plain planes where no frame is smaller.
+    """Compress byte planes in several ways by zstd; return the smallest frame, or the plain bytes if none is smaller.
 
-    A block of a frame has one entropy table. Similar columns best share a block; others have their own.
+    A zstd block has one entropy table, so similar columns compress best in one block and different ones in several.
     """
     whole = b"".join(planes)
     cuts = ([whole], _plane_runs(planes), planes)
@@ -259,7 +259,7 @@ def compress_code_planes(planes: Sequence[bytes]) -> bytes:
 
 
 def _plane_runs(planes: Sequence[bytes]) -> list[bytes]:
-    """Join neighbouring planes whose codes have equal bits."""
+    """Join neighbouring planes whose codes have the same number of bits."""
     made: list[list[bytes]] = []
     last = -1
     for plane in planes:

@@ -1,4 +1,4 @@
-"""Devices of tensors, the CPU and a CUDA device, and which kernels may read them."""
+"""Devices of tensors (the CPU and CUDA devices), and tests which kernels can read which tensors."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HOST = torch.device(CPU)
 
 
 def on_numba(*tensors: Tensor) -> bool:
-    """Return whether compiled CPU kernels may read these tensors."""
+    """Return whether compiled CPU kernels can read all these tensors."""
     return all(tensor.is_cpu for tensor in tensors)
 
 
@@ -25,7 +25,7 @@ def _warp() -> bool:
 
 
 def on_warp(*tensors: Tensor) -> bool:
-    """Return whether Warp kernels may read these tensors."""
+    """Return whether Warp kernels (GPU) can read all these tensors."""
     return all(tensor.is_cuda for tensor in tensors) and _warp()
 
 
@@ -38,7 +38,7 @@ def cuda_unavailable() -> str | None:
 
 
 def current_device(kind: str) -> torch.device:
-    """Return the device of this kind that a run uses; with several GPUs, torch's current one."""
+    """Return the device of a ``kind``, "cpu" or "cuda", that a run uses; of several GPUs, torch's current one."""
     return torch.device(kind, torch.cuda.current_device()) if kind == CUDA else torch.device(kind)
 
 

@@ -1,10 +1,11 @@
 """Compile the CPU kernels with numba: compiler flags, and the cache folder of the compiled code.
 
-numba's cache notices edits of a kernel's own file, but not of other files whose functions it inlined or whose constants
-it froze; and site-packages may be read-only. So compiled code is stored in the user's cache folder, under a hash of
-every source that can end up in it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, if set, replaces that folder. Whoever
-can write into or replace the folder controls what this user's processes execute. So it is used only if this user owns
-it and nobody else can do either; otherwise compiled code goes into a temporary folder of this process.
+numba's cache notices edits of a kernel's own file, but not of other files whose functions or constants were compiled
+into the kernel; and site-packages may be read-only. So compiled code is stored in the user's cache folder, under a hash
+of every source that can be part of it (:func:`kernel_sources`). ``NUMBA_CACHE_DIR``, if set, replaces that folder.
+Anyone who can write into or replace the folder controls what this user's processes execute. So neuprim uses the folder
+only if this user owns it and nobody else can change it; otherwise compiled code goes into a temporary folder of this
+process.
 """
 
 from __future__ import annotations
@@ -59,7 +60,7 @@ _IMPORT = re.compile(r"^\s*from (neuprim[\w.]*) import (\([^)]*\)|[^\n]*)|^\s*im
 
 
 def kernel_sources(module: Path, package: Path = _ROOT) -> set[Path]:
-    """Return the files whose text can end up in a module's kernels: itself and, recursively, its package imports."""
+    """Return the source files of a module's kernels: the module and, recursively, what it imports of the package."""
     found: set[Path] = set()
     todo = [module]
     while todo:
@@ -88,7 +89,7 @@ def _imported_sources(file: Path, package: Path) -> set[Path]:
 
 
 def sources_hash(module: Path, package: Path = _ROOT) -> str:
-    """Return a hash of the version and all :func:`kernel_sources`: twelve hexadecimal digits."""
+    """Return a hash of neuprim's version and all :func:`kernel_sources` of a module: twelve hexadecimal digits."""
     digest = hashlib.sha256(f"{module.name} {__version__}".encode())
     for source in sorted(kernel_sources(module, package)):
         digest.update(source.name.encode() + b"\0" + source.read_bytes() + b"\0")
@@ -264,7 +265,7 @@ compress16: Any = intrinsic(_llvm_compress16)
 
 
 def code_cache(folder: Path) -> Path:
-    """Return the folder, created if missing; a private temporary one, with a warning, if others can change it."""
+    """Return ``folder``, created if missing; if others can change it, warn and return a private temporary folder."""
     folder = folder.absolute()
     try:
         made = not folder.exists()
@@ -284,7 +285,7 @@ def code_cache(folder: Path) -> Path:
 
 
 def folder_weakness(folder: Path) -> str:
-    """Return in words who else can change the contents of a folder; "" if nobody can, and on Windows."""
+    """Return a text that says which other users can change the contents of a folder; "" if none can, and on Windows."""
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()

@@ -1,6 +1,6 @@
-"""Run nogil kernels over a range in parallel, and autograd operations without overhead where no gradient is needed.
+"""Run nogil kernels over a range in parallel; run autograd operations without overhead where no gradient is needed.
 
-Chunks never share output, so results do not depend on the number of threads.
+Each chunk of a range writes its own output, so results do not depend on the number of threads.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def machine_cores() -> int:
 
 
 def core_count() -> int:
-    """Return the number of cores this process may use: its limit by :func:`limit_process_threads`, if any."""
+    """Return the number of cores that this process may use, at most the limit set by :func:`limit_process_threads`."""
     cores = machine_cores()
     return min(cores, _share) if _share else cores
 
@@ -63,7 +63,7 @@ def limit_process_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Let "all cores" mean ``threads`` (0: all) inside the block, also for code without a ``threads`` argument."""
+    """Make "all cores" mean ``threads`` cores (0: all) inside the block, also in code without that argument."""
     token = _limit.set(threads)
     try:
         yield
@@ -77,8 +77,11 @@ def resolve_threads(threads: int) -> int:
 
 
 def chunk_size(count: int, least: int, threads: int) -> int:
-    """Return a good chunk size for :func:`parallel_for` over ``count`` items: eight chunks per thread balance the work,
-    at least ``least`` items each amortise the cost of a call. A single thread takes all items in one chunk."""
+    """Return a good chunk size for :func:`parallel_for` over ``count`` items.
+
+    Eight chunks per thread balance the work; at least ``least`` items per chunk amortise the cost of a call. A single
+    thread gets all items in one chunk.
+    """
     threads = resolve_threads(threads)
     return max(count, 1) if threads == 1 else max(least, count // (8 * threads))
 

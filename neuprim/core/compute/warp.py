@@ -1,4 +1,4 @@
-"""Configure Warp, and launch its kernels; no other module launches one.
+"""Configure Warp (NVIDIA's library of GPU kernels), and launch its kernels; no other module launches Warp kernels.
 
 Converting tensors to Warp arrays and packing them takes longer than the kernels of a small frame. So each kernel's
 launch is recorded once per device, and later launches overwrite its arguments.

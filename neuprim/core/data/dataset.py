@@ -1,4 +1,4 @@
-"""Data sets: posed images that load on demand, starting points, points to learn from, and the place of their scene."""
+"""Data sets: posed images that load on demand, starting points, known volume points, and the scene's coordinates."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ class View:
 
     name: str  # unique within its split; used for file names and reports
     camera: Camera
-    conditions: Conditions = field(default_factory=dict)  # further inputs of the image: time, light, ...
+    conditions: Conditions = field(default_factory=dict)  # other inputs of the image: time, light, ...
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,10 @@ class Pixels:
 
     rgb: Tensor  # (H, W, C) float32; with alpha it is premultiplied
     alpha: Tensor | None = None  # (H, W) float32 coverage 0..1, or None for an opaque photograph
-    mask: Tensor | None = None  # (H, W) bool of pixels that count, or None for all
+    mask: Tensor | None = None  # (H, W) bool: True for pixels that count; None: all count
 
     def to(self, device: torch.device) -> Pixels:
-        """Return a copy on another device; does not wait for it."""
+        """Return a copy of the pixels on another device; the copy may be asynchronous."""
         alpha, mask = (None if x is None else hardware.copy_to_device(x, device) for x in (self.alpha, self.mask))
         return Pixels(hardware.copy_to_device(self.rgb, device), alpha, mask)
 
@@ -70,7 +70,7 @@ class Pixels:
         return Pixels(self.rgb[chosen].contiguous(), alpha, mask)
 
     def over(self, background: Tensor) -> Tensor:
-        """Return the (H, W, C) image composited over a (C,) colour; opaque pixels are returned unchanged."""
+        """Return the (H, W, C) image, composited over a (C,) colour; images without alpha are returned unchanged."""
         rgb, alpha = self.rgb, self.alpha  # in this order: stored images convert both at once
         if alpha is None:
             return rgb
@@ -113,7 +113,7 @@ class ViewSubset(ViewSet):
         return self._views.pixels(self._indices[index])
 
     def source(self, index: int) -> tuple[ViewSet, int]:
-        """Return the set that has the view, and its index there."""
+        """Return the view set that contains the view ``index``, and the index of the view in that set."""
         return self._views, self._indices[index]
 
 
@@ -121,14 +121,14 @@ class ViewSubset(ViewSet):
 class PointCloud:
     """Points where training may start primitives."""
 
-    means: Tensor  # (N, 3) scene units; right after reading a file, float64 world units (see within)
+    means: Tensor  # (N, 3) positions, scene units; float64 world units before within() converts them
     colors: Tensor  # (N, C) in the data set's colour space
-    conditions: Mapping[str, Tensor] = field(default_factory=dict)  # (N,) when each was observed, e.g. "time" -> 0..1
+    conditions: Mapping[str, Tensor] = field(default_factory=dict)  # "time" -> (N,), at which points were observed
     axes: Tensor | None = None  # (N, 3) semi-axes of ellipsoids
     quats: Tensor | None = None  # (N, 4) rotations wxyz of the ellipsoids
     alphas: Tensor | None = None  # (N,) opacities 0..1 at the centres
     deviations: Tensor | None = None  # (N, 3) standard deviations of Gaussians, instead of axes
-    steps: Mapping[str, float] = field(default_factory=dict)  # condition -> distance of neighbouring frames, if known
+    steps: Mapping[str, float] = field(default_factory=dict)  # condition -> step between neighbouring frames
 
     def rows(self, index: Tensor) -> PointCloud:
         """Return the points at (M,) int64 or (N,) bool ``index``."""
@@ -137,7 +137,7 @@ class PointCloud:
         return replace(self, **chosen, conditions={n: value[index] for n, value in self.conditions.items()})
 
     def within(self, world: World) -> PointCloud:
-        """Return the points in scene coordinates; positions are converted in float64."""
+        """Return the points converted from ``world`` to scene coordinates, in float64."""
         means = world.scene_points(self.means).float()
         scale, quats = world.scale, self.quats
         axes, deviations = (x if x is None or scale == 1.0 else x * scale for x in (self.axes, self.deviations))
@@ -150,12 +150,12 @@ class PointCloud:
 
 @dataclass(frozen=True)
 class Clip:
-    """A film of views, in this order."""
+    """A film that shows views one after the other."""
 
     name: str
-    views: Sequence[int]  # indices into source
+    views: Sequence[int]  # indices into source, in the order of the film
     fps: float = 12.0  # frames per second
-    source: ViewSet | None = None  # None for the test split
+    source: ViewSet | None = None  # view set that indices refer to; None for the test split
 
 
 StartingPoints = Callable[[ViewSet, int, torch.Generator], PointCloud]
@@ -166,19 +166,19 @@ generator alone."""
 @final
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Dataset:
-    """A scene to train on: views, starting points, and what is known about it. Subclasses are refused."""
+    """The data of a scene to train on: views, starting points and properties. Subclasses are refused."""
 
     name: str  # shown in reports
     train: ViewSet  # training views
     test: ViewSet  # held-out views
     start: StartingPoints  # function that returns the starting points
-    extent: float  # size in scene units (camera_extent), the unit of learning rates and size limits
+    extent: float  # size of the scene in scene units (camera_extent), the unit of learning rates and size limits
     background: Tensor  # (C,) colour that evaluation composites over
     channels: int = 3  # C, channels of the images
-    color_space: Literal["srgb", "linear"] = "srgb"  # "srgb" as stored in PNG
-    data_source: DataSource = "real"  # for reports
+    color_space: Literal["srgb", "linear"] = "srgb"  # of images; "srgb" as stored in PNG
+    data_source: DataSource = "real"  # origin of the data, for reports
     random_background: bool = False  # whether training composites random colours (needs alpha)
-    downsampling: str = "none"  # for reports, e.g. "images_4" or "200x200 from 800x800 by area"
+    downsampling: str = "none"  # of images, for reports: "images_4" or "200x200 from 800x800 by area"
     up: Tensor = field(default_factory=lambda: torch.tensor([0.0, 0.0, 1.0]))  # (3,) upward direction, for orbits
     center: Tensor = field(default_factory=lambda: torch.zeros(3))  # (3,) point that the cameras look at, for orbits
     bounds: Tensor | None = None  # (2, 3) lower and upper corner of a box around everything, scene units, if known
@@ -186,7 +186,7 @@ class Dataset:
     world: World = field(default_factory=World)  # transform between the scene and the user's files
     placement: DensityGridPlacement | None = None  # placement of the scene's voxel files, if it has any
     largest: float | None = None  # largest extinction, 1/scene unit, if known; primitives stay below it
-    points: PointSupervision | None = None  # known points, for train.supervision=voxels and both
+    points: PointSupervision | None = None  # points with ground truth, for train.supervision=voxels and both
     # inputs of training views that are uncertain and learned with the model: "camera", names of conditions
     refine: Mapping[str, Correction] = field(default_factory=dict)
     extra: object = None  # further data in a class of the task, e.g. pixel classes; tasks accept None
@@ -213,8 +213,8 @@ class Dataset:
     def orbit(self, frames: int) -> list[View]:
         """Return views on a circle at the mean distance and elevation of the training cameras.
 
-        They look outward if the training cameras do. Scalar conditions run from their lowest to their highest training
-        value; others keep the value of the first view.
+        The views look outward if the training cameras do. Conditions that are one number run from their lowest to their
+        highest training value; other conditions keep the value of the first view.
         """
         cameras = [self.train.view(i).camera for i in range(len(self.train))]
         far = find_outliers(torch.stack([c.position for c in cameras]))
@@ -248,20 +248,20 @@ class Dataset:
 
 @dataclass(frozen=True)
 class PointSamples:
-    """Ground truth of a volume at M points of one frame."""
+    """Ground-truth extinction and source radiance of a volume at M points of one frame."""
 
     name: str  # name of the frame, for logs
     conditions: Conditions  # conditions of the frame, shared by all points
     points: Tensor  # (M, 3) float32, scene units
     sigma: Tensor  # (M,) float32 extinction, 1/scene unit
     source: Tensor | None  # (M, C) float32 extinction times isotropic source radiance; None trains the extinction only
-    sigma_scale: float  # typical sigma inside matter, by which its errors are divided
-    source_scale: float = 1.0  # typical source inside matter, by which its errors are divided
+    sigma_scale: float  # typical sigma inside matter; the loss divides errors of sigma by it
+    source_scale: float = 1.0  # typical source inside matter; the loss divides errors of source by it
     components: Mapping[str, tuple[Tensor, float]] = field(default_factory=dict)  # grid -> (M,) part of sigma, scale
 
 
 class PointSupervision(ABC):
-    """Base class of sources of known points, see :attr:`Dataset.points`."""
+    """Base class of objects that draw points with known ground truth, see :attr:`Dataset.points`."""
 
     components: tuple[str, ...] = ()  # names of the source grids in PointSamples.components
 
@@ -271,9 +271,9 @@ class PointSupervision(ABC):
 
 
 def hold_out_views(dataset: Dataset, every: int) -> Dataset:
-    """Replace the test split by every ``every``-th training view, which is no longer trained on.
+    """Return the data set with one of every ``every`` training views moved to the test split, which is replaced.
 
-    The position within each group of ``every`` views advances by one from group to group. So no single moment of a
+    The position of the moved view advances by one from each group of ``every`` views to the next. So no time step of a
     multi-camera sequence is missing from all cameras. Raises ConfigError: ``every`` < 2, or fewer than two training
     views.
     """
@@ -292,25 +292,25 @@ class DatasetImages(ABC):
     frames: Sequence[str]  # names of the frames, in order
     key: str  # hash of everything the images depend on; all processes must agree on it
     place: str  # folder or URL of the images
-    known: Mapping[str, Any]  # plain values that save other processes repeated work; passed to the scene's truth
+    known: Mapping[str, Any]  # plain values that other processes need not compute again; passed to SceneSpec.truth
 
     @abstractmethod
     def missing(self) -> list[int]:
-        """Return the indices of missing frames, in order."""
+        """Return the indices of the frames that have no images yet, in order."""
 
     @abstractmethod
     def begin(self) -> None:
-        """Prepare the place, before the first frame is rendered."""
+        """Prepare the folder or URL :attr:`place`, before the first frame is rendered."""
 
     @abstractmethod
     def make(self, frame: int, tell: Callable[[str], None]) -> None:
-        """Render a frame unless it exists. Writes are atomic, so processes may overlap.
+        """Render and write the images of a frame unless they exist. Writes are atomic, so processes may overlap.
 
-        Raises DataError if the source cannot be read or the place cannot be written.
+        Raises DataError if the source cannot be read or :attr:`place` cannot be written.
 
         Args:
             frame: index of the frame.
-            tell: function to call with a line of text while the place is unavailable.
+            tell: function to call with a line of text while :attr:`place` is unavailable.
         """
 
     @abstractmethod
@@ -320,16 +320,19 @@ class DatasetImages(ABC):
 
 @dataclass(frozen=True)
 class SceneContext:
-    """Input of a scene's loader besides its settings."""
+    """Input of the function that loads a scene, besides the settings of the scene."""
 
     seed: int  # seed for generated scenes
-    cache_dir: Path  # folder for generated data, by a key of everything they depend on
+    cache_dir: Path  # folder for generated data; a scene stores them under a key of all they depend on
     progress: Callable[[str, float], None] = lambda text, fraction: None  # to call with (text, fraction 0..1)
     world: World | None = None  # transform of the model that the scene is loaded for; None lets the scene choose
 
 
 def camera_extent(cameras: Sequence[Camera]) -> float:
-    """Return 1.1 times the largest distance of a camera from their mean, without outliers; 1.0 if it is 0."""
+    """Return 1.1 times the largest distance of a camera from the mean camera centre; 1.0 if the distance is 0.
+
+    Outliers are ignored.
+    """
     positions = torch.stack([c.position.detach().double() for c in cameras])
     positions = positions[~find_outliers(positions)]
     radius = (positions - positions.mean(0)).norm(dim=-1).max().item() * 1.1
@@ -361,8 +364,8 @@ def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
 def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
     """Return whether the optical axes determine a point in front of the cameras.
 
-    They pass it closer than half the spread of the centres, and 9 of 10 cameras look towards it. Parallel axes, outward
-    rings and tripods do not.
+    The axes must pass the point closer than half the spread of the centres, and 9 of 10 cameras must look towards it.
+    Parallel axes, outward rings and tripods determine no point.
     """
     positions, forward = _dataset_optical_axes(cameras)
     offsets = dataset_focus_point(cameras) - positions
@@ -385,11 +388,11 @@ FAR = 100.0  # camera extents from the origin, beyond which a scene is moved: fl
 
 
 def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
-    """Choose the transform between a scene and the world of its file: an offset for a scene far from the origin.
+    """Choose the transform between a scene and the world of its file: an offset if the scene is far from the origin.
 
-    If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin,
-    rounded to a power of ten between one and ten extents. Other scenes keep their coordinates bit for bit.
-    ``where`` names the file in warnings.
+    If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin. It is
+    first rounded to multiples of a power of ten between one and ten extents. Other scenes keep their coordinates bit
+    for bit. ``where`` names the file in warnings.
     """
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres

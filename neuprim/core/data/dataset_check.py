@@ -27,7 +27,8 @@ class DatasetError(DataError):
 
 
 def check_dataset_views(dataset: Dataset, conditions: Sequence[ConditionSpec]) -> None:
-    """Raise DatasetError unless members, all views, and the pixels of both splits' first view are valid."""
+    """Raise DatasetError unless the data set's attributes, all views, and the first view's pixels of both splits are
+    valid."""
     _check_dataset_values(dataset)
     for split in ("train", "test"):
         views: ViewSet = getattr(dataset, split)
@@ -54,7 +55,7 @@ def check_pixels(split: str, view: View, pixels: Pixels, channels: int) -> None:
 
 
 def check_mask(split: str, view: View, mask: Tensor) -> None:
-    """Check a mask alone, as :func:`check_pixels` does."""
+    """Check shape and dtype of a view's mask against its camera; raise DatasetError naming the ``split``."""
     size = (view.camera.height, view.camera.width)
     _check_dataset_tensor(f"{split} view {view.name}: mask", mask, torch.bool, size, ", rows x columns, or None")
 
@@ -76,7 +77,7 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
 
 
 def check_point_samples(samples: PointSamples, dataset: Dataset) -> None:
-    """Check shapes and dtypes of points to learn from, in every step; raise DatasetError."""
+    """Check shapes and dtypes of ground-truth points, in every training step; raise DatasetError."""
     _check_dataset_instance(f"{dataset.name}: points", samples, PointSamples)
     where = f"{dataset.name}: points of {samples.name}"
     count = len(samples.sigma) if isinstance(samples.sigma, Tensor) and samples.sigma.dim() else 0
@@ -183,7 +184,7 @@ def _check_dataset_tensor(where: str, value: Any, dtype: torch.dtype, shape: tup
 
 
 def _check_finite_dataset_tensor(where: str, value: Any, shape: tuple[int, ...], more: str = "") -> None:
-    """Require finite floating-point numbers of any precision."""
+    """Raise DatasetError unless ``value`` is a finite floating-point tensor of this shape, of any precision."""
     if not (isinstance(value, Tensor) and value.is_floating_point() and tuple(value.shape) == shape):
         _refuse_dataset_tensor(where, value, torch.float32, shape, more)
     _check_finite_dataset_values(value, where)

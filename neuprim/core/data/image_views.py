@@ -1,4 +1,4 @@
-"""Posed image files as a view set: decoded on demand, masked, freed of lens distortion, reduced and cached."""
+"""Posed image files as a view set: decoded on demand, masked, undistorted, down-sampled and cached."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ class Distortion(ABC):
 
     @abstractmethod
     def project(self, points: np.ndarray, camera: Camera) -> np.ndarray:
-        """Return (M, 2) pixels of the photograph for (M, 2) directions (x/z, y/z), float64; centres at +0.5."""
+        """Return (M, 2) pixels of the photograph for (M, 2) directions (x/z, y/z), float64; pixel centres at +0.5."""
 
 
 @dataclass(frozen=True)
 class RadialDistortion(Distortion):
-    """OpenCV's lens model: radius times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and tangential terms p1, p2."""
+    """OpenCV's lens model: radius r times 1 + k1 r^2 + k2 r^4 + k3 r^6 + k4 r^8, and tangential terms p1, p2."""
 
     k1: float = 0.0
     k2: float = 0.0
@@ -118,14 +118,15 @@ class Mask:
     """A mask file: pixels of value zero are ignored."""
 
     path: Path
-    inverted: bool = False  # ignore the other pixels instead
+    inverted: bool = False  # ignore pixels that are not zero instead
 
 
 def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
-    """Return the mask of every image file, None without; warns how many there are.
+    """Return the mask of every image file, None for images without a mask; warns how many masks there are.
 
-    ``images/a/b.jpg`` has ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP, nerfstudio). Of
-    ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` beside the image (instant-ngp) is inverted.
+    The mask of ``images/a/b.jpg`` is ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP,
+    nerfstudio). For ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` next to the image (instant-ngp) is
+    inverted.
 
     Args:
         images: folder of the images; None for the first part of their paths if it begins with "images".
@@ -156,12 +157,15 @@ def _find_mask(folder: Path, file: Path, images: Path | None) -> Mask | None:
 
 
 def average_pixels(values: Tensor, factor: int) -> Tensor:
-    """Average (H, W, C) over blocks: (H // factor, W // factor, C). The remainder is cut off."""
+    """Average (H, W, C) over blocks of ``factor`` x ``factor`` pixels: (H // factor, W // factor, C).
+
+    Remaining rows and columns are cut off.
+    """
     return F.avg_pool2d(values.permute(2, 0, 1), factor).permute(1, 2, 0).contiguous()
 
 
 def reduce_image_mask(mask: Tensor, factor: int) -> Tensor:
-    """Reduce a mask to (H // factor, W // factor) bool: True where all pixels of a block are."""
+    """Reduce a mask to (H // factor, W // factor) bool: True where all pixels of a block are True."""
     return F.avg_pool2d(mask[None].float(), factor)[0] > 0.999
 
 
@@ -195,13 +199,13 @@ def _premultiply_dataset_kernel(rgba, rgb, alpha):  # type: ignore[no-untyped-de
 
 @dataclass(frozen=True)
 class _StoredImage:
-    """Final pixels of a view, (H, W, C) uint8, half or float, and the mask of those that count."""
+    """Decoded pixels of a view, (H, W, C) uint8, half or float, and the mask of the pixels that count."""
 
     data: Tensor
     premultiplied: bool
     mask: Tensor | None
     to_linear: bool = False  # whether 8-bit colours are converted to linear light
-    scale: float = 1.0  # factor of colours after that
+    scale: float = 1.0  # factor on the colours, after to_linear
 
     def strided(self, step: int, column: int, row: int) -> _StoredImage:
         data, words = self.data, self.data.dtype == torch.uint8 and self.data.shape[-1] == 4
@@ -239,11 +243,12 @@ class _StoredImage:
 
 
 class StoredPixels(Pixels):
-    """Pixels of a stored image, converted to floats on first use: of a strided view only its own pixels, and only alpha
-    if nothing reads the colours.
+    """Pixels of a stored image, converted to floats on first use.
+
+    Strided views convert only their own pixels. Alpha is converted alone if nothing reads the colours.
 
     Args:
-        image: the image, or None with the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
+        image: the image; None if ``fields`` has the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
     """
 
     image: _StoredImage | None
@@ -268,10 +273,11 @@ class StoredPixels(Pixels):
 
 
 class ImageViews(ViewSet):
-    """Views of image files: decoded on demand, masked, undistorted, reduced and cached. Thread-safe.
+    """Views of image files: decoded on demand, masked, undistorted, down-sampled and cached. Thread-safe.
 
     Args:
-        downsample: factor by which images are reduced; remainders are cut off. ConfigError if an image is smaller.
+        downsample: factor by which images are reduced; remaining rows and columns are cut off. An image smaller than
+            the factor is a ConfigError.
         cache_bytes: size of the cache, which holds uint8 (PNG, JPEG) or half (OpenEXR).
         to_linear: convert sRGB files to linear light first.
     """
@@ -305,13 +311,13 @@ class ImageViews(ViewSet):
         return self._frames[index].path
 
     def pixels(self, index: int) -> Pixels:
-        """Return the pixels of a view; DataError if the file is missing, damaged or changed, or wholly masked."""
+        """Return the pixels of a view; raise DataError if the file is missing, damaged, changed or wholly masked."""
         return StoredPixels(replace(self._load_image(range(len(self))[index]), scale=self.scale))
 
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode and cache all images; return the errors of bad ones. ``empty`` allows transparent images."""
+        """Decode and cache all images; return view index -> error of bad ones. ``empty`` allows transparent images."""
 
         def fault(index: int) -> DataError | None:
             try:
@@ -331,7 +337,7 @@ class ImageViews(ViewSet):
         return faults
 
     def drop(self, indices: Container[int]) -> None:
-        """Remove views; later ones move up."""
+        """Remove the views at ``indices``; the indices of later views decrease."""
         left = [i for i in range(len(self)) if i not in indices]
         self._frames, self._cameras = [self._frames[i] for i in left], [self._cameras[i] for i in left]
         self._stored = {new: self._stored[old] for new, old in enumerate(left) if old in self._stored}

@@ -25,9 +25,9 @@ _ROUNDS = 8  # times that points are drawn in the box, until enough of them are 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a static scene.
 
-    These are the given ``points`` if there are any. Otherwise they are inferred, each seen by at least two cameras:
-    along the rays if the cameras do not look at one point, else on the visual hull for images with alpha, else in a
-    box around the focus.
+    If ``points`` are given, the starting points are drawn from them. Otherwise they are inferred, each in the image of
+    at least two cameras: along the rays if the cameras do not look at one point, else on the visual hull for images
+    with alpha, else in a box around the focus.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -56,7 +56,7 @@ def views_have_alpha(views: ViewSet) -> bool:
 
 
 def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
-    """Draw at most ``count`` distinct points uniformly, in their own order."""
+    """Draw at most ``count`` points with distinct positions, uniformly; the points stay in their order."""
     rows = _distinct_point_rows(points)
     if len(rows) > count:
         rows = rows[torch.randperm(len(rows), generator=generator)[:count]].sort().values
@@ -64,7 +64,7 @@ def draw_points(points: PointCloud, count: int, generator: torch.Generator) -> P
 
 
 def hull_points(views: ViewSet, count: int, generator: torch.Generator, resolution: int = 128) -> PointCloud:
-    """Spread ``count`` points over the visual hull's surface, with sub-voxel jitter and pixel colours."""
+    """Spread ``count`` points over the surface of the visual hull, with sub-voxel jitter and colours of the pixels."""
     centers, voxel = hull_surface(views, resolution)
     spread = count <= len(centers)
     rows = farthest_points(centers, count, generator) if spread else torch.arange(count) % len(centers)
@@ -73,7 +73,10 @@ def hull_points(views: ViewSet, count: int, generator: torch.Generator, resoluti
 
 
 def box_starting_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-    """Draw points in a cube around the focus, half the median camera distance to a side, seen by two cameras."""
+    """Draw points in a cube around the focus point of the cameras, each in the image of at least two cameras.
+
+    The side of the cube is the median distance of the cameras from that point.
+    """
     cameras = [views.view(i).camera for i in range(len(views))]
     center = dataset_focus_point(cameras)
     half = 0.5 * torch.stack([c.position for c in cameras]).sub(center).norm(dim=-1).median()
@@ -139,10 +142,10 @@ def _thin_points_by_grid(points: Tensor, count: int, generator: torch.Generator)
 
 
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
-    """Return (N, C) per-channel medians of the pixels that the points (N, 3) project to, not premultiplied.
+    """Return (N, C) colours of the points (N, 3): per-channel medians, over the views, of the pixels they project to.
 
-    A view counts where the point falls on a valid pixel with alpha above ``matter``. Points without views get
-    the median of the others, or mid-grey.
+    A view counts if the point falls on a valid pixel with alpha above ``matter``. Colours are not premultiplied. Points
+    in no view get the median colour of the other points, or mid-grey.
     """
     indices = sorted({round(i) for i in np.linspace(0, len(views) - 1, min(len(views), _COLOR_VIEWS))})
     samples = torch.stack(
@@ -179,10 +182,10 @@ _SHELL = 0.1  # share of the points that surround everything
 
 
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
-    """Return at most ``count`` points on what the views show and ``points`` leave out, with pixel colours.
+    """Return at most ``count`` points for surroundings that the views show but ``points`` do not contain.
 
-    Pixels without a point nearby are lifted to the depth of their neighbours, unless other views already cover
-    the place. A tenth of the points form a shell around everything, where some view looks.
+    Pixels without a point nearby become points, with their colours, at the depth of their neighbours, unless other
+    views already cover the position. A tenth of the points form a shell around the scene, where some view looks.
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))

@@ -34,8 +34,8 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
 
     Colours (``f_dc_0..2``, or ``red green blue``) are taken for sRGB, and become ``channels`` in ``color_space``.
     ``scale_0..2`` with ``rot_0..3`` (wxyz) and ``opacity`` (a logit) make Gaussians; two scales are discs, one a ball.
-    Vertices that stand for no point are left out with a warning. Raises DataError for a damaged or compressed file,
-    or one without usable points.
+    Vertices that are no valid points are left out with a warning. Raises DataError for a damaged or compressed file,
+    or a file without usable points.
     """
     if path.suffix.lower() in COMPRESSED:
         raise _compressed_start_points_error(path, f"{path.suffix} is a compressed format of Gaussians")

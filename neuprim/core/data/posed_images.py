@@ -65,14 +65,14 @@ _T = TypeVar("_T")
 
 
 class BadImageViews:
-    """Collection of damaged views, which are left out with a warning each; if ``strict``, the first is raised."""
+    """Collect the errors of damaged views, which are left out with a warning each; if ``strict``, raise the first."""
 
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
         self._faults: list[str] = []
 
     def read(self, name: str, function: Callable[_P, _T], *args: _P.args, **more: _P.kwargs) -> _T | None:
-        """Call ``function``; return None for a view that it refuses."""
+        """Return ``function(*args, **more)`` for the view ``name``; None if it raises DataError, which is recorded."""
         try:
             return function(*args, **more)
         except DataError as error:
@@ -88,7 +88,7 @@ class BadImageViews:
             self._first = error
 
     def settle(self, count: int) -> None:
-        """Warn of the bad ones of ``count`` views; raises DataError where most are bad."""
+        """Warn of the recorded bad views, out of ``count`` views; raise DataError if most views are bad."""
         bad = len(self._faults)
         if 2 * bad > count:
             more = "" if count == 1 else f"; {bad} of {count} views of {self._where} are like this"
@@ -104,11 +104,12 @@ _LISTED = 10
 
 
 class MissingFiles(DataError):
-    """Files that a data set names do not exist."""
+    """Error: files that a data set names do not exist."""
 
 
 def find_image(folder: Path, text: str) -> Path | None:
-    """Return the image ``text`` below ``folder``: as written, with a usual suffix, or in another case; else None."""
+    """Return the image file ``text`` below ``folder``, also if the suffix is missing or upper and lower case differ;
+    None if there is no such file."""
     text = str(folder / text.replace("\\", "/"))
     try:
         found = next((Path(text + s) for s in ("", *IMAGE_SUFFIXES) if Path(text + s).is_file()), None)
@@ -150,7 +151,7 @@ def exif_hint(info: ImageInfo) -> str:
 
 
 def missing_dataset_files_error(where: str, names: Sequence[str], hint: str = "") -> MissingFiles:
-    """Make one error for all absent files, naming the first ten."""
+    """Return one error for all missing files of a data set; its message names the first ten."""
     more = f" and {len(names) - _LISTED} more" if len(names) > _LISTED else ""
     return MissingFiles(f"{where}: {len(names)} files not found: {', '.join(names[:_LISTED])}{more}{hint}")
 
@@ -185,15 +186,15 @@ def split_every_nth(frames: Sequence[ImageFrame], n: int) -> tuple[list[ImageFra
 class SceneDetails:
     """Properties of a scene that a format provides besides its images."""
 
-    up: Tensor | None = None  # (3,) upward direction; None for the mean of the cameras' own
+    up: Tensor | None = None  # (3,) upward direction; None for the mean of the cameras' upward directions
     points: PointCloud | None = None  # starting points of the format, float64 in the coordinates of the file
     prefix: str = ""  # reduction that the files already have, e.g. "images_4"
     start: StartingPoints | None = None  # None takes points, else infers them from images at rest (initial_points)
     to_linear: bool = False  # convert sRGB files to linear light
-    exposure: float | Callable[[ImageViews], float] = 1.0  # divisor of linear values, perhaps from the training views
-    extra: object = None  # Dataset.extra
+    exposure: float | Callable[[ImageViews], float] = 1.0  # divisor of linear values, or a function that finds it
+    extra: object = None  # value of Dataset.extra
     positions: Sequence[str] = ()  # conditions that are positions, float64 in the coordinates of the file
-    home: Path | None = None  # folder of the data set, if it is not the one that where names
+    home: Path | None = None  # folder of the data set; None: the path that ``where`` names
 
 
 def assemble_dataset(
@@ -205,13 +206,14 @@ def assemble_dataset(
     context: SceneContext,
     details: SceneDetails = SceneDetails(),
 ) -> Dataset:
-    """Return a data set of two splits of image files.
+    """Return the data set with the given training and test frames.
 
     Args:
         where: file or folder that errors name.
 
     Raises:
-        DataError: an empty split, mixed kinds of images, most images damaged, or one with ``settings.strict``.
+        DataError: an empty split, mixed kinds of images, or most images damaged; with ``settings.strict``, any damaged
+            image.
         ConfigError: a random background without alpha, or a down-sampling factor larger than an image.
     """
     _check_dataset_splits(where, train, test, settings)
@@ -291,7 +293,7 @@ def _preload_split(
 
 
 def image_frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
-    """Move the camera and the conditions ``positions`` of a frame into the scene, in float64."""
+    """Convert a frame's camera and its conditions in ``positions`` from world to scene coordinates, in float64."""
     moved = {name: world.scene_points(frame.conditions[name]).float() for name in positions}
     return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 

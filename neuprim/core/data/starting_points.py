@@ -22,7 +22,7 @@ _COARSE = 64
 
 
 class EmptyHull(DataError):
-    """No voxel is left: masks and cameras disagree, or nothing is opaque."""
+    """Error: the visual hull has no voxel, because masks and cameras disagree or nothing is opaque."""
 
 
 @dataclass(frozen=True)
@@ -48,11 +48,11 @@ class _VoxelGrid:
 def hull_surface(
     views: ViewSet, resolution: int, seen_views: float = 0.5, wrong_views: float = 0.02, matter: float = 0.5
 ) -> tuple[Tensor, float]:
-    """Return centres (M, 3) float32 of the hull's surface voxels, and the voxel side, scene units.
+    """Return centres (M, 3) float32 of the visual hull's surface voxels, and the side of a voxel, in scene units.
 
-    ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull if at least the share
-    ``seen_views`` of the views contains it, and at most the share ``wrong_views`` shows no ``matter`` (alpha) there.
-    Raises EmptyHull if no voxel is left.
+    ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull if at least the fraction
+    ``seen_views`` of the views contains it, and alpha is at most ``matter`` there in at most the fraction
+    ``wrong_views``. Raises EmptyHull if the hull has no voxel.
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
@@ -131,7 +131,7 @@ def _carve_voxels(
 def _carve_hull_points(
     points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
 ) -> Any:
-    """Return (M,) bool of the points that at least ``needed`` views contain and at most ``allowed`` of those rule out.
+    """Return (M,) bool of the points in the images of ``needed`` or more views, with no matter in at most ``allowed``.
 
     ``points`` (M, 3), ``poses`` (V, 3, 4) world to camera, ``lenses`` (V, 6) fx fy cx cy width height, all float64. The
     summed-area table (height+1, width+1) of view j begins at ``tables[offsets[j]]``. ``reach`` is half the side of the
@@ -172,7 +172,7 @@ _PROBES = 2000  # pixels whose depth is searched
 _OTHERS = 32  # views with which they are compared
 _STEPS = 2.0 ** torch.arange(-2.0, 8.5, 0.5, dtype=torch.float64)  # depths that are tried, in camera extents
 _INFINITY = 1e6  # in camera extents
-_SEEN = 0.1  # a depth counts only if other views show more than this share of the pixels at that depth
+_SEEN = 0.1  # a depth counts only if other views show more than this fraction of the pixels at that depth
 _SAME = 1.02  # up to this ratio of differences, infinity agrees with the images as well as the best depth does
 _TRIED = 8  # depths tried per ray; the one at which other views agree best is used
 _PRIOR = 0.5  # weight of how well a depth fits all rays, relative to how well it fits one: some views agree by chance
@@ -180,19 +180,19 @@ _ROUNDS = 8
 
 
 def count_seeing_views(views: ViewSet, means: Tensor) -> Tensor:
-    """Return (N,) int64: how many of at most 100 views contain each of the points (N, 3)."""
+    """Return (N,) int64 counts of the views whose images contain each of the points (N, 3), among at most 100 views."""
     return torch.stack([views.view(i).camera.sees(means) for i in evenly_spaced(len(views), _VIEWS)]).sum(0)
 
 
 def ray_starting_points(
     views: ViewSet, count: int, generator: torch.Generator, matter: float = 0.5
 ) -> tuple[PointCloud, Tensor]:
-    """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with pixel colours.
+    """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with the colours of the pixels.
 
-    Depths range over those at which other views show the same colours. If no depth fits better than infinity, the
-    cameras count as one and the depth unit is arbitrary. Points must be seen by two cameras, unless the cameras count
-    as one. A pixel shows matter where alpha is above ``matter``. Returned are the points, and the (N,) views that they
-    come from. Raises DataError: no two cameras see the same place, or no pixel shows matter.
+    Returns the points, and the (N,) indices of the views that they come from. Depths range over those at which other
+    views show the same colours. If no depth fits better than infinity, the cameras count as one, and the unit of depth
+    is arbitrary. Otherwise every point must be in the images of two cameras. Only pixels with alpha above ``matter``
+    are used. Raises DataError: no two cameras see the same position, or no pixel has enough alpha.
     """
     depths, mean, needed = _find_starting_depths(views, generator, matter)
     found: list[tuple[Tensor, Tensor, Tensor]] = []

@@ -1,6 +1,6 @@
 """Frames of ``transforms.json`` files: cameras, lenses, masks and splits.
 
-Read are the files of instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³. Intrinsics
+The reader accepts files of instant-ngp, nerfstudio, BlenderNeRF, NeRF-synthetic, D-NeRF, NRHints and GS³. Intrinsics
 and other keys: :mod:`neuprim.core.cameras.intrinsics`. Poses are camera to world with OpenGL axes.
 """
 
@@ -51,7 +51,7 @@ def _image_frame_viewmat(record: JsonReader) -> Tensor:
 
 @dataclass(frozen=True)
 class TransformsLayout:
-    """Options of the reader in which formats differ."""
+    """How to read one format of ``transforms.json``: the points in which the formats differ."""
 
     keys: tuple[str, ...] = ()  # further keys that the loader reads
     name: Callable[[JsonReader], str] = _image_frame_path  # path of a frame's image, as the file states it
@@ -59,7 +59,7 @@ class TransformsLayout:
         folder, _image_frame_path(frame)
     )
     viewmat: Callable[[JsonReader], Tensor] = _image_frame_viewmat  # (4, 4) world to camera, OpenCV axes
-    masks: bool = False  # whether a folder ``masks`` beside the images counts where the file names no mask
+    masks: bool = False  # whether to look for a folder ``masks`` next to the images if the file names no mask
 
 
 def read_image_frames(
@@ -72,9 +72,10 @@ def read_image_frames(
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
     """Read the good frames whose images exist, with their records, in the order of ``records``.
 
-    ``document`` is the whole file, which provides what frames leave out; paths start at ``folder``. ``skip_missing``
-    leaves frames without an image out, unless that leaves none. Raises DataError for missing images or masks, wrong,
-    contradictory or unsupported fields, most views bad, or any bad view with ``settings.strict``.
+    ``document`` is the whole file; its fields apply to frames that lack them. Paths are relative to ``folder``.
+    ``skip_missing`` leaves out frames whose image is missing, unless no frame would remain. Raises DataError for
+    missing images or masks, wrong, contradictory or unsupported fields, most views bad, or, with ``settings.strict``,
+    any bad view.
     """
     for record in (document, *records):
         refuse_unsupported_camera_keys(record)
@@ -138,7 +139,7 @@ def _image_pose_numbers(value: object) -> list[float]:
 def _find_frame_masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
-    """Return the mask of every frame, or None: from ``mask_path`` of frame or file, else from next to the images."""
+    """Return the mask of every frame, or None: ``mask_path`` of the frame or file, else a mask next to the images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return find_masks(folder, [file for _, file in present])
     masks, lost = [], []
@@ -154,7 +155,7 @@ def _find_frame_masks(
 
 
 def _read_distortion(record: JsonReader, document: JsonReader, fisheye: bool) -> Distortion | None:
-    """Return the lens; None for one that is not a fisheye and has only zero coefficients."""
+    """Return the lens distortion of a frame; None for a lens that is not a fisheye and has only zero coefficients."""
     lens = read_lens_coefficients(record, document)
     k, p = [lens[f"k{i}"] for i in (1, 2, 3, 4)], [lens["p1"], lens["p2"]]
     if fisheye:
@@ -187,9 +188,9 @@ def split_named_images(
 ) -> tuple[list[ImageFrame], list[ImageFrame]]:
     """Split frames into (training, test) by the lists of names in the file, else every n-th is a test view.
 
-    Test views are those of ``test_filenames``, else of ``val_filenames``, else all that do not train. Training views
-    are those of ``train_filenames``, else all that no list names. Validation views never train. Raises DataError: a
-    list names an unknown image, or training and test lists overlap.
+    Test views are those in ``test_filenames``, else those in ``val_filenames``, else all views that are not training
+    views. Training views are those in ``train_filenames``, else all views that no list names. Validation views are
+    never trained on. Raises DataError: a list names an unknown image, or training and test lists overlap.
     """
     keys = [key for key in ("train_filenames", "val_filenames", "test_filenames") if document.has(key)]
     lists = {key: set(map(_plain_image_path, document.texts(key))) for key in keys}

@@ -1,1 +1,1 @@
-"""Files: images, films, PLY, OpenVDB and JSON, and atomic writes."""
+"""Read and write files: images, animations, PLY, OpenVDB and JSON; atomic writes."""

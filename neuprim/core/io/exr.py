@@ -1,4 +1,4 @@
-"""Read and write OpenEXR files: linear light, any named channels, atomic writes, lossless ZIP compression.
+"""Read and write OpenEXR files with any named channels. Written files use lossless ZIP compression, atomically.
 
 Channels without a prefix are the image (R, G, B and premultiplied A). A prefix and a dot name a layer, e.g.
 ``depth.Z``.
@@ -32,7 +32,7 @@ _MAGIC = b"\x76\x2f\x31\x01"
 
 
 def check_image_file_size(path: Path, width: int, height: int) -> None:
-    """Raise DataError unless a header's size is positive and at most :data:`MAX_PIXELS`."""
+    """Raise DataError unless an image has at least one pixel and at most :data:`MAX_PIXELS`."""
     if width <= 0 or height <= 0:
         raise DataError(f"{path}: header claims {width}x{height} pixels; expected a positive size")
     if width * height > MAX_PIXELS:
@@ -41,7 +41,7 @@ def check_image_file_size(path: Path, width: int, height: int) -> None:
 
 @contextmanager
 def refuse_image_file_beyond_memory(path: Path) -> Iterator[None]:
-    """Turn MemoryError into a DataError that names the image; damaged files also claim more than they hold."""
+    """Turn a MemoryError in the block into a DataError that names the image; damaged headers can claim huge sizes."""
     try:
         yield
     except MemoryError:
@@ -50,12 +50,12 @@ def refuse_image_file_beyond_memory(path: Path) -> Iterator[None]:
 
 
 def default_exr_channel_names(count: int) -> tuple[str, ...]:
-    """Return the names R, G, B for three channels, Y for one, else c0, c1, ..."""
+    """Return names for ``count`` channels: R, G, B for three, Y for one, else c0, c1, ..."""
     return {1: ("Y",), 3: ("R", "G", "B")}.get(count, tuple(f"c{i}" for i in range(count)))
 
 
 def exr_channel_name_error(names: Sequence[Any]) -> str | None:
-    """Return ``"PROBLEM; expected ..."`` for the first name that OpenEXR cannot hold or is ambiguous, else None."""
+    """Return ``"PROBLEM; expected ..."`` for the first channel name that is invalid or ambiguous, else None."""
     used: set[str] = set()
     for i, name in enumerate(names):
         if not isinstance(name, str):
@@ -72,7 +72,7 @@ def exr_channel_name_error(names: Sequence[Any]) -> str | None:
 
 
 def is_exr(path: Path, required: bool = False) -> bool:
-    """Return whether a file starts as OpenEXR; raises DataError if unreadable or, with ``required``, if not."""
+    """Return whether a file starts as OpenEXR; DataError if it does not and ``required``, or is unreadable."""
     try:
         with open(path, "rb") as file:
             head = file.read(8)
@@ -94,7 +94,7 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
-    """Return channel names (``wanted``, or the only R, G, B(, A)), width and height from the header, or DataError."""
+    """Return channel names (``wanted``, or the only R, G, B(, A)), width and height of a file; raises DataError."""
     channels, width, height = _read_exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:
@@ -111,7 +111,7 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
 
 
 def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
-    """Return channels by name, width and height; raises DataError."""
+    """Return channels by name, width and height of a file; raises DataError."""
     try:
         with OpenEXR.File(str(path), separate_channels=True, header_only=True) as file:
             parts = len(file.parts)
@@ -138,7 +138,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
 
 
 def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tensor:
-    """Return (H, W, C) float16 or float32 values of channels, as stored; raises DataError, also if not finite."""
+    """Return (H, W, C) float16 or float32 values of channels ``names``; raises DataError, also for NaN, infinity."""
     try:
         with OpenEXR.File(str(path), separate_channels=True) as file:
             planes = [np.array(file.channels()[name].pixels) for name in names]
@@ -164,14 +164,14 @@ def read_exr(path: Path, names: Sequence[str], width: int, height: int) -> Tenso
 
 @dataclass(frozen=True)
 class ExrChannel:
-    """One channel to write."""
+    """One channel of an OpenEXR file to write."""
 
     values: Tensor  # (H, W) finite numbers
     half: bool = False  # store 16-bit instead of 32-bit floats
 
 
 def write_exr(path: Path, image: Tensor, half: bool = True, names: Sequence[str] | None = None) -> None:
-    """Write (H, W, 3 or 4) linear values with premultiplied alpha, or (H, W, C) values of channels ``names``."""
+    """Write an OpenEXR file: (H, W, 3 or 4) linear premultiplied RGB(A), or (H, W, C) values of channels ``names``."""
     error = None if names is None else exr_channel_name_error(names)
     if error:
         raise DataError(f"{path}: names{error}")
@@ -189,7 +189,8 @@ def write_exr_layers(
     """Write an image of several layers as one OpenEXR file.
 
     Args:
-        channels: channels by name, with the prefix of their layer; all of one size, and at most 65504 if half.
+        channels: channels by name, with the prefix of their layer; all of one size, values of half floats at most
+            65504.
         attributes: header attributes: text, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})

@@ -1,4 +1,4 @@
-"""Write files and folders atomically, complete or not at all; find the folder for caches."""
+"""Write files and folders atomically (complete or not at all), and find the cache folder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ T = TypeVar("T")
 
 
 def cache_directory() -> Path:
-    """Return the folder for caches; ``NEUPRIM_CACHE_DIR`` overrides the platform's convention."""
+    """Return neuprim's cache folder: ``NEUPRIM_CACHE_DIR`` if set, else by the convention of the platform."""
     if os.environ.get("NEUPRIM_CACHE_DIR"):
         return Path(os.environ["NEUPRIM_CACHE_DIR"])
     if sys.platform == "win32":
@@ -40,7 +40,7 @@ def cache_directory() -> Path:
 
 @contextmanager
 def atomic_path(path: Path) -> Iterator[Path]:
-    """Return a context with a temporary file that replaces ``path`` when the block succeeds."""
+    """Yield the path of a temporary file, which replaces ``path`` when the block succeeds."""
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary: Path | None = None
     try:
@@ -65,7 +65,7 @@ def atomic_path(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def checked_atomic_path(path: Path) -> Iterator[Path]:
-    """Return a context as :func:`atomic_path`, in a folder that must exist; turns errors of the disk into DataError."""
+    """Like :func:`atomic_path`, in a folder that must exist; turns errors of the disk into DataError."""
     if not path.parent.is_dir():
         raise DataError(f"{path}: cannot be written (no such folder {path.parent})")
     try:
@@ -76,15 +76,15 @@ def checked_atomic_path(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write UTF-8 text; the file is complete or unchanged."""
+    """Write UTF-8 text atomically."""
     with atomic_path(path) as temporary:
         temporary.write_text(text, encoding="utf-8", newline="\n")
 
 
 def read_json(path: Path, what: str, instead: str) -> Any:
-    """Read a JSON file that neuprim wrote; None if there is no file.
+    """Return the content of a JSON file that neuprim wrote; None if the file does not exist.
 
-    A DataError says ``what`` the file should be and what the user can do ``instead``.
+    Raises DataError for another content; the message says ``what`` the file should be and what to do ``instead``.
     """
     try:
         data = load_json(path.read_text(encoding="utf-8"))
@@ -98,7 +98,7 @@ def read_json(path: Path, what: str, instead: str) -> Any:
 
 
 def read_json_record(path: Path, what: str, instead: str, version: int, parse: Callable[[Any], T]) -> T | None:
-    """Read a record with ``format: version`` as :func:`read_json` does; DataError also says where ``parse`` failed."""
+    """Return ``parse(content)`` of a JSON file with ``"format": version``; None and errors as :func:`read_json`."""
     data = read_json(path, what, instead)
     if data is None:
         return None
@@ -111,7 +111,7 @@ def read_json_record(path: Path, what: str, instead: str, version: int, parse: C
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write strict JSON (no NaN); the file is complete or unchanged."""
+    """Write a value as strict JSON (no NaN) atomically."""
     write_text(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
 
 
@@ -132,7 +132,7 @@ _DAY = 86400.0
 def remove_leftovers(folder: Path) -> None:
     """Remove temporary files and staging folders of killed writers from a locked folder and its subfolders.
 
-    A running process of this machine keeps files younger than a day.
+    Files of a process that still runs on this machine stay if they are younger than a day.
     """
     subfolders = (p for p in folder.iterdir() if p.name[0] != "." and p.is_dir() and not p.is_symlink())
     for place in (folder, *subfolders):
@@ -153,7 +153,7 @@ def remove_leftovers(folder: Path) -> None:
 
 
 def _is_file_writer_running(number: str | None) -> bool:
-    """Return whether another process of this machine has this process ID."""
+    """Return whether another process on this machine has the process ID ``number``."""
     # Containers reuse numbers. A file with this process's own number is old: the lock's holder has not written yet.
     if number is None or int(number) == os.getpid():
         return False
@@ -172,9 +172,10 @@ def _is_file_writer_running(number: str | None) -> bool:
 
 
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Have ``write`` fill a folder that is renamed to ``final`` when done, unless a ``complete`` one exists.
+    """Let ``write`` fill a temporary folder, then rename it to ``final``; does nothing if ``complete(final)``.
 
-    An incomplete folder at ``final`` is deleted. Of several processes the first wins: all must write the same files.
+    An incomplete folder at ``final`` is deleted. If several processes do this, the first wins: all must write the same
+    files.
     """
     if complete(final):
         return
@@ -183,7 +184,7 @@ def publish_folder(final: Path, write: Callable[[Path], None], complete: Callabl
 
 
 def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
-    """Publish a folder as :func:`publish_folder`, but always call ``write``; the parent folder must exist."""
+    """Like :func:`publish_folder`, but always call ``write``; the parent folder must exist."""
     draft = Path(tempfile.mkdtemp(prefix=f".{final.name}-", dir=final.parent))
     try:
         draft.chmod(0o755)  # mkdtemp's 0700 would hide a shared folder from its other users
@@ -200,7 +201,7 @@ def fill_folder(final: Path, write: Callable[[Path], None], complete: Callable[[
 
 
 def refuse_existing(final: Path, overwrite: bool) -> None:
-    """Raise ConfigError if ``final`` is a file or a folder that is not empty, unless it may be overwritten."""
+    """Raise ConfigError if ``final`` is a file or a non-empty folder, unless ``overwrite`` is True."""
     if overwrite or not os.path.lexists(final):
         return
     if not final.is_dir():
@@ -211,14 +212,14 @@ def refuse_existing(final: Path, overwrite: bool) -> None:
 
 
 class StagedOutput:
-    """A temporary place for an output: write to ``out``, then :meth:`publish` moves it to ``final``."""
+    """A temporary folder for an output: write to ``out``, then :meth:`publish` moves the output to ``final``."""
 
     def __init__(self, folder: Path, final: Path, overwrite: bool) -> None:
         self._folder, self._final, self._overwrite = folder, final, overwrite
         self.out = folder / (final.name if final.name not in ("", "..") else "out")
 
     def final_path(self, path: Path) -> Path | None:
-        """Return the final path of a staged file; None for a file outside the staging folder."""
+        """Return the path that a temporary file will get; None for a file outside the temporary folder."""
         try:
             parts = path.resolve().relative_to(self._folder.resolve()).parts
         except ValueError:
@@ -228,11 +229,11 @@ class StagedOutput:
         return self._final.joinpath(*parts[1:]) if parts[0] == self.out.name else self._final.parent.joinpath(*parts)
 
     def final_text(self, text: str) -> str:
-        """Replace the staged paths in a text by final ones."""
+        """Return a text with all temporary paths replaced by final paths."""
         return text.replace(str(self.out), str(self._final)).replace(str(self._folder), str(self._final.parent))
 
     def publish(self) -> None:
-        """Move everything to its place, file by file; ConfigError, and nothing is moved, if something is in the way."""
+        """Move all files to their final paths, one by one; ConfigError before the first move if a path is taken."""
         moves: list[tuple[Path, Path]] = []
         for entry in sorted(self._folder.iterdir()):
             target = self.final_path(entry)
@@ -252,7 +253,7 @@ class StagedOutput:
 
 @contextmanager
 def staged_output(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
-    """Yield a :class:`StagedOutput` that is deleted after the block; errors name final paths, not staged ones."""
+    """Yield a :class:`StagedOutput` that is deleted after the block; error messages get final paths."""
     existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".neuprim.{os.getpid()}.", dir=existing))

@@ -1,8 +1,8 @@
 """Read and write PNG, JPEG, WebP and OpenEXR images and animations, and convert between sRGB and linear light.
 
 PNG, JPEG and WebP hold display-referred sRGB values with *straight* alpha, OpenEXR linear light with *premultiplied*
-alpha. Grey and palettes are read as RGB(A); what 8-bit RGB(A) cannot hold is refused. Colour profiles and EXIF
-orientation are not applied, as in COLMAP. Every failure is a :class:`~neuprim.core.errors.DataError`.
+alpha. Grey and palette images are read as RGB(A). Images that 8-bit RGB(A) cannot represent exactly are refused. Colour
+profiles and EXIF orientation are not applied, as in COLMAP. Every failure is a :class:`~neuprim.core.errors.DataError`.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class ImageInfo:
 
 
 def image_info(path: Path, channels: Sequence[str] | None = None) -> ImageInfo:
-    """Return size and channels of an image; reads its header alone. Arguments and errors as :func:`read_image`."""
+    """Return size and channels of an image from its header. Arguments and errors as of :func:`read_image`."""
     if is_exr(path, required=channels is not None):
         names, width, height = read_exr_layout(path, channels)
         return ImageInfo(width, height, len(names), True)
@@ -94,7 +94,7 @@ def read_image(path: Path, size: tuple[int, int] | None = None, channels: Sequen
 
 
 def read_mask_image(path: Path, size: tuple[int, int] | None = None) -> Tensor:
-    """Return (H, W) bool of a PNG, JPEG or WebP: True where a colour channel is not 0. Errors as read_image."""
+    """Read a mask, (H, W) bool, from PNG, JPEG or WebP: True where a colour channel is not 0. Errors as read_image."""
     with refuse_image_file_beyond_memory(path), _open_image(path) as image:
         _lossless_mode(path, image)
         _check_image_size(path, image.width, image.height, size)
@@ -108,7 +108,7 @@ def _check_image_size(path: Path, width: int, height: int, size: tuple[int, int]
 
 @contextmanager
 def _open_image(path: Path) -> Iterator[Image.Image]:
-    """Open an image without decoding it; refuse other formats and sizes beyond MAX_PIXELS."""
+    """Open a PNG, JPEG or WebP without decoding pixels; DataError for other formats and sizes above MAX_PIXELS."""
     try:
         image = Image.open(path, formats=("PNG", "JPEG", "WEBP"))
     except FileNotFoundError:
@@ -132,14 +132,14 @@ def _open_image(path: Path) -> Iterator[Image.Image]:
 
 
 def _png_depth_and_kind(path: Path) -> tuple[int, int]:
-    """Return (bit depth, colour type) of a PNG; (0, -1) for other files. Pillow opens 16-bit RGB silently as 8-bit."""
+    """Return (bit depth, colour type) of a PNG; (0, -1) for other files. Needed as Pillow opens 16-bit RGB as 8-bit."""
     with open(path, "rb") as file:
         head = file.read(26)
     return (head[24], head[25]) if head[:8] == b"\x89PNG\r\n\x1a\n" and len(head) == 26 else (0, -1)
 
 
 def _lossless_mode(path: Path, image: Image.Image) -> str:
-    """Return "RGB" or "RGBA", whichever holds the image without loss; raise DataError if neither, or an animation."""
+    """Return "RGB" or "RGBA", which represents the image without loss; DataError if none does, or for an animation."""
     depth, kind = _png_depth_and_kind(path)
     if depth == 16 or image.mode not in ("1", "L", "LA", "P", "PA", "RGB", "RGBA"):
         what = {"L": "8-bit grey JPEG", "CMYK": "CMYK JPEG"}.get(image.mode, f"{image.format} of mode {image.mode}")
@@ -186,7 +186,7 @@ def to_uint8(image: Tensor) -> Tensor:
 
 
 def pillow_image(path: Path, image: Tensor) -> Image.Image:
-    """Convert (H, W, 3 or 4) sRGB values to an 8-bit image; raises DataError with ``path`` for a shape or NaN."""
+    """Convert (H, W, 3 or 4) sRGB values to an 8-bit image; DataError, with ``path``, for a wrong shape or NaN."""
     if image.ndim != 3 or image.shape[-1] not in (3, 4) or 0 in image.shape:
         raise DataError(f"{path}: image to write has shape {tuple(image.shape)}; expected (H, W, 3) or (H, W, 4)")
     try:
@@ -221,23 +221,23 @@ def encode_webp_data_uri(image: Tensor, max_width: int, quality: int = 85) -> st
 
 
 def srgb_to_linear(values: Tensor) -> Tensor:
-    """Return sRGB values (IEC 61966-2-1) as linear light; any shape, differentiable, unclamped, linear below 0."""
+    """Convert sRGB values (IEC 61966-2-1) to linear light; any shape, differentiable, unclamped, linear below 0."""
     curve = ((values.clamp_min(0.04045) + 0.055) / 1.055) ** 2.4
     return torch.where(values <= 0.04045, values / 12.92, curve)
 
 
 def linear_to_srgb(values: Tensor) -> Tensor:
-    """Return linear light as sRGB values (IEC 61966-2-1); any shape, differentiable also at 0, unclamped."""
+    """Convert linear light to sRGB values (IEC 61966-2-1); any shape, differentiable also at 0, unclamped."""
     curve = 1.055 * values.clamp_min(0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(values <= 0.0031308, values * 12.92, curve)
 
 
 def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: int = 80) -> None:
-    """Write (H, W, 3 or 4) sRGB frames as an endless animation: WebP, GIF or MP4 by the suffix.
+    """Write (H, W, 3 or 4) sRGB frames as a looping animation: WebP, GIF or MP4, by the suffix of ``path``.
 
-    GIF rounds frame times to hundredths of a second. MP4 is H.264 with even sizes (an odd last row or column is
-    repeated), RGB only. Raises DataError for frames, suffix or rate, and BackendUnavailable for MP4 without the package
-    ``av``.
+    GIF rounds frame times to hundredths of a second. MP4 is H.264, RGB only, with even width and height (an odd last
+    row or column is repeated). Raises DataError for invalid frames, suffix or rate, and BackendUnavailable for MP4
+    without the package ``av``.
     """
     _check_animation_rate(path, len(frames), fps)
     shapes = sorted({tuple(f.shape) for f in frames})
@@ -251,7 +251,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
 
 
 class FrameSpool:
-    """Collects frames in a temporary file in ``folder``, then writes them as an animation; needs little memory."""
+    """Collects frames in a temporary file in ``folder``, not in memory, then writes them as an animation."""
 
     def __init__(self, folder: Path) -> None:
         self._file = tempfile.TemporaryFile(dir=folder)
@@ -260,7 +260,7 @@ class FrameSpool:
         self.count = 0
 
     def add(self, frame: Tensor) -> None:
-        """Append a frame of (H, W, 3) sRGB values, float 0..1 or uint8; all have one size."""
+        """Append a frame of (H, W, 3) sRGB values, float 0..1 or uint8; all frames have the same size."""
         image = pillow_image(Path(f"frame {self.count} of a film"), frame)
         if image.size != (self._size or image.size):
             raise DataError(f"frame {self.count} of a film is {image.size}; expected {self._size}, as the first")
@@ -270,7 +270,7 @@ class FrameSpool:
         self.count += 1
 
     def write(self, path: Path, fps: float) -> None:
-        """Write the file that :func:`write_animation` would write (WebP or GIF), and close the spool."""
+        """Write all frames as :func:`write_animation` does (WebP or GIF), and delete the temporary file."""
         _check_animation_rate(path, self.count, fps)
         self._pages.finalize()
         self._file.seek(0)

@@ -1,8 +1,8 @@
-"""Read untrusted JSON, YAML and npz as plain data, and fields of JSON objects.
+"""Read untrusted JSON, YAML and npz files as plain data, and check the fields of JSON objects.
 
-Errors name the file, the field, the value and what was expected. Numbers are finite, whole ones have at most 64 bits,
-and YAML may not use anchors, which let a few lines describe more than memory holds. Arrays are checked before memory is
-allocated. Nothing is executed or looked up.
+Errors name the file, the field, the value and what was expected. Numbers must be finite, integers must fit in 64 bits,
+and YAML anchors are refused: a few lines with anchors can describe more data than fits in memory. Arrays are checked
+before memory is allocated. Nothing is executed or looked up.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _MISSING = object()
 
 
 def _describe_json(value: Any) -> str:
-    """Describe a JSON value briefly, for messages."""
+    """Return a short description of a JSON value for error messages."""
     if isinstance(value, list):
         return f"a list of {len(value)}"
     if isinstance(value, dict):
@@ -39,14 +39,14 @@ def _describe_json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class JsonReader:
-    """Reader of the fields of one JSON object."""
+    """Reads the fields of one JSON object and checks their types and ranges."""
 
     values: dict[str, Any]
     where: str  # prefix of messages, e.g. "/data/transforms.json: frames[3]"
 
     @classmethod
     def open(cls, path: Path, max_bytes: float = math.inf) -> JsonReader:
-        """Read the object of a file of camera poses; raises DataError for anything else."""
+        """Open a JSON file of camera poses that holds one object; raises DataError for any other content."""
         try:
             if path.stat().st_size > max_bytes:
                 raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {max_bytes:.0f}")
@@ -62,11 +62,11 @@ class JsonReader:
         return cls(value, str(path))
 
     def has(self, key: str) -> bool:
-        """Return whether the field is there and not null."""
+        """Return whether the object has the field ``key`` and its value is not null."""
         return self.values.get(key) is not None
 
     def fail(self, key: str, expected: str) -> DataError:
-        """Return the error for a field that is missing or wrong."""
+        """Return, not raise, the DataError for a field that is missing or wrong."""
         value = self.values.get(key, _MISSING)
         actual = "is missing" if value is _MISSING else f"is {_describe_json(value)}"
         return DataError(f"{self.where}: {key} {actual}; expected {expected}")
@@ -74,39 +74,39 @@ class JsonReader:
     def number(
         self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf
     ) -> float:
-        """Return a finite number strictly between ``low`` and ``high``, or raise DataError, as all readers here do."""
+        """Return a field that is a finite number in (``low``, ``high``). All these methods raise DataError."""
         value = finite_json_number(self.values.get(key))
         if value is None or not low < value < high:
             raise self.fail(key, expected)
         return value
 
     def number_or(self, key: str, default: float, expected: str = "a finite number", low: float = -math.inf) -> float:
-        """Return a number as :meth:`number`, or ``default`` if the field is absent or null."""
+        """Like :meth:`number`; returns ``default`` if the field is missing or null."""
         return self.number(key, expected, low) if self.has(key) else default
 
     def count(self, key: str) -> int:
-        """Return a positive whole number; exporters also write 800.0."""
+        """Return a field that is a positive integer; 800.0 counts, as some exporters write it."""
         value = self.number(key, "a positive whole number", 0.0)
         if value != int(value):
             raise self.fail(key, "a positive whole number")
         return int(value)
 
     def text(self, key: str) -> str:
-        """Return a text that is not empty."""
+        """Return a field that is a non-empty string."""
         value = self.values.get(key)
         if not isinstance(value, str) or not value or "\0" in value:
             raise self.fail(key, "a non-empty text")
         return value
 
     def texts(self, key: str) -> list[str]:
-        """Return a list of texts that are not empty."""
+        """Return a field that is a list of non-empty strings."""
         value = self.values.get(key)
         if not isinstance(value, list) or not all(isinstance(v, str) and v and "\0" not in v for v in value):
             raise self.fail(key, "a list of texts")
         return value
 
     def array(self, key: str, shape: tuple[int, ...], expected: str) -> Tensor:
-        """Return (n,) or (rows, columns) float64 from nested lists of exactly that shape, all finite numbers."""
+        """Return a field of nested lists as float64 of ``shape``, (n,) or (rows, columns); all must be finite."""
 
         def read(value: Any, shape: tuple[int, ...], place: str) -> Any:
             if not shape:
@@ -121,7 +121,7 @@ class JsonReader:
         return torch.tensor(read(self.values.get(key), shape, ""), dtype=torch.float64)
 
     def matrix(self, key: str) -> Tensor:
-        """Return (4, 4) float64 from 3 or 4 rows of 4 finite numbers; a fourth row must be 0 0 0 1."""
+        """Return a field of 3 or 4 rows of 4 finite numbers as (4, 4) float64; a fourth row must be 0 0 0 1."""
         rows = self.values.get(key)
         expected = "4 rows of 4 numbers"
         if not isinstance(rows, list) or len(rows) not in (3, 4):
@@ -133,7 +133,7 @@ class JsonReader:
         return torch.cat([matrix[:3], last])
 
     def objects(self, key: str) -> Iterator[JsonReader]:
-        """Yield readers of the objects in a list that is not empty."""
+        """Yield a reader for each object of a field that is a non-empty list of objects."""
         value = self.values.get(key)
         if not isinstance(value, list) or not value:
             raise self.fail(key, "a non-empty list of objects")
@@ -147,7 +147,7 @@ _MAX_DIGITS = 20  # digits of a whole number of 64 bits
 
 
 def finite_json_number(value: object) -> float | None:
-    """Return a number from a file as a float; None for text, true, a list, NaN, 1e400 and the like."""
+    """Return a parsed JSON value as a float; None if it is no finite number: text, true, a list, NaN, 1e400."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
@@ -158,14 +158,14 @@ def finite_json_number(value: object) -> float | None:
 
 
 def load_json(text: str | bytes, infinite: bool = False) -> Any:
-    """Parse JSON text; ``infinite`` accepts NaN and infinity. Raises ValueError or RecursionError."""
+    """Parse JSON text. NaN and infinity are errors unless ``infinite``. Raises ValueError or RecursionError."""
     parse_float = float if infinite else _parse_json_float
     parse_constant = float if infinite else _refuse_json_constant
     return json.loads(text, parse_int=_parse_json_int, parse_float=parse_float, parse_constant=parse_constant)
 
 
 def parse_yaml_file(text: str) -> Any:
-    """Parse YAML text; raises yaml.YAMLError, ValueError or RecursionError."""
+    """Parse YAML text with the limits of this module; raises yaml.YAMLError, ValueError or RecursionError."""
     loader = _PlainYamlLoader(text)
     try:
         return loader.get_single_data()
@@ -191,7 +191,7 @@ def _refuse_json_constant(text: str) -> float:
 
 
 class _PlainYamlLoader(yaml.SafeLoader):
-    """``yaml.SafeLoader`` with the limits of this module."""
+    """``yaml.SafeLoader`` that refuses anchors and enforces the number limits of this module."""
 
     def compose_node(self, parent: Any, index: Any) -> Any:
         event = self.peek_event()
@@ -221,7 +221,7 @@ ArrayType = tuple[Any, tuple[int | None, ...]]  # dtype and shape; None for any 
 
 
 def read_npz_arrays(path: Path, wanted: Mapping[str, ArrayType]) -> dict[str, np.ndarray]:
-    """Read the named arrays of an uncompressed file of ``numpy.savez``; raises DataError before memory is allocated."""
+    """Read the ``wanted`` arrays of a ``numpy.savez`` file; DataError before memory is allocated for a wrong array."""
     damaged = (OSError, ValueError, KeyError, EOFError, RuntimeError, SyntaxError, TokenError, zipfile.BadZipFile)
     try:
         size = path.stat().st_size

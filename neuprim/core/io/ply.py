@@ -28,7 +28,7 @@ _MAX_PROPERTIES = 10_000
 
 @dataclass(frozen=True)
 class PlyVertices:
-    """Vertices of a file."""
+    """The vertices of a PLY file."""
 
     rows: np.ndarray  # (N,) structured: one field per scalar property, in the file's byte order
     comments: tuple[str, ...] = ()  # without the keyword
@@ -38,7 +38,7 @@ class PlyVertices:
         return self.rows.dtype.names or ()
 
     def columns(self, names: Sequence[str]) -> np.ndarray:
-        """Return the properties ``names`` as (N, len(names)) float64."""
+        """Return the properties ``names`` of all vertices as (N, len(names)) float64."""
         if not names:
             return np.zeros((len(self.rows), 0))
         return np.stack([self.rows[name].astype(np.float64) for name in names], -1)
@@ -46,7 +46,7 @@ class PlyVertices:
 
 @dataclass(frozen=True)
 class PlyList:
-    """A list property: row i has ``sizes[i]`` of the ``values``, which are stored without gaps."""
+    """A list property of all rows of an element: row i has the next ``sizes[i]`` numbers of ``values``."""
 
     sizes: np.ndarray
     values: np.ndarray
@@ -54,7 +54,7 @@ class PlyList:
 
 @dataclass(frozen=True)
 class PlyElement(PlyVertices):
-    """Rows and list properties of any element."""
+    """All rows of one element of a PLY file (such as "vertex" or "face"), with its list properties."""
 
     lists: dict[str, PlyList] = field(default_factory=dict)
 
@@ -67,7 +67,7 @@ class _ElementHeader:
 
 
 def write_ply(path: Path, rows: np.ndarray, comments: Sequence[str] = ()) -> None:
-    """Write a structured array as the vertices of a binary file, atomically; each comment must be one line."""
+    """Write a structured array as the vertices of a binary PLY file, atomically; each comment must be one line."""
     if any("\n" in c or "\r" in c for c in comments):
         raise ValueError("a PLY comment is one line")
     fields = [(name, rows.dtype[name].newbyteorder("<")) for name in rows.dtype.names or ()]
@@ -80,7 +80,7 @@ def write_ply(path: Path, rows: np.ndarray, comments: Sequence[str] = ()) -> Non
 
 
 def read_ply(path: Path) -> PlyVertices:
-    """Read the vertices of a file; raises DataError for a missing or damaged one."""
+    """Read the vertices of a PLY file; raises DataError if it is missing or damaged."""
     try:
         with open(path, "rb") as file:
             return read_ply_elements(file, path.stat().st_size, path, ("vertex",))["vertex"]
@@ -89,7 +89,7 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_ply_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Read the ``wanted`` elements that a file of ``size`` bytes has; raises DataError."""
+    """Read those of the ``wanted`` elements that an open PLY file of ``size`` bytes has; raises DataError."""
     order, elements, comments = _read_ply_header(file, path)
     result: dict[str, PlyElement] = {}
     missing = set(wanted) & {element.name for element in elements}
@@ -108,7 +108,7 @@ def read_ply_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[st
 
 
 def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHeader], tuple[str, ...]]:
-    """Return byte order ("" for ASCII), elements and comments."""
+    """Read a PLY header; return byte order ("" for ASCII), element headers and comments."""
     order: str | None = None
     elements: list[_ElementHeader] = []
     comments: list[str] = []
@@ -177,7 +177,7 @@ def _describe_ply_rows(element: _ElementHeader) -> str:
 
 
 def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str, left: int) -> _Values:
-    """Read rows of equal size at once, and rows whose lists differ in length one by one."""
+    """Read the rows of a binary element: all at once if they have equal sizes, one by one if lists differ in length."""
     count, fields = element.count, element.fields
     if not count or not fields:
         return np.zeros(0, [(name, order + kind) for name, kind, length in fields if not length]), {}
@@ -209,7 +209,7 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
 
 
 def _first_ply_list_lengths(file: BinaryIO, fields: list[tuple[str, str, str]], order: str) -> list[int] | None:
-    """Return the lengths of the first row's lists, 1 for scalars; None if they are implausible."""
+    """Return the length of each property of the first row, 1 for scalars; None if a length is impossible."""
     sizes = []
     for _, kind, length in fields:
         size = 1

@@ -1,7 +1,7 @@
-"""Folders of files that several processes and machines share: a local or mounted folder, or an object store by URL.
+"""Storage that several processes and machines share: a local or mounted folder, or an object store with a URL.
 
-A folder counts as complete when its last file exists: a killed process leaves nothing that looks complete. Of two
-processes that make the same folder either may win, as both make the same files.
+A subfolder counts as complete when its last file exists, so that an interrupted write never looks complete. Two
+processes may write the same subfolder: both write the same files, and either may finish first.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ T = TypeVar("T")
 
 
 def open_store(address: str, copies: Path) -> Store:
-    """Open the store at a folder's path or a URL; files of an object store are copied to the folder ``copies``.
+    """Open the store at ``address``, a path or a URL. Files of an object store are copied to the folder ``copies``.
 
-    Raises ConfigError, BackendUnavailable (a protocol's package is missing) or DataError.
+    Raises ConfigError, BackendUnavailable (the package for this protocol is missing) or DataError.
     """
     protocol, is_url, path = address.partition("://")
     if "::" in address or (is_url and protocol not in PROTOCOLS):
@@ -62,14 +62,14 @@ def open_store(address: str, copies: Path) -> Store:
 
 
 class Store:
-    """Folders of files in one place, ``path`` or fsspec's ``system`` and ``root``; a name's content never changes."""
+    """Shared folders of files, in ``path`` or in fsspec's ``system`` under ``root``. A written file never changes."""
 
     def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
         self.address, self.path, self._system, self._root = address, path, system, root
 
     @classmethod
     def local(cls, path: Path) -> Store:
-        """Return the store in a folder of a local or shared file system."""
+        """Return the store in a folder of a local or mounted file system."""
         return cls(str(path), path)
 
     @property
@@ -77,14 +77,14 @@ class Store:
         return self._system is None
 
     def at(self, *names: str) -> Store:
-        """Return the store in a subfolder."""
+        """Return the store in the subfolder ``names`` of this store."""
         path, below = self.path.joinpath(*names), "/".join(names)
         if self.is_local:
             return Store.local(path)
         return Store(f"{self.address}/{below}", path, self._system, f"{self._root}/{below}")
 
     def prepare(self) -> None:
-        """Create the folder, so that files can be written. Raises OSError or DataError."""
+        """Create the folder of the store if it does not exist. Raises OSError or DataError."""
         if self.is_local:
             self.path.mkdir(parents=True, exist_ok=True)
         elif self.address.partition("://")[0] not in _BUCKETS:  # buckets have no folders; a typo must not create one
@@ -92,7 +92,7 @@ class Store:
                 self._system.makedirs(self._root, exist_ok=True)
 
     def complete_folders(self, last: str) -> set[str]:
-        """Return the names of the folders that have the file ``last``."""
+        """Return the names of the subfolders that contain the file ``last``."""
         if not self.is_local:
             with self._client_errors("read"):
                 self._system.invalidate_cache()
@@ -105,7 +105,7 @@ class Store:
         return {e.name for e in entries if e.name[:1] != "." and os.path.isfile(os.path.join(e.path, last))}
 
     def has_file(self, name: str) -> bool:
-        """Return whether a file exists, by its name with folders, ``"frame_00001/points.npz"``."""
+        """Return whether the store has the file ``name``, such as ``"frame_00001/points.npz"``."""
         if self.is_local:
             return (self.path / name).is_file()
         with self._client_errors("read"):
@@ -113,7 +113,10 @@ class Store:
             return bool(self._system.exists(f"{self._root}/{name}"))
 
     def fetch_file(self, name: str, max_bytes: int) -> Path:
-        """Return a local file with that content, which does not exist if the store has none; or raise DataError."""
+        """Return a local path of the file ``name``, where nothing exists if the store has no such file.
+
+        Files of an object store are copied first. Raises DataError, also for more than ``max_bytes``.
+        """
         file = self.path / name
         if self.is_local:
             try:
@@ -133,7 +136,7 @@ class Store:
         return file
 
     def write_folder(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        """Have ``write`` fill an empty folder, then publish it under ``name`` unless a complete one exists."""
+        """Let ``write`` fill an empty folder, then store it as ``name`` unless a complete one exists."""
         if self.is_local:  # the store's folder must exist: creating a lost mount would hide it
             fill_folder(self.path / name, write, lambda folder: (folder / last).is_file())
             for draft in self.path.glob(f".{name}-*"):  # of killed or slower processes
@@ -147,7 +150,7 @@ class Store:
                     self._system.put_file(str(Path(folder) / file), f"{self._root}/{name}/{file}")
 
     def write_file(self, name: str, write: Callable[[Path], None]) -> None:
-        """Have ``write`` write one file, which then exists completely or not at all. Raises OSError or DataError."""
+        """Let ``write`` write one file, and store it atomically as ``name``. Raises OSError or DataError."""
         if self.is_local:
             with checked_atomic_path(self.path / name) as draft:
                 write(draft)
@@ -158,9 +161,9 @@ class Store:
                 self._system.put_file(str(Path(folder) / "file"), f"{self._root}/{name}")
 
     def retry(self, call: Callable[[], T], notify: Callable[[str], None]) -> T:
-        """Return what ``call`` returns; if a local folder disappeared meanwhile, wait for it and call again.
+        """Return what ``call`` returns. If a local store disappears during the call, wait for the store and call again.
 
-        Raises DataError if it is not back within :data:`MAX_WAIT` seconds; or as ``call``.
+        Raises DataError if the store stays away for :data:`MAX_WAIT` seconds, and what ``call`` raises otherwise.
         """
         second_try = True
         while True:
@@ -177,14 +180,14 @@ class Store:
             self._wait(notify)
 
     def _is_gone(self) -> bool:
-        """Return whether the folder is missing or does not answer. A lost mount leaves an empty folder: ask inside."""
+        """Return whether the folder is missing or does not answer; looks inside, as a lost mount looks empty."""
         try:
             return not self.path.is_dir()
         except OSError:
             return True
 
     def _may_be_transient(self, error: Exception) -> bool:
-        """Return whether the folder may have been gone for a moment: one of its files was not found."""
+        """Return whether the error may come from a short loss of the folder: a file in the folder was not found."""
         cause = error if isinstance(error, OSError) else error.__cause__
         number = cause.errno if isinstance(cause, OSError) else None
         return number in (None, *_DISAPPEARED) and str(self.path) in str(error)
@@ -200,7 +203,7 @@ class Store:
 
     @contextmanager
     def _client_errors(self, action: str) -> Iterator[None]:
-        """Turn errors of a storage client into DataError."""
+        """Turn errors of the object store's client in the block into DataError."""
         try:
             yield
         except NeuprimError:

@@ -1,6 +1,6 @@
-"""The user's consent to use a run of somebody else like one of their own: ``--trust``, or an environment variable.
+"""Whether the user trusts runs that other people made: set by ``--trust`` or by an environment variable.
 
-:mod:`neuprim.config.stored_run` says what needs it.
+:mod:`neuprim.config.stored_run` says which uses of a run need trust.
 """
 
 from __future__ import annotations
@@ -14,13 +14,13 @@ ENVIRONMENT = "NEUPRIM_TRUST"  # gives the flag to every command; processes that
 
 
 def trusted() -> bool:
-    """Return whether the user trusts runs of others."""
+    """Return whether the user trusts runs that other people made."""
     return os.environ.get(ENVIRONMENT, "") not in ("", "0")
 
 
 @contextmanager
 def trusting(said: bool) -> Iterator[None]:
-    """Trust runs inside the block if ``said``, the user's flag, is set, or if the environment variable is."""
+    """Trust other people's runs in the block if the user passed ``--trust`` (``said``) or set the variable."""
     before = os.environ.get(ENVIRONMENT)
     if said:
         os.environ[ENVIRONMENT] = "1"

@@ -22,7 +22,10 @@ _MAX_NAMED = 6  # views in one line; metrics.json names all
 
 
 def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both images as detached float64 (H, W, C) on the CPU; raises DataError or NonFiniteError."""
+    """Return both images as detached float64 (H, W, C) on the CPU.
+
+    Raises DataError for images that cannot be compared, and NonFiniteError for NaN or infinity.
+    """
     first, second = _check_images(rendered, truth)
     return first.double(), second.double()
 
@@ -54,7 +57,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
     Args:
         mask: (H, W) bool of the pixels that count; None for all.
-        peak: value of full signal.
+        peak: largest possible pixel value.
     """
     first, second = _check_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -74,7 +77,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
 
 
 def psnr_gain(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: float = 1.0) -> float:
-    """Return :func:`psnr` after the gain per channel that brings ``rendered`` closest to ``truth``."""
+    """Return the :func:`psnr` of ``rendered`` after each channel is scaled by the factor that fits ``truth`` best."""
     first, second = comparable_images(rendered, truth)
     counted = torch.ones(second.shape[:2], dtype=torch.bool) if mask is None else mask.cpu()
     square = first[counted].square().sum(0)
@@ -86,7 +89,8 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
     """Return the structural similarity (SSIM), mean over pixels and channels, from -1 to 1 for equal images.
 
     The window is Gaussian, 11x11, sigma 1.5, K1 = 0.01, K2 = 0.03, and lies inside the image (Wang et al. 2004). For
-    smaller images it shrinks to the largest odd size. ``peak`` is the data range L. Equal to kornia in float64.
+    smaller images, the window shrinks to the largest odd size. ``peak`` is the data range L. Agrees with kornia in
+    float64.
     """
     first, second = _check_images(rendered, truth)
     if not (math.isfinite(peak) and peak > 0):
@@ -105,8 +109,8 @@ def ssim(rendered: Tensor, truth: Tensor, peak: float = 1.0) -> float:
 def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
     """Return the structural similarity as the tools of 3D Gaussian splatting compute it, to compare with their tables.
 
-    It differs from :func:`ssim` of values 0 to 1: every pixel has a whole window, and images are black outside. The
-    mean is mostly higher. Unlike those tools, it does not quantise images.
+    Differences from :func:`ssim` with values from 0 to 1: a window is centred on every pixel, and images count as black
+    outside. The mean is mostly higher. Unlike those tools, this function does not quantise images.
     """
     first, second = _check_images(rendered, truth)
     border = (0, 0, *(SSIM_WINDOW // 2,) * 4)
@@ -114,7 +118,7 @@ def ssim_3dgs(rendered: Tensor, truth: Tensor) -> float:
 
 
 def metric_to_json(key: str, value: float) -> dict[str, float | bool | None]:
-    """Return JSON entries of a metric: infinity becomes ``null`` and ``KEY_infinite: true``."""
+    """Return the JSON entries for the metric ``key``; infinity becomes ``null`` and ``KEY_infinite: true``."""
     return {key: None, f"{key}_infinite": True} if value == math.inf else {key: value}
 
 
@@ -145,7 +149,7 @@ def metric_from_json(entries: Mapping[str, object], key: str) -> float | None:
 
 
 def format_metrics(metrics: Mapping[str, Any]) -> str:
-    """Summarise metrics.json: ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``. PSNR is the mean of inexact views."""
+    """Summarise metrics.json: ``PSNR 29.99 dB, SSIM 0.977 (20 held-out views)``; the PSNR omits infinite values."""
     values = [value for entry in metrics["per_view"] if (value := metric_from_json(entry, "psnr")) is not None]
     wrong = [value for value in values if math.isfinite(value)]
     exact = f", {len(values) - len(wrong)} exact" if len(wrong) < len(values) else ""

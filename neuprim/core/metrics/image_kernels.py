@@ -1,4 +1,4 @@
-"""SSIM and squared error of two images, in float64 without copies of them, on all cores."""
+"""SSIM and squared error of two images, in float64, on all cores, without copies of the images."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """LPIPS, the learned perceptual distance of two images (Zhang et al. 2018), with the user's own weights.
 
-Weights are state dictionaries that LPIPS and torchvision publish, as torch or safetensors files: a whole
-``lpips.LPIPS(net="vgg")``, or linear layers and convolutions side by side in a folder. Shapes tell AlexNet from VGG16.
+Weights are state dictionaries that LPIPS and torchvision publish, as torch or safetensors files: either a whole
+``lpips.LPIPS(net="vgg")``, or a folder with one file of linear layers and one of convolutions. The shapes of the
+tensors tell whether the network is AlexNet or VGG16.
 """
 
 from __future__ import annotations
@@ -33,8 +34,8 @@ class _Layer(NamedTuple):
     side: int
     stride: int
     padding: int
-    pool: int  # side of the max pooling before it, stride 2; 0 for none
-    tap: bool  # whether the distance compares its output
+    pool: int  # side of the max pooling before the layer, stride 2; 0 for none
+    tap: bool  # whether the distance compares the layer's output
 
 
 def _vgg16() -> tuple[_Layer, ...]:
@@ -81,7 +82,7 @@ class Lpips:
 
     @staticmethod
     def load(path: str | Path) -> Lpips:
-        """Return the distance with weights of a file, or of a folder's files together; raises DataError."""
+        """Return the LPIPS distance with the weights in a file, or in all files of a folder; raises DataError."""
         where = Path(path)
         files = sorted(f for f in where.iterdir() if f.suffix in _SUFFIXES) if where.is_dir() else [where]
         if not files:
@@ -89,11 +90,11 @@ class Lpips:
         return _lpips_of_weights({key: value for file in files for key, value in _read_weights(file).items()}, where)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> float:
-        """Return the distance as published, of (H, W, 3) values clamped to 0..1 and mapped to -1..1."""
+        """Return the LPIPS distance of two (H, W, 3) images; values are clamped to 0..1 and mapped to -1..1."""
         return self._distance(*(2.0 * image - 1.0 for image in self._images(rendered, truth)))
 
     def unmapped(self, rendered: Tensor, truth: Tensor) -> float:
-        """Return the distance as the tools of 3D Gaussian splatting compute it: values 0 to 1 are not mapped."""
+        """Return the LPIPS distance as 3D Gaussian splatting tools compute it: values 0..1 are not mapped to -1..1."""
         return self._distance(*self._images(rendered, truth))
 
     def _images(self, rendered: Tensor, truth: Tensor) -> list[Tensor]:

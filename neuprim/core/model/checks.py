@@ -1,4 +1,4 @@
-"""Checks of the tensors that fields return: errors name field, tensor, found and expected in one line.
+"""Check the tensors that fields return. Error messages name field, tensor, found and expected value in one line.
 
 Compiled kernels do not check bounds, and torch would broadcast wrong shapes. Tensors are float32 or float64, in any
 mix, dense and all on one device; strides do not matter.
@@ -63,7 +63,10 @@ def model_method_label(field: Field, name: str) -> str:
 
 
 def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
-    """Return the sizes that the tensors of ellipsoids share (``count`` of them, where known), or raise FormError."""
+    """Return the sizes that the tensors of a :class:`Geometry` share, or raise FormError if they do not fit.
+
+    ``count``: expected number of primitives, if known.
+    """
     if not isinstance(geometry, Geometry):
         raise FormError(f"{who} has type {type(geometry).__name__}; expected Geometry")
     sizes: Sizes = {} if count is None else {"N": (count, "the geometry given")}
@@ -74,12 +77,12 @@ def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
 
 
 def check_lowered_density(density: Any, sizes: Sizes, field: str | None) -> None:
-    """Raise :class:`FormError` unless a lowered density fits; ``sizes`` are those of :func:`check_geometry`."""
+    """Raise :class:`FormError` unless a lowered density fits the geometry; ``sizes``: from :func:`check_geometry`."""
     _check_lowered_form(model_field_label("density", field), density, _DENSITIES, sizes)
 
 
 def check_lowered_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
-    """Raise :class:`FormError` unless a lowered colour fits, as :func:`check_lowered_density`."""
+    """Raise :class:`FormError` unless a lowered colour fits the geometry; ``sizes``: from :func:`check_geometry`."""
     _check_lowered_form(model_field_label("colour", field), colour, _COLOURS, sizes)
 
 
@@ -93,7 +96,7 @@ def _check_lowered_form(who: str, form: Any, kinds: tuple[type[PrimitiveTensors]
 
 
 def check_lowered_channels(found: int, colour: ColourField) -> None:
-    """Raise :class:`FormError` unless a lowered colour has as many channels as its field says."""
+    """Raise :class:`FormError` unless a lowered colour has ``found == colour.channels`` channels."""
     if found != colour.channels:
         raise FormError(
             f"{model_method_label(colour, 'lower')} returned a colour of C={found}; "
@@ -111,7 +114,7 @@ def check_model_tensor_shape(name: str, value: Any, shape: tuple[int, ...], why:
 
 
 def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
-    """Raise :class:`FormError` unless ``rows`` are ascending int64 (M,), ``length`` of them, below ``model``."""
+    """Raise :class:`FormError` unless ``rows`` are ``length`` ascending int64 row numbers below ``model``."""
     found = None
     if not _is_dense_primitive_tensor(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
         found = _describe_model_tensor(rows)
@@ -130,7 +133,7 @@ def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: 
 
 
 def check_primitive_field_result(value: Any, shape: tuple[int, ...], who: str) -> Tensor:
-    """Return the result of a field's own code; raise FormError unless it is a dense real tensor of this shape."""
+    """Return the result of a field's method; raise FormError unless the result is a dense real tensor of this shape."""
     if not _is_dense_primitive_tensor(value) or not value.is_floating_point():
         kinds = " or ".join(device.DEVICE_TYPES)
         raise FormError(
@@ -143,7 +146,10 @@ def check_primitive_field_result(value: Any, shape: tuple[int, ...], who: str) -
 
 
 def check_primitive_shading(found: Any, count: int, who: str) -> Shading:
-    """Return the result of ``shade``, None as no shading; raise FormError unless it fits ``count`` primitives."""
+    """Return the result of a field's ``shade``, with None replaced by an empty :class:`Shading`.
+
+    Raises FormError unless the result fits ``count`` primitives.
+    """
     if found is None:
         return Shading()
     if not isinstance(found, Shading):
@@ -164,7 +170,7 @@ def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, wh
 
 
 def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
-    """Return the tensors that a field's method returned; raise FormError unless they fit those of ``like``."""
+    """Return the tensors that a field's method returned; raise FormError unless names and shapes are as in ``like``."""
     if not isinstance(found, Mapping):
         raise FormError(f"{who} returned type {type(found).__name__}; expected a dict of tensors by name")
     if set(found) != set(like):
@@ -181,7 +187,7 @@ def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) ->
 
 
 def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
-    """Return the error for primitive ``row``, which is not finite or leaves the range of float32."""
+    """Return the error for primitive ``row``, some value of which is not finite or exceeds the range of float32."""
     for name, value in tensors.items():
         if not bool(torch.isfinite(value[row]).all()):
             return NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].flatten()[:8].tolist()}")
@@ -194,9 +200,9 @@ def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFi
 
 
 def check_primitive_colours_finite(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
-    """Raise NonFiniteError for non-finite colours, which per-primitive kernels do not read; synchronises with a GPU.
+    """Raise NonFiniteError for non-finite colours, because the kernels that check primitives do not read colours.
 
-    ``named``: all tensors of the frame; the first of them that is not finite is the cause.
+    Synchronises with a GPU. ``named``: all tensors of the frame; the message names the first that is not finite.
     """
     total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
     if math.isfinite(total):  # one number, so that a GPU is waited for once

@@ -28,7 +28,7 @@ C3 = (
 MOST_LOBES = 8
 
 LOG_LIMIT = 20.0
-"""Logarithms of sharpness are clamped to plus or minus this value, and get no gradient beyond."""
+"""Logarithms of a lobe's sharpness are clamped to plus or minus this value, without gradient beyond."""
 
 SHORTEST = 1e-24
 """Vectors of at most this length have no direction: the unit vector is zero and passes no gradient. The limit keeps

@@ -1,5 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""GPU kernels of harmonics and lobes, one thread per primitive, float64 inside; on the CPU ``model.colours_cpu``."""
+"""GPU kernels of view-dependent colours (harmonics and lobes), one thread per primitive, float64 inside.
+
+The CPU kernels are in :mod:`neuprim.core.model.colours_cpu`.
+"""
 
 import functools
 from typing import Any

@@ -1,15 +1,15 @@
-"""The density of a neural primitive: one hidden layer of K cosines (the paper's; method: "Density"), with an edge and a
-gain.
+"""The density of the paper's neural primitive, one hidden layer of K cosines, extended by an edge and a gain.
 
     sigma(x) = g (1 - |y|^2)^p f(x~)/m inside the ellipsoid |y| < 1,   f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k))
     + b2,   g = exp(log_gain)
 
 p = 0 without gain is the paper's primitive; p = 2 with K = 0 is close to a Gaussian, with a support that ends.
 
-**Canonical form.** A sum stays the same when (v_k, b_k) changes sign, when rate b_k gains a whole turn, and when it
-gains half a turn and w_k changes sign. So every w_k can be positive and every b_k between 0 and half a turn.
+**Canonical form.** A sum of w_k cos(rate (v_k . x + b_k)) stays the same when (v_k, b_k) changes sign, when rate b_k
+gains a whole turn, and when rate b_k gains half a turn and w_k changes sign. So every w_k can be positive, and every
+rate b_k between 0 and half a turn.
 
-**Pruning** keeps the neurons whose part of the density varies most and adds the mean of the others to b2. Over an
+**Pruning** keeps the neurons whose term of the density varies most, and adds the mean of the other terms to b2. Over an
 ellipsoid with semi-axes s and orientation R, x~ = R diag(s/m) y with y in the unit ball, a neuron's cosine has
 
     mean of cos(phi + r.y) = cos(phi) b(|r|),   b(r) = 3 (sin r - r cos r)/r^3,   phi = omega0 b1,
@@ -41,24 +41,25 @@ __all__ = ["CosineDensity", "cosine_density", "split_cosine"]
 OMEGA0 = 30.0  # SIREN boost: multiplies the whole phase
 
 GAIN_LIMIT = 20.0
-"""Bound of |log_gain|: beyond, a gain counts as exp(20) or exp(-20), and its gradient is zero. No scene needs densities
-so far apart, and products with the other weights stay far from the ends of float32."""
+"""Bound to which log_gain is clamped, without gradient beyond. No scene needs densities so far apart, and products with
+the other weights stay far from the limits of float32."""
 
 
 DENSITY_OPTIONS: dict[str, Any] = {"edge": EDGES, "gain": bool, "omega0": Annotated[float, Range(above=0)]}
-"""Its settings under ``model.density``, in every task, for :func:`neuprim.core.validation.validate_choices`."""
+"""Settings of CosineDensity under ``model.density``, for :func:`neuprim.core.validation.validate_choices`."""
 
 
 DENSITY_TRADE: dict[str, tuple[int, ...]] = {"model.neurons": (0, 2, 4, 8), "model.density.edge": EDGES}
-"""Its settings that trade quality for speed or size, for :attr:`neuprim.core.task.TaskSpec.tunable_settings`."""
+"""Settings of CosineDensity that trade quality for speed or size, for
+:attr:`neuprim.core.task.TaskSpec.tunable_settings`."""
 
 
 class CosineDensity(DensityField):
-    """Density field of the neural primitive: K cosine neurons and an offset (method: "Density").
+    """Density field of the neural primitive: K cosine neurons and an offset (docs/mathematics.md, "Density").
 
-    It lowers to :class:`~neuprim.core.model.fields.Cosine` and has 5K + 1 parameters, and one for the gain.
-    ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``; "paper" draws the offset
-    as the authors do, which leaves half of all chords without a gradient. Raises ValueError for other arguments.
+    The field lowers to :class:`~neuprim.core.model.fields.Cosine`. Each primitive has 5K + 1 parameters, plus one with
+    ``gain``. ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``. "paper" draws
+    the offset as the authors do; half of all chords then have no gradient. Raises ValueError for invalid arguments.
 
     Args:
         neurons: K, 0 to 16.
@@ -150,7 +151,7 @@ class CosineDensity(DensityField):
 
 
 def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return (w2, b2), (N, K) and (N, 1), times the gain exp(log_gain), (N, 1) or (N,)."""
+    """Return ``w2`` (N, K) and ``b2`` (N, 1), each times exp(``log_gain``); ``log_gain``: (N, 1) or (N,)."""
     if log_gain is None:
         return w2, b2
     from neuprim.core.model.rows import fused_cosine_gain  # numba, loaded when first needed
@@ -174,7 +175,7 @@ def _initial_density_offset(ctx: InitContext, amplitude: float, norm: float) -> 
 
 
 def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) -> Tensor:
-    """Return the density (M,), 1/scene unit, unclamped, of a cosine form at points (M, 3) of primitives ``prim``."""
+    """Return the density (M,), 1/scene unit, unclamped, of primitives ``prim`` (M,) at points ``x`` (M, 3)."""
     m = geometry.length_scale[prim]
     local = (x - geometry.means[prim]) / m[:, None]
     phase = form.omega0 * ((form.W1[prim] * local[:, None, :]).sum(-1) + form.b1[prim])
@@ -188,7 +189,7 @@ def cosine_density(form: Cosine, geometry: Geometry, prim: Tensor, x: Tensor) ->
 
 
 def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
-    """Return the (rows,) float64 factors c on the children's (w2, b2), see :func:`split_cosine`."""
+    """Return the float64 factors c, one per child, by which :func:`split_cosine` multiplies w2 and b2 of children."""
     r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
     if edge == 0:
         return r
@@ -198,11 +199,11 @@ def split_density_scale(old: Geometry, new: Geometry, edge: int = 0) -> Tensor:
 def split_cosine(
     params: Params, old: Geometry, new: Geometry, omega0: float = OMEGA0, edge: int = 0
 ) -> dict[str, Tensor]:
-    """Return the tensors of children that continue their parents' f.
+    """Return the parameters of children of split primitives, which continue the function f of their parents.
 
-    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m. With a hard edge c = r and sigma does not
-    change. A soft edge also fades inside a child: c = r V/2V', V = s_1 s_2 s_3, so that both children together have the
-    weight (1 - |y|^2)^p of their parent. Computed in float64, so that the field changes only by the final rounding.
+    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m. With a hard edge, c = r, and sigma does not
+    change. With a soft edge, sigma also fades inside a child. Then c = r V/2V', V = s_1 s_2 s_3, so that both children
+    together have the weight (1 - |y|^2)^p of their parent. Float64 keeps the change of f to the final rounding.
     """
     r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
@@ -227,10 +228,11 @@ _GOLDEN = (5**0.5 - 1) / 2
 
 
 def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[Tensor, Tensor]:
-    """Return (N,) supports c and (N,) central optical depths tau of primitives that replace Gaussians; float64.
+    """Return size c (N,) and central optical depth tau (N,) of primitives that replace Gaussians; float64.
 
-    c is in standard deviations; ``alphas`` are the (N,) opacities of the Gaussians, 0..1. ``volume``: the Gaussians
-    are densities in space, so that their optical depth, not their alpha, is a Gaussian on the screen.
+    c is the distance from centre to edge in standard deviations; ``alphas`` are the (N,) opacities of the Gaussians,
+    0..1. ``volume``: the Gaussians are densities in space. Then their optical depth, not their alpha, is a Gaussian in
+    the image.
     """
     table = _gaussian_support_table(edge, volume)
     alphas = alphas.double().clamp(1e-9, 1 - 1e-9)
@@ -275,11 +277,12 @@ _SLACK = 1e-6  # in turns: phases this close to an end by rounding stay, so that
 def canonicalize_cosines(
     params: Params, inputs: tuple[str, ...], phase: str, weights: str, rate: float
 ) -> dict[str, Tensor]:
-    """Make every weight of the first output at least 0, and every phase between 0 and half a turn, pi/rate.
+    """Return equivalent cosines whose weights for the first output are at least 0, with phases from 0 to pi/rate.
 
     Args:
-        inputs: names of the frequencies, by which cosines multiply their inputs, (N, K) or (N, K, ...).
-        phase, weights: names of the b_k, (N, K), and of the w_k, (N, K) or (N, outputs, K).
+        inputs: names of the frequency parameters, which multiply the inputs of the cosines, (N, K) or (N, K, ...).
+        phase, weights: names of the phases b_k, (N, K), and of the weights w_k, (N, K) or (N, outputs, K).
+        rate: factor on the whole argument of the cosines.
     """
     turn = 2 * math.pi / rate
     b, w = params[phase].detach().double(), params[weights].detach()
@@ -299,7 +302,10 @@ def canonicalize_cosines(
 
 
 def canonicalize_gain(params: Params, strength: str, log_gain: str, limit: float) -> dict[str, Tensor]:
-    """Move |b| of the products b exp(g) into g, so that b is -1, 0 or 1; pairs stay if g would exceed ``limit``."""
+    """Move the magnitude of b in the products b exp(g) into g, so that b is -1, 0 or 1.
+
+    ``strength`` and ``log_gain`` name the parameters b and g. Where |g| would exceed ``limit``, both stay unchanged.
+    """
     b, g = params[strength].detach(), params[log_gain].detach()
     joined = g.double().clamp(-limit, limit) + b.double().abs().log()
     fits = (b != 0) & (joined.abs() <= limit)
@@ -312,7 +318,7 @@ def smaller_cosine_neuron_counts(neurons: int) -> tuple[int, ...]:
 
 
 def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
-    """Keep the ``keep`` neurons of each primitive whose part of the density varies most."""
+    """Keep the ``keep`` neurons of each primitive whose terms of the density vary most; add the other means to b2."""
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
     rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations

@@ -1,8 +1,8 @@
 """The edge of a support: how a primitive's density fades to zero in space, or its extinction in time.
 
-With u the distance from the middle over that to the edge, the weight is (1 - u^2)^p: p = 0 is a hard edge, 1 and 2 are
-soft. Along an uncut chord, u in [-1, 1] and D = 1 - |y|^2 at its middle, a support (1 - |y|^2)^p is D^p (1 - u^2)^p,
-and
+The weight is (1 - u^2)^p, where u is the distance from the middle divided by the distance from the middle to the edge.
+p = 0 is a hard edge, 1 and 2 are soft. On a chord that is not cut, with u in [-1, 1] and D = 1 - |y|^2 at its middle,
+the weight (1 - |y|^2)^p is D^p (1 - u^2)^p, and
 
     1/2 integral of (1 - u^2)^p cos(phase + z u) du = N_p/2 cos(phase) B_p(z),   N = 2, 4/3, 16/15
     B_0 = sin z / z,   B_1 = 3 (B_0 - cos z)/z^2,   B_2 = 15 (B_1 - B_0)/z^2        (all 1 at z = 0)
@@ -30,7 +30,7 @@ _SERIES_BELOW, _TERMS = (
 
 
 def edge_weight(square: Tensor, edge: int) -> Tensor:
-    """Return (1 - u^2)^p from u^2, 0 outside the support; 1 everywhere for p = 0."""
+    """Return the weight (1 - u^2)^p from ``square`` = u^2 and ``edge`` = p; 0 outside the support, 1 if p = 0."""
     if edge == 0:
         return torch.ones_like(square)
     inner = (1 - square).clamp_min(0)
@@ -78,10 +78,10 @@ def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]
 def soft_edge_chord_integral(
     quadratic: tuple[Tensor, Tensor, Tensor], edge: int, phase: Tensor, z: Tensor, amplitude: Tensor, offset: Tensor
 ) -> Tensor:
-    """Return (M,) means of a cosine density with a soft edge along chords.
+    """Return the (M,) mean values along chords of a cosine density with a soft edge.
 
-    1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)), p = 1 or 2;
-    ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
+    The mean is 1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)),
+    p = 1 or 2. ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
     """
     a = edge_legendre(*quadratic, edge)
     total = offset * a[0]
@@ -96,7 +96,7 @@ def soft_edge_chord_integral(
 
 
 def edge_profile(z: Tensor, order: int) -> Tensor:
-    """Return B_order(z) = (2 order + 1)!! j_order(z)/z^order, 1 at 0; float64, differentiable."""
+    """Return B_p(z) = (2p + 1)!! j_p(z)/z^p for p = ``order``, with the value 1 at z = 0; float64, differentiable."""
     if order == 0:
         return sinc(z)
     small = z.abs() < 1e-3

@@ -47,17 +47,21 @@ Conditions = Mapping[str, Tensor]
 
 @dataclass(frozen=True)
 class ConditionSpec:
-    """An input of every frame besides its camera, such as the time; commands have a flag ``--NAME`` for it.
+    """A condition of a task: an input of every frame besides its camera, such as the time.
+
+    Commands have a flag ``--NAME`` for each condition.
 
     Attributes:
         name: name of the flag, and the key in a frame's conditions.
-        range: lowest and highest value of every element. Values beyond it give a warning; values that are not finite
-            are refused.
+        range: lowest and highest value of every element. Values outside the range give a warning; values that are not
+            finite are refused.
         parse: text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
-            :class:`~neuprim.core.errors.ConfigError`. For numbers, neuprim parses lists and ranges before.
+            :class:`~neuprim.core.errors.ConfigError`. For conditions that are one number, neuprim splits lists, and
+            expands ranges that ``parse`` refuses.
         sweep: a text that animates the condition, for the commands that reports suggest; empty for none.
-        in_frames: (text, count) -> text of the same animation in ``count`` frames; None if the text says how many.
-        place: for positions: ``parse`` with the world of the user's files, (text, world) -> scene units.
+        in_frames: (text, count) -> text of the same animation with ``count`` frames; None if the text states a number
+            of frames.
+        place: for positions: used instead of ``parse``, (text in world coordinates, world) -> scene units.
         of_scene: (scene settings) -> whether the views of a scene have the condition.
     """
 
@@ -66,19 +70,19 @@ class ConditionSpec:
     unit: str  # unit of the value, for help texts
     range: tuple[float, float]
     parse: Callable[[str], list[Tensor]]
-    strict: bool = False  # whether values beyond the range are refused
+    strict: bool = False  # whether values outside the range are refused
     sweep: str = ""
     in_frames: Callable[[str, int], str | None] = lambda text, count: None
     place: Callable[[str, World], list[Tensor]] | None = None
     of_scene: Callable[[Mapping[str, Any]], bool] = lambda scene: True
 
     def within(self, world: World) -> ConditionSpec:
-        """Return the condition for a model in ``world``: users write positions in the coordinates of their files."""
+        """Return this condition with a ``parse`` that converts positions from the user's ``world`` to scene units."""
         place = self.place
         return self if place is None else replace(self, parse=lambda text: place(text, world))
 
     def given(self, value: Tensor, world: World) -> Tensor:
-        """Return a value as users write it: a position is in float64 world coordinates."""
+        """Return a ``value`` of the condition as users write it: positions become float64 world coordinates."""
         return value if self.place is None else world.world_points(value)
 
 
@@ -88,11 +92,11 @@ class ConditionSpec:
 class Field(ABC):
     """Base class of density and colour fields: parameters of each primitive, and their meaning."""
 
-    init_settings: tuple[str, ...] = ()  # keys of model.init that start values read
+    init_settings: tuple[str, ...] = ()  # keys under model.init that the field's start values depend on
 
     @abstractmethod
     def parameters(self) -> list[ParameterSpec]:
-        """Return the specifications of the field's tensors, in storage order."""
+        """Return the specification of each parameter of this field, in the order of storage."""
 
     @abstractmethod
     def settings(self) -> dict[str, Any]:
@@ -104,10 +108,12 @@ class Field(ABC):
         return cls().parameters()
 
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
-        """Receive the used fraction of the budget, 0..1, before every training step; e.g. to unlock SH bands."""
+        """Receive the used fraction 0..1 of the training budget before every step; e.g. to activate SH bands."""
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Return the tensors of children, created inside their parents, that continue the parents' field.
+        """Return the parameters of new primitives (children) that replace a split primitive (parent).
+
+        Children lie inside their parent and continue its field, as far as the field can.
 
         Args:
             params: this field's tensors of the parents, one row per child.
@@ -121,33 +127,34 @@ class Field(ABC):
         return {}
 
     def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
-        """Return the closest field and tensors with one of :meth:`reductions` applied.
+        """Return a field whose setting ``name`` has the smaller ``value``, and the parameters that fit best.
 
-        The tensors include "means" (N, 3) if the centres of the primitives change.
+        ``name`` and ``value`` are from :meth:`reductions`. The parameters include "means" (N, 3) if the centres of the
+        primitives change.
         """
         raise NotImplementedError(
             f"{type(self).__name__} names {name} in reductions() and does not know how to reduce it"
         )
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return disjoint sets of numbers that pruning may set to zero in single primitives."""
+        """Return disjoint groups of parameter elements, such as neurons; pruning may zero a group in any primitive."""
         return ()
 
     def canonicalize(self, params: Params) -> dict[str, Tensor]:
-        """Return equivalent tensors whose numbers lie close together, for quantised files.
+        """Return equivalent parameters whose values span smaller ranges, for quantised files.
 
-        Images may change by rounding only; a second call changes no bit.
+        Images may change by rounding only. Applying the method to its own result changes no bit.
         """
         return dict(params)
 
     def script(self) -> str | None:
-        """Return the JavaScript that lowers the field on web pages (docs/plugin_reference.md); None: they cannot show
-        it."""
+        """Return the JavaScript that lowers the field on web pages (docs/plugin_reference.md); None: web pages cannot
+        show the field."""
         return None
 
 
 def prunable_units_of_model(density: DensityField, colour: ColourField) -> dict[str, PrunableUnit]:
-    """Return the units of both fields by name, e.g. ``density.neuron 0`` or ``colour.coefficient 1 +0, channel 2``."""
+    """Return the prunable units of two fields by name: ``density.neuron 0``, ``colour.coefficient 1 +0, channel 2``."""
     found = {}
     for kind, own in (("density", density), ("colour", colour)):
         for piece in own.prunable_units():
@@ -172,7 +179,7 @@ class DensityField(Field):
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> LoweredDensity:
-        """Return the closed form of the density in one frame."""
+        """Return the closed form of the density under the conditions of one frame."""
 
     @abstractmethod
     def density(self, params: Params, geometry: Geometry, prim: Tensor, x: Tensor, conditions: Conditions) -> Tensor:
@@ -180,13 +187,13 @@ class DensityField(Field):
 
     @abstractmethod
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """Return the tensors of a density ``factor`` (N,) times as large everywhere."""
+        """Return the parameters of a density that is larger everywhere by ``factor`` (N,), one per primitive."""
 
     def components(self, params: Params) -> dict[str, Tensor]:
-        """Return name -> (N,) share, 0..1, of each primitive's extinction that comes from a source grid.
+        """Return grid name -> (N,) fraction 0..1 of each primitive's extinction that comes from this source grid.
 
-        For fields fitted to several grids (:attr:`neuprim.core.data.PointSamples.components`); images do not depend on
-        them.
+        For fields fitted to several voxel grids (:attr:`neuprim.core.data.PointSamples.components`); images do not
+        depend on the fractions.
         """
         return {}
 
@@ -195,18 +202,18 @@ class DensityField(Field):
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the (M,) int64 rows, ascending, of primitives that can absorb anything; None: all."""
+        """Return the ascending int64 row numbers (M,) of primitives with non-zero extinction; None: all primitives."""
         return None
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
-        """Return the ellipsoids under these conditions; differentiable."""
+        """Return the ellipsoids as they are under the conditions of a frame, e.g. moved; differentiable."""
         return geometry
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return size and opacity of new primitives that resemble Gaussians of opacities ``alphas`` (N,).
+        """Return size and opacity of primitives that replace Gaussians with the opacities ``alphas`` (N,).
 
-        (N,) standard deviations from centre to edge, and (N,) opacities through the centre. The default is that of a
-        constant density.
+        The size is the (N,) distance from centre to edge in standard deviations of the Gaussian; opacities are (N,)
+        along a ray through the centre. The default implementation suits a constant density.
         """
         return torch.full_like(alphas, math.sqrt(5.0)), alphas
 
@@ -217,20 +224,21 @@ class ColourField(Field):
     channels: int  # number of channels of the images
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """Return ``dc`` (N, C) and ``rest`` of :func:`~neuprim.core.model.sh.sh_colors`; None without harmonics."""
+        """Return the spherical harmonics of the colours, ``dc`` (N, C) and ``rest`` as for
+        :func:`~neuprim.core.model.sh.sh_colors`; None for colours that are no spherical harmonics."""
         return None
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the (N, C) part of the colour, at least 0, that depends on neither direction nor light, or None."""
+        """Return the part (N, C) of the colour that depends on neither direction nor light, at least 0; None: none."""
         found = self.harmonics(params, conditions)
         return None if found is None else lowest_band_colors(found[0])
 
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
-        """Return the closed form of the colour in one frame."""
+        """Return the closed form of the colour for one camera, under the conditions of one frame."""
 
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading | None:
-        """Return further factors on the colours of a frame, such as shadows; None for none."""
+        """Return additional factors on the colours of a frame, such as shadows; None: no additional factors."""
         return None

@@ -1,6 +1,7 @@
-"""The closed forms that fields lower to: the renderer's input, with the conditions of a frame folded in.
+"""The closed forms of density and colour that fields lower to: the renderer's input, with a frame's conditions applied.
 
-Each form checks its tensors and computes its values along chords (:class:`PrimitiveChords`). Kernels implement a few.
+Each form checks its tensors and computes its values along chords (:class:`PrimitiveChords`). Fast kernels implement a
+few of the forms.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Cosine(PrimitiveTensors):
     """Density of a cosine network: sigma(x) = (1 - |y|^2)^p f(x~) / m inside the ellipsoid |y| < 1, 0 outside.
 
     f(x~) = sum_k w2_k cos(omega0 (W1_k . x~ + b1_k)) + b2 with x~ = (x - mu) / m, m = max semi-axis. p = 0 is the hard
-    edge of the paper; 1 and 2 are soft (:mod:`neuprim.core.model.edge`). ``first + second`` is the sum of densities.
+    edge of the paper; 1 and 2 are soft (:mod:`neuprim.core.model.edge`). ``first + second`` adds two densities.
     """
 
     shapes: ClassVar[Shapes] = {
@@ -56,9 +57,10 @@ class Cosine(PrimitiveTensors):
         return super().fault(sizes) or labelled_fault("omega0", field_number_fault(self.omega0))
 
     def __add__(self, other: Cosine) -> Cosine:
-        """Return the exact sum, with the neurons of both and the omega0 of the first (of the second if that is 0).
+        """Return the exact sum of two densities of the same primitives, with the neurons of both.
 
-        Raises FormError for other primitives, different edges, or more than :data:`MOST_UNITS` neurons together.
+        The result has the omega0 of the first, or of the second if the first is 0. Raises FormError for different
+        primitives or edges, or more than :data:`MOST_UNITS` neurons together.
         """
         if not isinstance(other, Cosine):
             return NotImplemented
@@ -84,7 +86,7 @@ class Cosine(PrimitiveTensors):
         )
 
     def primitive_rows(self, index: Tensor | slice) -> Cosine:
-        """Return the form of some primitives, (M,) int64 or first:end, without gradient."""
+        """Return the form of the primitives ``index`` only, (M,) int64 or first:end, without gradient."""
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
@@ -95,7 +97,7 @@ class Cosine(PrimitiveTensors):
         return Cosine(self.W1, self.b1, w2, b2, self.omega0, self.edge)
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Return (M,) float64 integrals of sigma along chords: one (cos, sinc) pair per neuron, for any length."""
+        """Return (M,) float64 integrals of sigma along chords of any length, from one (cos, sinc) pair per neuron."""
         prim = pairs.prim
         W1 = self.W1.double()[prim]
         phase = self.omega0 * ((W1 * pairs.local[:, None, :]).sum(-1) + self.b1.double()[prim])
@@ -109,7 +111,7 @@ class Cosine(PrimitiveTensors):
 
 @dataclass(frozen=True)
 class CustomDensity(PrimitiveTensors):
-    """Any other density, as PyTorch code for pairs of ray and primitive; only the reference backend renders it.
+    """A density given by PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
     Attributes:
         line_integral: (prim, origin, direction, t0, t1) -> (M,) optical depths, from (M,) rows, (M, 3) ray origins and
@@ -123,7 +125,7 @@ class CustomDensity(PrimitiveTensors):
         return labelled_fault("line_integral", function_fault(self.line_integral))
 
     def primitive_rows(self, index: Tensor | slice) -> CustomDensity:
-        """Return the form of some primitives, (M,) int64 or first:end."""
+        """Return the form of the primitives ``index`` only, (M,) int64 or first:end."""
         if isinstance(index, slice):
             return CustomDensity(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
         return CustomDensity(lambda prim, *ray: self.line_integral(index[prim], *ray))
@@ -138,7 +140,7 @@ class CustomDensity(PrimitiveTensors):
         return CustomDensity(line_integral)
 
     def optical_depth(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the integrals of sigma along chords as the code computes them, unchecked."""
+        """Return the integrals (M,) of sigma along chords, as ``line_integral`` computes them, unchecked."""
         return self.line_integral(pairs.prim, pairs.origins, pairs.direction, *pairs.ends)
 
 
@@ -167,7 +169,7 @@ class Constant(PrimitiveTensors):
         return {"colors": self.rgb}  # the name that users know
 
     def shaded(self, factors: Tensor | None) -> Constant:
-        """Return ``rgb`` times (N,) factors, at least 0, plus ``ambient``; None: factors of 1."""
+        """Return the colours ``rgb`` times (N,) factors, at least 0, plus ``ambient``; None: factors of 1."""
         rgb = self.rgb if factors is None else self.rgb * factors.to(self.rgb)[:, None]
         return Constant(rgb if self.ambient is None else rgb + self.ambient)
 
@@ -187,7 +189,7 @@ class Constant(PrimitiveTensors):
 
 @dataclass(frozen=True)
 class CustomColour(PrimitiveTensors):
-    """Any other colour, as PyTorch code for pairs of ray and primitive; only the reference backend renders it.
+    """A colour given by PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
     Attributes:
         radiance: (prim, x, d) -> (M, C) colours, from (M,) rows, (M, 3) chord middles and unit directions.
@@ -216,11 +218,11 @@ class CustomColour(PrimitiveTensors):
         return CustomColour(radiance, self.channels)
 
     def chord_colours(self, pairs: PrimitiveChords) -> Tensor:
-        """Return the colours along chords as the code computes them, unchecked."""
+        """Return the (M, C) colours that rays see along chords, as ``radiance`` computes them, unchecked."""
         return self.radiance(pairs.prim, pairs.points, pairs.direction)
 
     def at_primitive_centers(self, geometry: Geometry, position: Tensor) -> Tensor:
-        """Return the colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
+        """Return the (N, C) colours at the centres of the primitives, seen from ``position`` (3,), unchecked."""
         means = geometry.means
         directions = torch.nn.functional.normalize(means - position.to(means), dim=1)
         return self.radiance(torch.arange(geometry.count, device=means.device), means, directions)
@@ -233,8 +235,8 @@ class RayNet(PrimitiveTensors):
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
     x_m is the middle of the chord behind the near plane. The network has one hidden layer of H cosine units, H = 0 to
-    256. A field folds what is constant in a primitive (view direction, light) into ``bias``, ``Wout`` and ``base``. A
-    colour of exactly 0 still passes its gradient, as ``clamp_min`` does.
+    256. Inputs that are constant in a primitive (view direction, light) are already part of ``bias``, ``Wout`` and
+    ``base``. A colour of exactly 0 still passes its gradient, as with ``clamp_min``.
     """
 
     per_primitive: ClassVar[bool] = True
@@ -283,8 +285,8 @@ class RayNet(PrimitiveTensors):
 
 
 LoweredColour = Constant | RayNet | CustomColour
-"""What :meth:`ColourField.lower` returns. ``per_primitive``: whether the colour at a primitive's centre may stand for
-the whole primitive in one view, exactly (:class:`Constant`) or approximately (:class:`RayNet`)."""
+"""What :meth:`ColourField.lower` returns. ``per_primitive``: whether, in one view, the colour at a primitive's centre
+may replace the colour of the whole primitive, exactly (:class:`Constant`) or approximately (:class:`RayNet`)."""
 
 Shade = Callable[[Tensor], Tensor]
 """Function of the (M, 3) float64 scene points that pixels show, which returns (M,) factors on their light, without
@@ -293,11 +295,12 @@ gradient."""
 
 @dataclass(frozen=True)
 class Shading:
-    """Factors on the colours of a frame that follow from the primitives themselves, such as shadows; no gradient.
+    """Factors on the colours of a frame that are computed from all primitives, such as shadows; no gradient.
 
     Attributes:
         primitives: (M,) factors of at least 0, one per primitive of the frame; None: 1.
-        pixels: function of one point per pixel, at the mean depth of what it shows (deferred shading); None: 1.
+        pixels: function that returns one factor per pixel, from the scene point at the pixel's mean depth (deferred
+            shading); None: 1.
     """
 
     primitives: Tensor | None = None

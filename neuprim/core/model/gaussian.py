@@ -1,4 +1,4 @@
-"""A true Gaussian density: the baseline of comparisons. No fast kernel renders it, only the reference backend.
+"""A true Gaussian density, as a baseline for comparisons; only the reference backend renders Gaussian densities.
 
 With y = diag(1/s) R^T (x - mu) the whitened point and c standard deviations at the support's edge |y| = 1,
 
@@ -65,7 +65,7 @@ class GaussianDensity(DensityField):
         return (depth / ctx.thickness / central).log().float()[:, None]
 
     def from_gaussians(self, alphas: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the support of the Gaussians, c standard deviations, and ``alphas``."""
+        """Return the size of the support, c standard deviations for every primitive, and ``alphas`` unchanged."""
         return torch.full_like(alphas, self.deviations), alphas
 
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
@@ -120,7 +120,7 @@ class GaussianDensity(DensityField):
         }
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """Return the scaled amplitudes; a factor below 1e-30 counts as 1e-30, a negative one is a ValueError."""
+        """Return the parameters with kappa times ``factor``, clamped to at least 1e-30; negative: ValueError."""
         if bool((factor < 0).any()):
             raise ValueError(f"density factor {float(factor.min())}; a Gaussian's must not be negative")
         shift = factor.to(params["log_amplitude"]).clamp_min(_FAINTEST).log()
@@ -130,9 +130,9 @@ class GaussianDensity(DensityField):
 def bell_integral(u: Tensor, w: Tensor) -> Tensor:
     """Return B(u, w) = integral of exp(-z^2) over [u - w, u + w], w >= 0, to a few ulp; float64, differentiable.
 
-    Three exact forms, each where it does not cancel (Abramowitz and Stegun 1964, 7.1 and 22.11): where the interval
-    holds 0, sqrt(pi)/2 (erf(w + u) + erf(w - u)); in one tail, sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)); where it is
-    short, the Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
+    Three exact forms are used, each where no digits cancel (Abramowitz and Stegun 1964, 7.1 and 22.11). If the interval
+    contains 0: sqrt(pi)/2 (erf(w + u) + erf(w - u)). In one tail: sqrt(pi)/2 (erfc(|u| - w) - erfc(|u| + w)). If the
+    interval is short: the Taylor series 2 exp(-u^2) sum_k w^(2k+1) H_2k(u) / (2k+1)!, H the Hermite polynomials.
     """
     side = u.abs()
     both = torch.erf(w + u) + torch.erf(w - u)

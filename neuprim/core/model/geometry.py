@@ -52,7 +52,7 @@ class Geometry(PrimitiveTensors):
 
     @property
     def log_length_scale(self) -> Tensor:
-        """Logarithm of the longest semi-axis m, (N,); the first of equal axes gets the gradient, in every backend."""
+        """Logarithm of the longest semi-axis m, (N,). Of equal axes, the first gets the gradient, in every backend."""
         first = self.log_scales.argmax(dim=-1, keepdim=True)
         return self.log_scales.gather(-1, first)[..., 0]
 
@@ -87,13 +87,14 @@ GEOMETRY_SPECS: tuple[ParameterSpec, ...] = (
     ParameterSpec("log_scales", (3,), 2e-2, _initial_log_scales),
     ParameterSpec("quats", (4,), 1e-2, _initial_quats),
 )
-"""Every model starts with these ten numbers per primitive."""
+"""Parameters of the ellipsoids, ten values per primitive; they come first in every model."""
 
 
 @dataclass(frozen=True)
 class PrimitiveChords:
-    """M chords, one for each ray and primitive that meet; float64, differentiable. Lengths are in m, the longest
-    semi-axis.
+    """M chords, one for each pair of a ray and a primitive that it crosses; float64, differentiable.
+
+    The unit of length is m, the longest semi-axis of the primitive, unless stated.
 
     Attributes:
         prim: (M,) int64 rows of the primitives.
@@ -102,8 +103,9 @@ class PrimitiveChords:
         half: (M,) half lengths of the chords, in m.
         origin: (M, 3) or (3,) starts of the rays, scene units.
         near, far, middle: (M,) ends and middles of the chords, as ray distances in m.
-        m: (M,) scene units.
-        whitened, pace: (M, 3) middles in whitened space, and their derivative by the ray distance in m.
+        m: (M,) longest semi-axes, scene units.
+        whitened: (M, 3) middles of the chords in whitened space, where the ellipsoid is the unit ball.
+        pace: (M, 3) derivative of whitened positions along the ray with respect to the ray distance in m.
     """
 
     prim: Tensor
@@ -122,7 +124,7 @@ class PrimitiveChords:
     def of(
         cls, geometry: Geometry, prim: Tensor, origin: Tensor, direction: Tensor, t0: Tensor, t1: Tensor
     ) -> PrimitiveChords:
-        """Return the chords, or parts of chords, from ray distance ``t0`` to ``t1`` (M,), scene units."""
+        """Return the chords, or parts of chords, between ray distances ``t0`` and ``t1``, (M,) each, scene units."""
         m = geometry.length_scale.double()[prim]
         middle = (t0 + t1) / 2
         local = (origin + middle[:, None] * direction - geometry.means.double()[prim]) / m[:, None]

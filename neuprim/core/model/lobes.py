@@ -28,7 +28,7 @@ AMPLITUDE, AXIS, LOG_SHARPNESS = "lobe_amplitude", "lobe_axis", "lobe_log_sharpn
 def lobe_colors(
     means: Tensor, dc: Tensor, amplitude: Tensor, axis: Tensor, log_sharpness: Tensor, origin: Tensor
 ) -> Tensor:
-    """Return (N, C) colours of spherical Gaussian lobes, in the colour space of the images; fused on float32.
+    """Return (N, C) colours of spherical Gaussian lobes, in the colour space of the images; one kernel for float32.
 
     c(d) = max(0, C0 dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))), d the unit direction from the camera.
 
@@ -93,7 +93,7 @@ def random_lobe_axes(count: int, lobes: int, generator: torch.Generator) -> Tens
 def reduce_lobes(params: Params, keep: int) -> dict[str, Tensor]:
     """Keep the ``keep`` lobes of each primitive that vary most over the sphere of directions.
 
-    The means of the others are added to the base colour.
+    The mean colours of the removed lobes are added to the base colour.
     """
     amplitude = params[AMPLITUDE].double()
     s = params[LOG_SHARPNESS].double().clamp(-LOG_LIMIT, LOG_LIMIT).exp()

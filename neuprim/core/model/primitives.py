@@ -1,4 +1,4 @@
-"""A model: geometry and the tensors of its two fields, one row per primitive."""
+"""The model: ellipsoids and the parameters of a density field and a colour field, one row per primitive."""
 
 from __future__ import annotations
 
@@ -56,9 +56,9 @@ class LoweredPrimitives:
         self.check_frame(viewmat, background)
 
     def check_finite(self) -> None:
-        """Raise NonFiniteError for the first primitive with a number, quaternion or scale that cannot be rendered.
+        """Raise NonFiniteError for the first primitive with a value, quaternion or scale that cannot be rendered.
 
-        The kernels check the same while they prepare a frame.
+        The kernels of the backends make the same check while they prepare a frame.
         """
         g = self.geometry
         if not g.count:
@@ -77,7 +77,7 @@ class LoweredPrimitives:
                 raise non_finite_primitive_error(tensors, int(bad.nonzero()[0]))
 
     def check_frame(self, viewmat: Any, background: Any) -> None:
-        """Check shade, background, viewmat and devices, which :meth:`Primitives.lower` does not; raises FormError."""
+        """Check shading, background, viewmat and devices; raise FormError. :meth:`Primitives.lower` checks the rest."""
         if self.shade is not None and (fault := function_fault(self.shade)) is not None:
             raise FormError(f"{self.owner('colour')}: shade has {fault} or None")
         if background is not None:
@@ -106,7 +106,7 @@ class LoweredPrimitives:
 
     @property
     def movable(self) -> bool:
-        """Whether :meth:`to` can move it to another device: no, if custom code computes density or colour."""
+        """Whether :meth:`to` can move the tensors to another device; False if density or colour is custom code."""
         return self.density.movable and self.colour.movable
 
     def to(self, device: torch.device) -> LoweredPrimitives:
@@ -120,7 +120,7 @@ class LoweredPrimitives:
         return model_field_label(kind, None if self.fields is None else self.fields[kind == "colour"])
 
     def source(self, kind: Literal["density", "colour"]) -> str:
-        """Return the name of field and form for messages: ``"density field Waves lowered to Cosine"``."""
+        """Return the names of field and closed form for messages, ``"density field Waves lowered to Cosine"``."""
         return f"{self.owner(kind)} lowered to {type(getattr(self, kind)).__name__}"
 
     def center_colors(self, position: Tensor) -> Tensor:
@@ -145,15 +145,15 @@ class LoweredPrimitives:
 
 @dataclass(frozen=True)
 class ActivePrimitives:
-    """The M primitives that can absorb anything under some conditions."""
+    """The M primitives whose extinction is not zero under the conditions of a frame."""
 
     field: DensityField
     conditions: Conditions
     rows: Tensor | None  # (M,) int64 rows of the model, ascending; None for all
-    params: dict[str, Tensor]  # all tensors of these primitives
-    own: dict[str, Tensor]  # tensors of the density field
+    params: dict[str, Tensor]  # all parameters of these primitives
+    own: dict[str, Tensor]  # parameters of the density field
     stored: Geometry  # ellipsoids as the model stores them
-    geometry: Geometry  # ellipsoids under the conditions
+    geometry: Geometry  # ellipsoids under the conditions of the frame, e.g. moved
 
     def sigma(self, prim: Tensor, x: Tensor) -> Tensor:
         """Return sigma (P,), 1/scene unit, unclamped, of active primitives ``prim`` (P,) at points ``x`` (P, 3)."""
@@ -228,10 +228,10 @@ class Primitives:
     def lower(
         self, camera: AnyCamera, conditions: Conditions, settings: RenderSettings | None = None, shaded: bool = True
     ) -> LoweredPrimitives:
-        """Return the closed forms of a frame, without inactive primitives; differentiable.
+        """Return the renderer's input for a frame: closed forms without inactive primitives; differentiable.
 
         Args:
-            settings: for images that a colour field renders first, such as those of shadows; None: the defaults.
+            settings: for images that a colour field itself renders, such as shadow maps; None: the defaults.
             shaded: whether to apply :meth:`~neuprim.core.model.fields.ColourField.shade`.
 
         Raises:
@@ -253,7 +253,7 @@ class Primitives:
         return LoweredPrimitives(geometry, density, colour, active.rows, shading.pixels, names)
 
     def lower_density(self, conditions: Conditions) -> tuple[Geometry, LoweredDensity]:
-        """Return geometry and density of the active primitives of a frame."""
+        """Return geometry and closed form of the density for the active primitives of a frame."""
         active = self.active(conditions)
         return active.geometry, self._lower_density(active)[0]
 
@@ -275,7 +275,7 @@ class Primitives:
 
     @torch.no_grad()
     def limit(self, largest: float) -> None:
-        """Scale densities in place, so that no primitive exceeds the extinction ``largest``, 1/scene unit."""
+        """Scale the densities of primitives in place, so that none exceeds the extinction ``largest``, 1/scene unit."""
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
         if found is None:
@@ -286,7 +286,7 @@ class Primitives:
                 own[name].copy_(value)
 
     def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActivePrimitives:
-        """Return the active primitives of a frame; differentiable. With ``dtype``, detached and of that type."""
+        """Return the active primitives of a frame; differentiable. With ``dtype``, detached and of this dtype."""
         rows = self.density.active_rows(self.of(self.density), conditions)
         params = self.params
         if rows is not None:
@@ -305,7 +305,7 @@ class Primitives:
         return ActivePrimitives(self.density, conditions, rows, params, own, stored, moved)
 
     def to(self, device: torch.device) -> Primitives:
-        """Return the model on another device, without gradients; itself if it is there already."""
+        """Return a copy of the model on another device, without gradients; ``self`` if it is on ``device`` already."""
         if self.device == device:
             return self
         return Primitives(
@@ -313,7 +313,7 @@ class Primitives:
         )
 
     def rows(self, index: Tensor) -> dict[str, Tensor]:
-        """Return detached copies of some rows of every parameter, by name."""
+        """Return parameter name -> detached copy of the rows ``index``, for every parameter."""
         return {name: value.detach()[index].clone() for name, value in self.params.items()}
 
     def check_finite(self, what: str = "parameter") -> None:
@@ -332,12 +332,15 @@ KINDS = ("density", "colour")  # first parts of the names of reductions
 
 
 def reduction_names(density: DensityField, colour: ColourField) -> list[str]:
-    """List the names of all reductions of two fields, such as ``density.neurons``."""
+    """List the settings of two fields that can be reduced after training, such as ``density.neurons``."""
     return [f"{kind}.{name}" for kind, own in zip(KINDS, (density, colour), strict=True) for name in own.reductions()]
 
 
 def validate_reduction(density: DensityField, colour: ColourField, kind: str, name: str, value: Any) -> int:
-    """Return the value if the field of this kind can be reduced to it, or raise ConfigError."""
+    """Return ``value`` if the setting ``name`` of a field can be reduced to it, or raise ConfigError.
+
+    ``kind`` is "density" or "colour".
+    """
     field = density if kind == KINDS[0] else colour
     offered = field.reductions()
     if name not in offered:
@@ -351,7 +354,8 @@ def validate_reduction(density: DensityField, colour: ColourField, kind: str, na
 
 
 def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primitives:
-    """Return the model with one field reduced, as close to the original as possible; what changes is detached."""
+    """Return the model with the setting ``name`` of one field reduced to ``value``, as close to the original as
+    possible. Changed tensors are detached."""
     own = model.density if kind == KINDS[0] else model.colour
     tensors = {key: value.detach() for key, value in model.of(own).items()}
     field, reduced = own.reduce(tensors, model.geometry, name, value)
@@ -365,7 +369,7 @@ def reduce_model(model: Primitives, kind: str, name: str, value: int) -> Primiti
 def reduce_fields(
     density: DensityField, colour: ColourField, overrides: Sequence[str]
 ) -> tuple[DensityField, ColourField]:
-    """Apply the reductions of ``model.reduced``, one after the other, to fields that have no model yet."""
+    """Apply the reductions of the setting ``model.reduced``, in order, to fields that have no parameters yet."""
     for word in overrides:
         key, equals, text = word.partition("=")
         kind, dot, name = key.partition(".")

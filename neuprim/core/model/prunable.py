@@ -1,8 +1,8 @@
-"""Prunable units: numbers that a primitive can do without, such as a neuron; files store pruned parameters sparsely.
+"""Prunable units: groups of parameter elements, such as a neuron, that pruning can set to zero in single primitives.
 
-Pruning decides per primitive which units stay. Where it is smaller, a file has two tensors of a parameter:
-``NAME|there``, uint8, one bit per number, row by row and lowest bit first, and ``NAME|numbers``, float32, those whose
-bit is set.
+Pruning decides for each primitive which units stay. A file stores a parameter sparsely where that takes less space, as
+two tensors. ``NAME|there``, uint8, has one bit per element, row by row and lowest bit first. ``NAME|numbers``, float32,
+has the elements whose bit is set.
 """
 
 from __future__ import annotations
@@ -25,24 +25,27 @@ Index = tuple[int | slice, ...]  # index into a parameter, behind the axis of th
 
 @dataclass(frozen=True)
 class PrunableUnit:
-    """Numbers of a field that pruning removes together, such as one neuron."""
+    """Elements of a field's parameters that pruning sets to zero together, such as one neuron."""
 
     name: str  # unique within the field, e.g. "neuron 2"
-    places: Mapping[str, Index]  # parameter -> index of the numbers
-    group: str = ""  # units that are reported together, e.g. "band 2"; empty: the name
+    places: Mapping[str, Index]  # parameter name -> index of the elements in a row
+    group: str = ""  # label under which reports add up units, e.g. "band 2"; empty: the unit's name
 
     def of(self, params: Params) -> dict[str, Tensor]:
-        """Return the numbers by parameter, as (N, ...) views."""
+        """Return parameter name -> elements of this unit, as (N, ...) views."""
         return {name: params[name][(slice(None), *place)] for name, place in self.places.items()}
 
 
 def count_unit_numbers(unit: PrunableUnit, params: Params) -> int:
-    """Count the numbers of a unit in one primitive."""
+    """Return how many parameter elements a unit has in one primitive."""
     return sum(math.prod(value.shape[1:]) for value in unit.of(params).values())
 
 
 def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
-    """Return (N,) first-order changes, when the unit becomes zero, of the sum whose gradients are given."""
+    """Return (N,) sums over the unit of value times gradient.
+
+    The sum is, to first order and negated, how much the differentiated loss changes when the unit becomes zero.
+    """
     slopes = unit.of(gradients)
     parts = [_flat_primitive_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]
     total = parts[0]
@@ -52,7 +55,10 @@ def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients:
 
 
 def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
-    """Copy the parameters with units, name -> (unit, (N,) bool of primitives that lose it), set to zero."""
+    """Return copies of the parameters in which some primitives' units are zero.
+
+    ``units``: name -> (unit, (N,) bool of the primitives that lose the unit).
+    """
     changed = {name for unit, gone in units.values() if bool(gone.any()) for name in unit.places}
     found = {name: value.detach().clone() if name in changed else value for name, value in params.items()}
     for unit, gone in units.values():
@@ -63,12 +69,12 @@ def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params)
 
 
 def primitives_with_unit(unit: PrunableUnit, params: Params) -> Tensor:
-    """Return (N,) bool of the primitives for which some number of the unit is not zero."""
+    """Return (N,) bool of the primitives in which some element of the unit is not zero."""
     return torch.stack([_flat_primitive_rows(value.detach() != 0).any(1) for value in unit.of(params).values()]).any(0)
 
 
 def _flat_primitive_rows(value: Tensor) -> Tensor:
-    """Reshape to (N, numbers per primitive), also for N = 0."""
+    """Reshape to (N, elements per primitive), also for N = 0."""
     return value.reshape(len(value), math.prod(value.shape[1:]))
 
 
@@ -76,7 +82,7 @@ _MASK, _NUMBERS = "|there", "|numbers"
 
 
 def sparse_primitive_parameters(params: Params, specs: Sequence[ParameterSpec]) -> tuple[dict[str, Tensor], list[str]]:
-    """Return the tensors of a file and the names of sparse parameters; ``specs`` are those of the fields."""
+    """Return the tensors to write to a model file, and the names of the parameters that are stored sparsely."""
     stored, sparse = dict(params), []
     for name in (spec.name for spec in specs):
         numbers = params[name].detach().cpu().contiguous().flatten()
@@ -92,9 +98,9 @@ def sparse_primitive_parameters(params: Params, specs: Sequence[ParameterSpec]) 
 def dense_primitive_parameters(
     stored: Params, names: object, specs: Sequence[ParameterSpec], where: str
 ) -> dict[str, Tensor]:
-    """Return the dense tensors of a model file with sparse parameters ``names``; ``where``: the file, for messages.
+    """Return the dense parameters from the ``stored`` tensors of a file whose parameters ``names`` are sparse.
 
-    Raises CheckpointError where the tensors do not fit the fields or each other.
+    ``where`` names the file in messages. Raises CheckpointError if tensors do not fit the ``specs`` or each other.
     """
     shapes = {spec.name: spec.shape for spec in specs}
     if not isinstance(names, list) or not all(isinstance(name, str) and name in shapes for name in names):

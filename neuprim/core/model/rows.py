@@ -1,6 +1,6 @@
-"""Compiled CPU kernels per primitive: gather rows of many tensors, rotations and gains.
+"""Compiled CPU kernels that run per primitive: gather rows of many tensors, rotations and gains.
 
-Row numbers ascend, so that a gradient is written in one pass.
+Row numbers must ascend, so that the backward pass writes a gradient in one pass.
 """
 
 from __future__ import annotations
@@ -20,7 +20,10 @@ _FEW = 4096  # for fewer rows without a gradient, torch is faster than starting 
 
 
 def take_primitive_rows(tensors: Mapping[str, Tensor], rows: Tensor) -> dict[str, Tensor]:
-    """Gather ascending int64 ``rows`` (M,), unchecked, of float32 or float64 tensors (N, ...); differentiable once."""
+    """Return the ``rows`` (M,) of float32 or float64 tensors (N, ...); differentiable once.
+
+    ``rows`` must be ascending int64; this is not checked.
+    """
     if not device.on_numba(rows, *tensors.values()) or (len(rows) < _FEW and not kernel_needs_grad(*tensors.values())):
         return {name: value.index_select(0, rows) for name, value in tensors.items()}
     return dict(zip(tensors, apply_kernel_operation(_PrimitiveRows, rows, *tensors.values()), strict=True))
@@ -94,7 +97,10 @@ class _PrimitiveRows(torch.autograd.Function):
 
 @strict
 def ellipsoid_rotation(w, x, y, z):  # type: ignore[no-untyped-def]
-    """Return 1/|q| and the rotation matrix of a float64 quaternion, row by row; float32 squares would scale it."""
+    """Return 1/|q| and the nine entries of the rotation matrix of a float64 quaternion, row by row.
+
+    In float32, the rounding of the squares would scale the matrix.
+    """
     n = 1.0 / np.sqrt(w * w + x * x + y * y + z * z)
     w, x, y, z = w * n, x * n, y * n, z * n
     return (
@@ -117,7 +123,10 @@ def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
 
 @strict
 def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
-    """Return dL/dq from ``g``, dL/dR row by row, and ``n`` = 1/|q|; normalisation projects out the radial part."""
+    """Return dL/dq from ``g``, the nine entries of dL/dR row by row, and ``n`` = 1/|q|.
+
+    The result is perpendicular to q, because the rotation does not depend on |q|.
+    """
     g00, g01, g02, g10, g11, g12, g20, g21, g22 = g
     w, x, y, z = w * n, x * n, y * n, z * n
     gw = 2 * (x * (g21 - g12) + y * (g02 - g20) + z * (g10 - g01))
@@ -137,7 +146,11 @@ def ellipsoid_rotation_backward(q, n, g, out):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def cosine_gain_backward(w2, b2, factor, p_w2, p_b2, g_w2, g_b2, pulled):  # type: ignore[no-untyped-def]
-    """Write the gradients of w2 (N, K) and b2 (N, 1), which ``factor`` (N, 1) multiplies, and of it, ``pulled``."""
+    """Write the gradients of w2 (N, K), b2 (N, 1) and ``factor`` (N, 1) for the products w2 factor and b2 factor.
+
+    ``p_w2`` and ``p_b2`` are the gradients of the products; ``g_w2``, ``g_b2`` and ``pulled`` receive the results.
+    ``pulled`` is the gradient of the factor.
+    """
     for n in range(b2.shape[0]):
         total = np.float64(p_b2[n, 0]) * b2[n, 0]
         g_b2[n, 0] = p_b2[n, 0] * factor[n, 0]
@@ -165,7 +178,10 @@ class _CosineGain(torch.autograd.Function):
 
 
 def fused_cosine_gain(w2: Tensor, b2: Tensor, log_gain: Tensor, limit: float) -> tuple[Tensor, Tensor]:
-    """Return w2 (N, K) and b2 (N, 1) times exp(log_gain), log_gain (N, 1) clamped to +-``limit``; one dtype."""
+    """Return ``w2`` (N, K) and ``b2`` (N, 1) times exp(log_gain); ``log_gain`` (N, 1) is clamped to +-``limit``.
+
+    All tensors have the same dtype.
+    """
     if not device.on_numba(w2, b2, log_gain):
         gain = log_gain.clamp(-limit, limit).exp()
         return w2 * gain, b2 * gain

@@ -23,7 +23,7 @@ Params = Mapping[str, Tensor]
 
 @dataclass
 class InitContext:
-    """Input of the functions that draw the start values of parameters.
+    """Input of the functions that draw the start values of the parameters of N primitives.
 
     Attributes:
         means: (N, 3) initial centres, scene units.
@@ -67,27 +67,27 @@ class InitContext:
         return (2.0 * u - 1.0) * bound
 
     def number(self, name: str, default: float, low: float = -math.inf, high: float = math.inf) -> float:
-        """Return ``settings[name]``, strictly between ``low`` and ``high``, or raise ConfigError."""
+        """Return the number ``settings[name]``; raise ConfigError unless it is above ``low`` and below ``high``."""
         bounds = Range(above=low, below=high)
         return float(validate_value(self.settings.get(name, default), Annotated[float, bounds], f"model.init.{name}"))
 
     def choice(self, name: str, *offered: str) -> str:
-        """Return ``settings[name]``, one of those offered (default: the first), or raise ConfigError."""
+        """Return ``settings[name]``, by default the first of ``offered``; raise ConfigError for any other value."""
         return str(validate_value(self.settings.get(name, offered[0]), Literal[offered], f"model.init.{name}"))
 
 
 @dataclass(frozen=True)
 class ParameterSpec:
-    """One learnable tensor with one row per primitive.
+    """Description of a parameter: one learnable tensor with one row per primitive.
 
     Attributes:
-        name: unique within a model; the key in checkpoints, rates and exports.
+        name: unique within a model; the key in checkpoints, learning rates and exports.
         shape: shape per primitive, ``()`` for a scalar.
         lr: learning rate; ``train.rates.NAME`` overrides it. 0 means a label: not learned, stored in every file.
         init: function that draws the (N, *shape) float32 start values.
         lr_unit: factor on the rate: "absolute", 1; "extent", the data set's
             :attr:`~neuprim.core.data.Dataset.extent`; "pixel", the size of a pixel at the median depth of the start.
-            ``train.rate_units.NAME`` overrides it.
+            ``train.rate_units.NAME`` overrides ``lr_unit``.
         low: lower bound of the values. With 0, a value that the model clamps at 0 keeps its gradient and can rise.
     """
 

@@ -52,7 +52,7 @@ def lowest_band_colors(dc: Tensor) -> Tensor:
 
 
 def sh_colors(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Tensor, degree: int) -> Tensor:
-    """Return the (N, C) colours max(0, SH(direction from origin to mean) + 1/2); fused on float32 tensors.
+    """Return the (N, C) colours max(0, SH(direction from origin to mean) + 1/2); one kernel for float32 tensors.
 
     Args:
         means: (N, 3) centres of the primitives, scene units.
@@ -100,7 +100,7 @@ def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Ten
 
 
 def truncate_sh_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
-    """Return the tensors without the bands of ``name`` above ``degree``, the closest approximation on average."""
+    """Return the parameters with the bands of ``name`` cut above ``degree``, the closest approximation on average."""
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : sh_coefficient_count(degree) - 1].contiguous()} if degree else kept
 
@@ -111,7 +111,7 @@ black."""
 
 
 def prunable_sh_coefficients(degree: int, channels: int, name: str) -> tuple[PrunableUnit, ...]:
-    """Return a unit for each number of the coefficients ``name``, (N, (degree + 1)^2 - 1, C), in groups by band."""
+    """Return a unit for each element of the coefficients ``name``, (N, (degree + 1)^2 - 1, C), in groups by band."""
     return tuple(
         PrunableUnit(
             f"coefficient {band} {order - band:+d}, channel {c}", {name: (band * band - 1 + order, c)}, f"band {band}"

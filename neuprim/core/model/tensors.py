@@ -1,6 +1,6 @@
-"""Requirements of kernels on tensors: dtype, layout, device, and shapes in which letters are common sizes.
+"""Requirements of kernels on tensors: dtype, layout, device and shape. Letters in shapes are sizes in common.
 
-Functions return a fault as text, or None; :mod:`neuprim.core.model.checks` raises errors.
+The functions return None, or what is wrong as text; :mod:`neuprim.core.model.checks` raises the errors.
 """
 
 from __future__ import annotations
@@ -55,7 +55,8 @@ def function_fault(value: Any) -> str | None:
 
 
 def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
-    """Return the fault of the first (name, tensor, allowed shapes) that does not fit, or None; extends ``sizes``."""
+    """Return what is wrong with the first of (name, tensor, allowed shapes) whose tensor kernels cannot read or whose
+    shape is not allowed; None if all are valid. Adds the sizes found to ``sizes``."""
     for name, value, shapes in tensors:
         fault = primitive_tensor_fault(value)
         if fault is None:
@@ -70,7 +71,7 @@ def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]
 
 
 def labelled_fault(name: str, fault: str | None) -> str | None:
-    """Return ``"NAME has FAULT"``, or None without a fault."""
+    """Return ``"NAME has FAULT"``, or None if ``fault`` is None."""
     return None if fault is None else f"{name} has {fault}"
 
 
@@ -130,7 +131,7 @@ class PrimitiveTensors:
 
     @property
     def movable(self) -> bool:
-        """Whether :meth:`to` can move it: yes if it holds tensors; custom code stays on the device of its tensors."""
+        """Whether :meth:`to` can move the group to another device: True for tensors, False for custom code."""
         return bool(self.shapes)
 
     def to(self, device: torch.device) -> Self:
@@ -138,9 +139,9 @@ class PrimitiveTensors:
         return replace(self, **{name: getattr(self, name).to(device) for name in self.shapes})  # type: ignore[type-var]
 
     def fault(self, sizes: Sizes) -> str | None:
-        """Return the first fault, ``"w2 has shape (5,); expected (100, 3), as means has N=100 ..."``, or None.
+        """Return the first error in the tensors, ``"w2 has shape (5,); expected (100, 3), as means has N=100 ..."``.
 
-        ``sizes``: sizes known so far; this adds those of its own tensors.
+        Returns None if all tensors are valid. ``sizes``: sizes known so far; those of these tensors are added.
         """
         return primitive_tensors_fault(
             [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes

@@ -1,4 +1,4 @@
-"""One renderer for every task: ``render(model, camera, conditions, settings) -> RenderOutput``."""
+"""Render a model of any task: ``render(model, camera, conditions, settings) -> RenderOutput``."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def render(
 
     Args:
         camera: the camera; rgb is (camera.height, camera.width, C). Only "reference" renders a :class:`RayCamera`.
-        conditions: a value of every condition, e.g. ``{"time": tensor(0.5)}``.
+        conditions: one value for each condition of the model, e.g. ``{"time": tensor(0.5)}``.
         settings: render settings; None for the defaults with ``near="auto"``.
         background: (C,) colour behind everything; None is black.
 
@@ -81,7 +81,7 @@ def render(
 def render_lowered(
     lowered: LoweredPrimitives, camera: AnyCamera, settings: RenderSettings, background: Tensor | None = None
 ) -> RenderOutput:
-    """Render closed forms, as :meth:`Primitives.lower` returns them; raises the errors of :func:`render`."""
+    """Render a model that :meth:`Primitives.lower` evaluated at its conditions; errors as :func:`render`."""
     lowered.check(camera.viewmat, background)
     return _render_checked_view(lowered, camera, settings, background)
 
@@ -114,7 +114,7 @@ def _render_checked_view(
 
 
 def probe_backend(name: str) -> str | None:
-    """Return None if a backend works on this machine, else the reason; renders one small sphere to find out."""
+    """Test a backend by rendering one small sphere; return None if the backend works here, else the reason."""
     from neuprim.core.model.geometry import Geometry
 
     try:
@@ -139,12 +139,12 @@ def probe_backend(name: str) -> str | None:
 def render_slabs(
     geometry: Geometry, density: LoweredDensity, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return (S, H, W) opacities and mean depths of groups of primitives (slabs), each rendered alone; no gradients.
+    """Render each group of primitives (slab) alone; return (S, H, W) opacities and (S, H, W) mean depths; no gradients.
 
-    Slabs without primitives are left out; the others keep their order.
+    S is the number of slabs that have primitives. They keep their order; empty slabs are left out.
 
     Args:
-        slabs: (N,) slab of each primitive, 0 to ``count`` - 1, on the primitives' device.
+        slabs: (N,) index of the slab of each primitive, 0 to ``count`` - 1, on the primitives' device.
         settings: render settings with ``depth``.
     """
     with torch.no_grad():

@@ -1,4 +1,4 @@
-"""The table of renderer backends; a backend's module is imported only when it is used."""
+"""The renderer backends and which one to use; the module of a backend is imported at its first use."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def _cpu_backend_name() -> str:
 
 @dataclass(frozen=True)
 class Backend:
-    """A renderer backend."""
+    """One implementation of the renderer, a row of :data:`TABLE`."""
 
     name: str  # value of the setting renderer.backend
     load: Callable[[], Draw]  # imports the backend and returns its render function
     unsupported: Callable[[LoweredPrimitives, AnyCamera | None], str | None] = _no_backend_fault
-    """Returns what it cannot render of a model with a camera (None: any pinhole), as the rest of a sentence that starts
-    with "cannot draw"; None if it can."""
+    """Returns what the backend cannot render of a model with a camera (None: any pinhole), as the rest of a sentence
+    that starts with "cannot draw"; None if it can render all."""
     device_name: Callable[[], str] = _cpu_backend_name  # name of its device, for reports
     missing: Callable[[], str | None] = _no_backend_fault
     """Returns what this machine lacks, such as a package; None if nothing. Must be fast."""
@@ -53,25 +53,28 @@ class Backend:
     differentiates_intrinsics: bool = False  # whether focal lengths and principal points get gradients
     devices: tuple[str, ...] = (hardware.CPU,)  # kinds of device that it renders on, its main one first
     slabs: Callable[[], Callable[..., tuple[Tensor, Tensor]] | None] = _no_backend_fault
-    """Loads and returns a function that renders all slabs in one frame; None if it has none."""
+    """Loads and returns the backend's function that renders all slabs in one frame; None if there is none."""
 
     def drawing_device(self, settings: RenderSettings) -> str:
-        """Return the kind of device, "cpu" or "cuda", on which it renders with these settings."""
+        """Return the kind of device, "cpu" or "cuda", on which the backend renders with these settings."""
         return self.devices[0] if settings.device == AUTO else settings.device
 
     def computing_on(self, settings: RenderSettings) -> str:
-        """Return the name of the device on which it renders with these settings, for reports."""
+        """Return the name of the device on which the backend renders with these settings, for reports."""
         return self.device_name() if self.drawing_device(settings) == self.devices[0] else _cpu_backend_name()
 
     def unavailable(self, device: str | None = None) -> str | None:
-        """Return why this machine cannot run it on a kind of device (None: its main one); None if it can."""
+        """Return why the backend cannot run here on a kind of device (None: its main one); None if it can."""
         device = device or self.devices[0]
         return (hardware.cuda_unavailable() if device == hardware.CUDA else None) or self.missing()
 
     def cannot_draw(
         self, lowered: LoweredPrimitives, camera: AnyCamera | None, device: str | None = None
     ) -> str | None:
-        """Return why it cannot draw this on a kind of device (None: its main one), as a predicate; None if it can."""
+        """Return why the backend cannot render this model, as in "cannot run here: ..."; None if it can.
+
+        ``camera`` None: any pinhole. ``device``: "cpu", "cuda" or None, the main device of the backend.
+        """
         device = device or self.devices[0]
         if device not in self.devices:
             return f"draws on the {' or '.join(self.devices)}, but renderer.device is {device}"
@@ -85,7 +88,7 @@ class Backend:
 
 
 def unsupported_by_kernels(lowered: LoweredPrimitives, camera: AnyCamera | None) -> str | None:
-    """Return which form or camera the cpu and cuda kernels cannot draw; None if they can draw this."""
+    """Return which form or camera the cpu and cuda backends cannot render; None if they can render this model."""
     if not (isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)):
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
         return f"{forms}; it knows Cosine, and Constant or RayNet"
@@ -134,7 +137,7 @@ TABLE: tuple[Backend, ...] = (
 
 
 def backend_names() -> tuple[str, ...]:
-    """Return the names of the whole table, in its order."""
+    """Return the names of all backends, fastest first, whether this machine can run them or not."""
     return tuple(backend.name for backend in TABLE)
 
 
@@ -144,14 +147,14 @@ def available_backends() -> tuple[Backend, ...]:
 
 
 def check_backend_name(name: object) -> None:
-    """Raise :class:`ConfigError` unless the setting ``renderer.backend`` may have this value."""
+    """Raise :class:`ConfigError` unless ``name`` is a valid value of the setting ``renderer.backend``."""
     valid = (AUTO, *backend_names())
     if name not in valid:
         raise ConfigError(f"renderer.backend={name}: expected {', '.join(valid[:-1])} or {valid[-1]}")
 
 
 def find_backend(name: str) -> Backend:
-    """Return the backend of this name, or raise :class:`ConfigError`."""
+    """Return the backend called ``name``; raises :class:`ConfigError` if there is none."""
     for backend in TABLE:
         if backend.name == name:
             return backend
@@ -160,9 +163,9 @@ def find_backend(name: str) -> Backend:
 
 
 def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tuple[Backend, ...]:
-    """Return the backends that may draw tensors on a ``kind`` of device under these settings.
+    """Return the backends that these settings permit for tensors on a ``kind`` of device, "cpu" or "cuda".
 
-    Tensors on the CPU move to a GPU only if the settings request it.
+    The renderer moves tensors from the CPU to a GPU only if the settings request a GPU.
     """
     if settings.backend != AUTO:
         return (find_backend(settings.backend),)
@@ -174,7 +177,7 @@ def candidate_backends(settings: RenderSettings, kind: str = hardware.CPU) -> tu
 
 
 def gpu_backends_unavailable() -> str | None:
-    """Return why no backend can draw on a GPU here; None if one can."""
+    """Return why no backend can render on a GPU of this machine; None if one can."""
     reason = hardware.cuda_unavailable()
     rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CUDA]
     if reason is None and not rows:
@@ -183,7 +186,7 @@ def gpu_backends_unavailable() -> str | None:
 
 
 def check_backend_device(settings: RenderSettings) -> None:
-    """Raise :class:`ConfigError` if the named backend does not draw on the device of the settings."""
+    """Raise :class:`ConfigError` if the backend of the settings cannot use the device of the settings."""
     if AUTO in (settings.backend, settings.device):
         return
     backend = find_backend(settings.backend)
@@ -211,7 +214,7 @@ def check_render_backend(settings: RenderSettings) -> None:
 
 
 def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
-    """Return settings to draw a finished run here: without a GPU, device "cuda" of backend "auto" becomes "auto"."""
+    """Return settings to render a finished run: without a GPU, device "cuda" of backend "auto" becomes "auto"."""
     gone = settings.device == hardware.CUDA and gpu_backends_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 
@@ -219,7 +222,7 @@ def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
 def best_render_backend_device(
     model: Primitives, settings: RenderSettings, camera: AnyCamera, conditions: Conditions
 ) -> torch.device:
-    """Return the device on which a run should store its tensors to draw frames like this one."""
+    """Return the device on which a run should store its tensors to render frames like this one."""
     check_render_backend(settings)
     if settings.device != AUTO:
         return hardware.current_device(settings.device)
@@ -237,7 +240,7 @@ def best_render_backend_device(
 def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera: AnyCamera | None = None) -> Backend:
     """Return the backend that renders this model with this camera (None: any pinhole).
 
-    Raises BackendUnavailable if the chosen backend cannot, and ConfigError if no backend has this name.
+    Raises BackendUnavailable if the backend of the settings cannot render it, and ConfigError for an unknown name.
     """
     check_render_backend(settings)
     reasons = []

@@ -1,6 +1,6 @@
-"""Layers that ``neuprim render --format exr`` can write, and the frame from which they are computed.
+"""Layers, such as depth, that ``neuprim render --format exr`` can write, and the input of their functions.
 
-Every task has those of :data:`COMMON`; :attr:`neuprim.core.task.TaskSpec.layers` adds others.
+Every task has the layers in :data:`COMMON`; :attr:`neuprim.core.task.TaskSpec.layers` adds others.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ _ROUNDS = 14  # at most: thins by 8^14 = 4e12; float32 hardly needs more
 
 @dataclass(frozen=True)
 class LayerFrame:
-    """The input of a layer: a model in one view, with its image and integrals along rays, without gradients."""
+    """One view of a model: its image and integrals along rays, from which layers are computed; no gradients."""
 
     model: Primitives
     camera: Camera
@@ -38,18 +38,18 @@ class LayerFrame:
 
     @cached_property
     def lowered(self) -> LoweredPrimitives:
-        """The closed forms of the frame's primitives."""
+        """The primitives at the conditions of the frame, with closed forms of density and colour."""
         with torch.no_grad():
             return self.model.lower(self.camera, self.conditions, self.settings)
 
     @cached_property
     def drawn(self) -> RenderOutput:
-        """Image over black, with depth; ``rgb`` is premultiplied by ``alpha``."""
+        """The rendered image over black, with depth; ``rgb`` is premultiplied by ``alpha``."""
         return self._render(self.lowered, replace(self.settings, depth=True))
 
     @cached_property
     def emitted(self) -> Tensor | None:
-        """Integral of sigma times colour along each ray, (H, W, C); None if colours vary within a primitive."""
+        """Integral of extinction times colour along each ray, (H, W, C); None if colours vary within a primitive."""
         colours = self.lowered.colour.flat
         if colours is None:
             return None
@@ -64,7 +64,7 @@ class LayerFrame:
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """Mean shading factor of what each pixel shows, (H, W), 0 where nothing is hit; None without shading."""
+        """Mean shading factor in each pixel, (H, W), 0 where the ray hits no primitive; None without shading."""
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
@@ -89,8 +89,8 @@ class LayerFrame:
     def integral(self, weights: Tensor | None = None) -> Tensor:
         """Return (H, W) sums along each ray of the primitives' optical depths, each times its weight.
 
-        Optical depths are those of whole chords behind the near plane, at least 0. ``alpha_max``, ``alpha_min`` and
-        ``transmittance_min`` do not apply: the result is -log of the transmittance of a medium made thin enough.
+        Each optical depth covers the whole chord behind the near plane and is at least 0. ``alpha_max``, ``alpha_min``
+        and ``transmittance_min`` do not apply: the result is computed as -log of the transmittance of a thinned medium.
 
         Args:
             weights: (N,) finite numbers of at least 0, one per primitive of :attr:`lowered`; None for 1.
@@ -110,7 +110,7 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """Return -log of the transmittance; opaque pixels are measured again in thinner and thinner media."""
+        """Return -log of a transmittance function at full density; opaque pixels use ever lower densities."""
         T = transmittance(1.0)
         found, opaque, factor = _depth_of_transmittance(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
@@ -122,7 +122,7 @@ class LayerFrame:
         return found.clamp_min(0.0).add(0.0).to(T.dtype)  # no -0
 
     def _transmittance(self, weights: Tensor, camera: Camera, settings: RenderSettings) -> Tensor:
-        """Return the (H, W) transmittance with densities times ``weights``: black primitives before white."""
+        """Return the (H, W) transmittance with densities times ``weights``: renders black primitives over white."""
         lowered, means = self.lowered, self.lowered.geometry.means
         black = Constant(torch.zeros(len(means), 1, device=means.device))
         thin = replace(lowered, density=lowered.density.scaled(weights), colour=black, shade=None)
@@ -135,7 +135,7 @@ class LayerFrame:
 
 
 def _depth_of_transmittance(transmittance: Tensor) -> Tensor:
-    """Return the float64 optical depth -log T; T below the smallest normal number of its dtype counts as that."""
+    """Return the float64 optical depth -log T; T is at least the smallest normal number of its dtype."""
     return -transmittance.clamp_min(torch.finfo(transmittance.dtype).tiny).double().log()
 
 
@@ -149,10 +149,10 @@ class LayerSpec:
     Attributes:
         name: what the user types after ``--layers``, and the prefix of the channels: letters, digits, _.
         summary: one line with meaning and unit of the values; it is also written into the file.
-        draw: :class:`LayerFrame` -> (H, W, C) finite values, or (H, W) for one channel; None if the model of the frame
-            has no such layer.
-        channels: names of the channels. Empty for layers of light, which have the channels of the task's images over
-            black, premultiplied by alpha, and are sums over the lights of an environment. They need linear colours.
+        draw: function of a :class:`LayerFrame` that returns (H, W, C) finite values, or (H, W) for one channel; or None
+            if the model of the frame has no such layer.
+        channels: names of the channels. Empty for a layer of light: it has the channels of the task's images, over
+            black and premultiplied by alpha, is summed over the lights of an environment, and needs linear colours.
     """
 
     name: str
@@ -194,8 +194,8 @@ def select_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> 
 
     Args:
         text: names separated by commas, or None.
-        own: the task's layers.
-        several: whether several lights are on. Then the task's layers that are not light are not offered.
+        own: the layers of the task, beside the common ones.
+        several: whether several lights are on. Then only those of the task's layers that are light can be selected.
 
     Raises:
         ConfigError: an unknown name, or no name.

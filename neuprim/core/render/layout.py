@@ -1,8 +1,9 @@
-"""Columns of the arrays that the CPU and CUDA kernels share, and the bounds of their per-primitive stage.
+"""Column numbers of the arrays that CPU and CUDA kernels share, and numerical bounds of their per-primitive stage.
 
-A pixel kernel reads one float32 row per primitive and writes one gradient row per (tile, primitive) pair. Constant
-offsets into flat arrays let LLVM vectorise. The CUDA kernels have float4 rows (:mod:`neuprim.core.render.cuda.layout`),
-but float64 rows and gradient rows with these columns. benchmarks/numerics.py gave the float32 bounds.
+A pixel kernel reads one float32 row per primitive. The backward pass writes one row of gradients (a gradient row) per
+(tile, primitive) pair. Constant offsets into flat arrays let LLVM vectorise. The CUDA kernels have float4 rows
+(:mod:`neuprim.core.render.cuda.layout`), but float64 rows and gradient rows with these columns. benchmarks/numerics.py
+gave the float32 bounds.
 """
 
 from __future__ import annotations
@@ -72,5 +73,5 @@ MIN_RIM_SHARES = tuple(MIN_RIM ** (p + 0.5) for p in EDGES)  # share of the larg
 
 
 def min_visible_depth(alpha_min: float) -> float:
-    """Return the optical depth that a chord must reach to be drawn: that of ``alpha_min``, less a rounding margin."""
+    """Return the optical depth from which a sample is drawn: that of opacity ``alpha_min``, less a rounding margin."""
     return -float(np.log1p(-alpha_min)) * VISIBLE_SHARE

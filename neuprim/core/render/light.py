@@ -1,4 +1,4 @@
-"""Light at primitives: its direction, its strength, and its visibility through the other primitives."""
+"""The light that arrives at a primitive: its direction, its intensity, and its visibility through other primitives."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _MIN_LIGHT_DISTANCE = 1e-4  # in units of a primitive's size; a nearer light doe
 
 
 def normalize_direction(vector: Tensor, size: Tensor | float = 1.0) -> Tensor:
-    """Return (..., 3) unit vectors; those shorter than 1e-6 ``size`` (..., 1) are scaled by 1e6/size."""
+    """Return (..., 3) unit vectors; vectors shorter than 1e-6 ``size`` are divided by 1e-6 ``size``."""
     scaled = vector / vector.detach().abs().amax(-1, keepdim=True).clamp_min(_MIN_LENGTH * size)
     return scaled / scaled.norm(dim=-1, keepdim=True).clamp_min(1.0)
 
@@ -43,8 +43,10 @@ def check_typical_light(typical: float) -> None:
 
 
 def light_factor(geometry: Geometry, conditions: Conditions, typical: float, falloff: bool) -> Tensor:
-    """Return the (N, C) light intensity divided by ``typical``, and with ``falloff`` by the squared distance to the
-    primitives' centres."""
+    """Return the (N, C) light intensity at primitives, divided by ``typical``.
+
+    With ``falloff``, it is also divided by the squared distance from the light to the primitive's centre.
+    """
     means = geometry.means
     strength = device.to_device_like(conditions["light_intensity"], means) / typical
     if not falloff:
@@ -72,7 +74,7 @@ _CHUNK = 1024  # points per unit of work
 def shade_by_light(
     where: str, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading | None:
-    """Return the visibility of the frame's light, ``where`` one of :data:`VISIBILITY`; None for "none"."""
+    """Return the visibility of the frame's light, computed as ``where`` (:data:`VISIBILITY`) says; None for "none"."""
     if where == "none":
         return None
     light = conditions["light"]
@@ -85,24 +87,31 @@ def shade_by_light(
 def shade_volume_by_light(
     geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
 ) -> Shading:
-    """Return the visibility of the frame's light at the centres of primitives that overlap, as in smoke: each slab
-    absorbs its share evenly over its own depth."""
+    """Return the visibility of the frame's light at the primitives' centres, for overlapping primitives as in smoke.
+
+    Each slab absorbs evenly over its own depth.
+    """
     visible = light_visibility(geometry, density, conditions["light"], settings, VOLUME_SIZE, VOLUME_LAYERS)
     return Shading(primitives=visible(geometry.means, 1 / VOLUME_LAYERS, before=0.5))
 
 
 @torch.no_grad()
 def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
-    """Return (N,) extents of the ellipsoids in the direction from their centre to ``point`` (3,): the distance between
-    the two tangent planes perpendicular to it, in scene units."""
+    """Return the (N,) extent of each ellipsoid in the direction from its centre to ``point`` (3,), in scene units.
+
+    The extent is the distance between the two tangent planes perpendicular to this direction.
+    """
     towards = device.to_device_like(point, geometry.means) - geometry.means
     units = normalize_direction(towards, geometry.length_scale[:, None])
     return 2 * ((geometry.rotations * units[:, :, None]).sum(1) * geometry.scales).norm(dim=-1)
 
 
 class Visibility(Protocol):
-    """Function of scene points (M, 3) that returns (M,) float32 visibility, 0 to 1. Light fades over ``fade`` scene
-    diameters plus (M,) ``more`` scene units; the share ``before`` of that is before a depth image, the rest behind."""
+    """Function of scene points (M, 3) that returns (M,) float32 visibility of a light, 0 to 1.
+
+    At a slab, light fades over ``fade`` scene diameters plus (M,) ``more`` scene units. The fraction ``before`` of this
+    distance lies before the slab's mean depth, the rest behind.
+    """
 
     def __call__(self, points: Tensor, fade: float, more: Tensor | None = None, before: float = 0.0) -> Tensor: ...
 
@@ -115,10 +124,10 @@ def light_visibility(
     size: int = SIZE,
     layers: int = LAYERS,
 ) -> Visibility:
-    """Return the visibility function of a point light (3,), by layered shadow maps.
+    """Return the function that gives the visibility of a point light (3,), computed by layered shadow maps.
 
-    The primitives are sorted into slabs across the light's direction, and each slab is drawn on its own, as opacity
-    A_k and mean depth d_k. The light's transmittance at a point x of depth z is
+    The primitives are sorted into slabs by depth from the light. Each slab is rendered alone, to opacity A_k and mean
+    depth d_k. The light's transmittance at a point x of depth z is
 
         V(x) = prod_k (1 - A_k s((z - d_k)/fade)),      s a smooth step from 0 at 0 to 1 at 1,
 
@@ -127,9 +136,9 @@ def light_visibility(
     weighted by opacity, are interpolated bilinearly. This is exact on planes, so that a lit floor does not shadow
     itself at grazing light. V carries no gradient.
 
-    The light's camera looks at the middle of all centres and sees all of them. A light among them looks towards that
-    middle, too, and points behind it count as lit. ``settings`` are the frame's own: its backend and threads also draw
-    the depth images.
+    The light's camera looks at the middle of all centres and sees all of them. A light among the primitives also looks
+    at that middle; points behind the light count as lit. ``settings`` are the frame's own: its backend and threads also
+    draw the depth images.
     """
     if not geometry.count:
         return lambda points, fade, more=None, before=0.0: torch.ones(len(points), device=points.device)
@@ -187,7 +196,7 @@ def sample_visibility(
     fades: Tensor,
     before: float = 0.0,
 ) -> Tensor:
-    """Return (M,) float32 visibility of ``points`` (M, 3) float64, in torch for GPUs; the same as the kernel below."""
+    """Return (M,) float32 visibility of ``points`` (M, 3) float64, in torch; the GPU version of the kernel below."""
     nearness = torch.where(alphas > 0, alphas.double() / depths.double().clamp_min(near), 0.0)
     images = torch.stack([alphas.double(), nearness], 1)  # (slabs, 2, S, S)
     x, y, z = ((view[a, :3] * points).sum(-1) + view[a, 3] for a in range(3))
@@ -241,12 +250,12 @@ def _visibility_kernel(start, stop, points, view, near, focal, alphas, depths, n
 
 
 def unshadowed_layer(frame: LayerFrame) -> Tensor | None:
-    """Return the (H, W, C) frame without shadows; None if the colours have no shadows."""
+    """Return the (H, W, C) image without shadows; None if the model computes no shadows."""
     return None if frame.shading is None else frame.unshaded
 
 
 def visibility_layer(frame: LayerFrame) -> Tensor | None:
-    """Return the (H, W) mean visibility of the light; None if the colours have no shadows."""
+    """Return the (H, W) mean visibility of the light; None if the model computes no shadows."""
     return None if frame.shading is None else frame.shading.clamp(0.0, 1.0)  # rounding may exceed 1
 
 

@@ -1,4 +1,4 @@
-"""The near plane, the extent and the size of a pixel of a scene, from the depths at which cameras see its points."""
+"""Near plane, extent and pixel size of a scene, from the depths of its points in the cameras."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ _MIN_NEAR = 1e-6  # share of the typical depth, in case a point lies at a camera
 
 
 def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
-    """Return (nearest, median) depth at which cameras see points (N, 3); ray distance for a ``RayCamera``.
+    """Return (nearest, median) depth of points (N, 3) in the cameras that see them; ray distance for a ``RayCamera``.
 
-    If no camera sees a point, these are the distances of all points from all cameras.
+    If no camera sees a point, both are taken over the distances of all points from all cameras.
     """
     means = means.detach().double().cpu()[:: max(len(means) // _MAX_POINTS, 1)]
     cameras = [
@@ -41,15 +41,15 @@ def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tup
 
 
 def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """Return the data set's extent, or the median depth of points (N, 3) if that is over 100 times as large."""
+    """Return ``extent``, or the median depth of points (N, 3) if the depth is over 100 times as large."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth
 
 
 def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: float) -> float:
-    """Return the side of a pixel, in scene units, at the median depth of points (N, 3), at most 1/250 of the extent.
+    """Return the size of a pixel, in scene units, at the median depth of points (N, 3); at most 1/250 of ``extent``.
 
-    Uses the median of the cameras' focal lengths; without any, the result is 1/250 of the extent.
+    Uses the median focal length of the cameras. Without cameras that have one, returns 1/250 of ``extent``.
     """
     _, depth = nearest_and_median_depth(means, cameras)
     focal = sorted(camera.fx for camera in cameras if isinstance(camera, Camera))
@@ -58,7 +58,7 @@ def typical_pixel_size(means: Tensor, cameras: Sequence[AnyCamera], extent: floa
 
 
 def resolve_near(settings: RenderSettings, means: Tensor, cameras: Sequence[AnyCamera]) -> RenderSettings:
-    """Return the settings with a number for ``near=auto``, from points (N, 3) and the cameras that see them."""
+    """Return the settings with a number instead of ``near="auto"``, from points (N, 3) and the cameras."""
     if settings.near != "auto":
         return settings
     if not len(means):

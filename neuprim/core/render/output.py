@@ -1,4 +1,4 @@
-"""A rendered frame, its statistics and contributions, and wrappers of draw functions."""
+"""The result of rendering with its statistics, and functions that wrap the draw function of a backend."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from neuprim.core.settings import RenderSettings
 
 @dataclass
 class Contributions:
-    """Contributions of the N primitives of a frame to its image; 0 until the backward pass fills them."""
+    """Contribution of each of N primitives to the image of a frame; 0 until the backward pass fills the values."""
 
     weight: Tensor  # (N,) sum over pixels of alpha_i T_i; positive exactly for visible primitives
     error_weight: Tensor  # (N,) sum over pixels of alpha_i T_i x error
     rows: Tensor | None = None  # (N,) rows of the model, if some primitives were left out of the frame
 
     def of_all(self, count: int) -> tuple[Tensor, Tensor]:
-        """Return ``weight`` and ``error_weight`` (count,) of the model's primitives, 0 for those not in the frame."""
+        """Return ``weight`` and ``error_weight``, (count,) each, of all the model's primitives; 0 outside the frame."""
         if self.rows is None:
             return self.weight, self.error_weight
         weight, error_weight = (
@@ -36,7 +36,7 @@ class Contributions:
 
 
 def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributions:
-    """Return the sum of the contributions to several frames, in frame order, of a model with ``count`` primitives."""
+    """Sum the contributions to several frames, in their order, for all ``count`` primitives of the model."""
     weight, error = frames[0].of_all(count)
     for contributions in frames[1:]:
         more = contributions.of_all(count)
@@ -46,7 +46,7 @@ def sum_contributions(frames: Sequence[Contributions], count: int) -> Contributi
 
 @dataclass
 class ContributionRequest:
-    """A request for contributions: a backend's backward pass reads ``error`` and fills ``result``."""
+    """A request for contributions. The backward pass of a backend reads ``error`` and fills ``result``."""
 
     error: Tensor  # error of each ray, in the shape of the frame as the backend drew it
     result: Contributions
@@ -54,7 +54,7 @@ class ContributionRequest:
     sums: tuple[Tensor, Tensor] | None = None
 
     def add(self, rows: Tensor, weight: Tensor, error_weight: Tensor) -> None:
-        """Add the sums of primitives ``rows`` (R,) over some of the rays, for backends that draw in blocks."""
+        """Add (R,) sums over some of the rays for primitives ``rows`` (R,); for backends that render in blocks."""
         if self.sums is None:
             blank = torch.zeros_like(self.result.weight, device=rows.device)
             self.sums = blank, blank.clone()
@@ -63,7 +63,7 @@ class ContributionRequest:
         self.fill(*self.sums)
 
     def fill(self, weight: Tensor, error_weight: Tensor) -> None:
-        """Set the result from the sums (N,) over all rays."""
+        """Set the result from (N,) sums over all rays, one per primitive."""
         n = self.rays
         weight, error_weight = (sums.to(self.result.weight.device) for sums in (weight, error_weight))
         self.result.weight, self.result.error_weight = (
@@ -85,7 +85,7 @@ class RenderStats:
     extra: dict[str, Any] = field(default_factory=dict)  # further data of the backend
 
     def request_contributions(self, error: Tensor) -> Contributions:
-        """Do what :meth:`RenderOutput.request_contributions` does, without the check of the shape."""
+        """Like :meth:`RenderOutput.request_contributions`, without checking the shape of ``error``."""
         n, error = self.samples, error.detach()
         blank = torch.zeros(self.count, device=error.device)
         result = Contributions(blank, blank.clone(), self.rows)
@@ -97,7 +97,7 @@ class RenderStats:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """A rendered frame."""
+    """A rendered image with alpha, optional depth and statistics."""
 
     rgb: Tensor  # (H, W, C) in the model's colour space, composited over the background
     alpha: Tensor  # (H, W) accumulated opacity 1 - T
@@ -107,19 +107,19 @@ class RenderOutput:
     stats: RenderStats
 
     def request_contributions(self, error: Tensor) -> Contributions:
-        """Return how much each primitive contributes to the image and to an error.
+        """Return how much each primitive contributes to the image, and to an error given per pixel.
 
-        The backward pass fills the result: call this before ``backward()``. A second call replaces the first.
+        The backward pass fills the result: call this method before ``backward()``. A second call replaces the first.
 
         Args:
-            error: (H, W) any measure of error at each pixel; no gradient reaches it.
+            error: (H, W) any measure of error at each pixel; gets no gradient.
         """
         check_model_tensor_shape("request_contributions: error", error, tuple(self.alpha.shape), ", that of the frame")
         return self.stats.request_contributions(error)
 
 
 def mean_depth(weighted: Tensor, alpha: Tensor) -> Tensor:
-    """Return the (H, W) mean depth: sum of w z divided by sum of w, which is alpha; 0 where nothing is hit."""
+    """Return the (H, W) mean depth: sum of w z (``weighted``) over sum of w (``alpha``); 0 where nothing is hit."""
     hit = alpha > 0
     if not (torch.is_grad_enabled() and (weighted.requires_grad or alpha.requires_grad)):
         return (weighted / alpha).masked_fill_(~hit, 0.0)
@@ -133,7 +133,7 @@ Draw = Callable[..., RenderOutput]
 def draw_pixel_samples(
     draw: Draw, lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw ``settings.samples`` ** 2 rays per pixel; average rgb and alpha, and depth weighted by alpha."""
+    """Render with ``settings.samples`` ** 2 rays per pixel; average rgb and alpha, and depth weighted by alpha."""
     n = settings.samples
     fine = draw(lowered, camera.resized(camera.width * n, camera.height * n), background, replace(settings, samples=1))
     alpha = _average_pixel_samples(fine.alpha, n)
@@ -149,7 +149,7 @@ def _average_pixel_samples(image: Tensor, n: int) -> Tensor:
 
 
 def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
-    """Return the (H, W, 3) float64 scene points that a depth image (H, W) shows; no gradient."""
+    """Return the (H, W, 3) float64 scene point at the depth (H, W) of each pixel; no gradient."""
     depth = depth.detach().double()
     view = device.to_device_like(camera.viewmat.detach(), depth)
     if isinstance(camera, RayCamera):
@@ -162,7 +162,7 @@ def unproject_rendered_depth(depth: Tensor, camera: AnyCamera) -> Tensor:
 
 
 def draw_shaded_view(draw: Draw) -> Draw:
-    """Return a draw function that multiplies the frame, not its background, by ``lowered.shade`` at the mean depth."""
+    """Return a draw function that multiplies the image over black by ``lowered.shade`` at the mean depth."""
 
     def shaded(
         lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
@@ -186,7 +186,7 @@ def draw_shaded_view(draw: Draw) -> Draw:
 
 
 def draw_on_device(draw: Draw, place: torch.device) -> Draw:
-    """Return a draw function that draws on another device and moves the frame back; differentiable."""
+    """Return a draw function that renders on the device ``place`` and moves the result back; differentiable."""
 
     def moved(
         lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings

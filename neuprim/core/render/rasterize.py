@@ -1,6 +1,7 @@
-"""Render a lowered model with the :class:`torch.autograd.Function` of a kernel backend: inputs, outputs, gradients.
+"""Render a model with the :class:`torch.autograd.Function` of the cpu or cuda backend: inputs, outputs, gradients.
 
-``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``: those of :data:`PARAMETERS`, then NET.
+``forward`` takes ``(ctx, request, viewmat, background, palette, *tensors)``; ``tensors`` are those that
+:data:`PARAMETERS` names, then those of NET.
 """
 
 from __future__ import annotations
@@ -28,7 +29,7 @@ NET = ("Wx", "bias", "Wout")
 
 @dataclass(frozen=True)
 class RasterRequest:
-    """The inputs of a frame that are not tensors."""
+    """The inputs of a kernel backend that are not tensors, for one frame."""
 
     camera: Camera
     turns: float  # omega0 / 2 pi of the density
@@ -47,7 +48,7 @@ class RasterRequest:
 
 
 def rasterizer_tensors(lowered: LoweredPrimitives) -> tuple[Tensor, ...]:
-    """Return the tensors that :data:`PARAMETERS` names, in its order."""
+    """Return the tensors of geometry and density that :data:`PARAMETERS` names, in that order."""
     g, density = lowered.geometry, lowered.density
     assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
     return g.means, g.log_scales, g.quats, density.W1, density.b1, density.w2, density.b2.reshape(-1)
@@ -61,7 +62,7 @@ def rasterize(
     background: Tensor | None,
     settings: RenderSettings,
 ) -> RenderOutput:
-    """Render :class:`Cosine` densities with :class:`Constant` or :class:`RayNet` colours by a backend's operation."""
+    """Render :class:`Cosine` densities with :class:`Constant` or :class:`RayNet` colours by ``operation``."""
     colour = lowered.colour
     net: tuple[Tensor, ...] = ()
     assert isinstance(colour, Constant | RayNet), "the caller chooses a backend that knows the forms"
@@ -82,13 +83,16 @@ def rasterize(
 
 
 def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Save dtypes and devices for :func:`rasterizer_input_gradients`; let ``backward`` get None for unused outputs."""
+    """Save the inputs' dtypes and devices for :func:`rasterizer_input_gradients`; keep unused gradients None."""
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
     ctx.set_materialize_grads(False)  # without a gradient, the depth image adds no cost
 
 
 def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
-    """Return the result of ``backward``, a gradient per input, from ``view``, dL/d(R | t) (3, 4), and the others."""
+    """Return what ``backward`` must return: a gradient per input, in its dtype and on its device.
+
+    ``view``: (3, 4) dL/d(R | t); ``gradients``: those of the tensors after ``viewmat``.
+    """
     full = None
     if view is not None:
         full = torch.zeros(4, 4, dtype=torch.float64, device=view.device)

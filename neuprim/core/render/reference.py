@@ -1,5 +1,7 @@
-"""The reference backend: the method's closed form in plain torch, float64, with autograd. Every other backend is tested
-against it."""
+"""The reference backend: the closed form of the method in plain torch, in float64, with autograd.
+
+The other backends are tested against the reference.
+"""
 
 from __future__ import annotations
 
@@ -22,7 +24,7 @@ _BLOCK = 32  # pixels per side of a block; limits memory, does not change result
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) with the derivative at max(D, floor): the exact one grows as D^-1/2 at a silhouette."""
+    """sqrt(D) with its derivative taken at max(D, floor): the exact one grows as D^-1/2 at a silhouette."""
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:
@@ -37,7 +39,7 @@ class _FlooredSqrt(torch.autograd.Function):
 
 
 class _Contributions(torch.autograd.Function):
-    """Identity on the weights of one block; its backward sums them per primitive, for the population statistics."""
+    """Identity on the weights of a block; its backward pass sums the contributions of each primitive."""
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, rows: Tensor, pixels: Tensor, stats: RenderStats) -> Tensor:
@@ -56,7 +58,7 @@ class _Contributions(torch.autograd.Function):
 
 
 class _PreparedPrimitives:
-    """Per-primitive quantities of one view, in float64, in camera axes."""
+    """Primitives of one view, in float64 and camera axes."""
 
     def __init__(self, lowered: LoweredPrimitives, camera: AnyCamera) -> None:
         g = lowered.geometry
@@ -79,7 +81,7 @@ class _PreparedPrimitives:
 def render(
     lowered: LoweredPrimitives, camera: AnyCamera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw a frame in float64 and return it in the model's dtype; see :data:`neuprim.core.render.output.Draw`."""
+    """Render in float64; return a frame of the model's dtype. See ``Draw`` in :mod:`neuprim.core.render.output`."""
     frame = _PreparedPrimitives(lowered, camera)
     count = lowered.geometry.count
     seen = frame_rays(camera, lowered.geometry, frame.center, settings.near_plane)
@@ -120,7 +122,10 @@ def _composite_ray_block(
     settings: RenderSettings,
     stats: RenderStats,
 ) -> Tensor:
-    """Return (P, channels + 2): premultiplied colour, transmittance, sum of w z of P rays through sorted ``rows``."""
+    """Composite P rays through primitives ``rows``, sorted front to back; return (P, channels + 2).
+
+    The columns are premultiplied colour, transmittance and the sum of w z.
+    """
     d, P = rays.directions, len(pixels)
     with torch.no_grad():  # find the (primitive, ray) pairs that intersect
         v = frame.whiten[rows].detach() @ d.T  # (R, 3, P)
@@ -201,7 +206,7 @@ def _composite_ray_block(
 
 @dataclass(frozen=True)
 class ReferenceRays:
-    """Rays from the camera centre, float64."""
+    """Rays from the camera centre, in float64."""
 
     directions: Tensor  # (..., 3) unit vectors in camera axes; a zero vector meets nothing
     near: Tensor  # (...) ray distance of the near plane, which cuts chords, scene units
@@ -209,17 +214,17 @@ class ReferenceRays:
 
 
 class FrameRays(ABC):
-    """The rays (H, W) of one frame, and its primitives front to back."""
+    """Base class: the H x W rays of one frame, and its primitives from front to back."""
 
     rays: ReferenceRays  # one per pixel
     order: Tensor  # (N,) primitive rows, front to back
 
     @abstractmethod
     def touched(self, y: int, x: int, h: int, w: int) -> Tensor:
-        """Return (N,) whether a ray of the h x w pixels at (y, x) may hit each primitive; never False for a hit."""
+        """Return (N,) bool: False only if no ray of the h x w pixels at (y, x) hits the primitive."""
 
     def block(self, y: int, x: int, h: int, w: int) -> tuple[ReferenceRays, Tensor]:
-        """Return the h*w rays of a block of pixels, flat, and the primitive rows they may hit, front to back."""
+        """Return the h*w rays of the pixels at (y, x), and the primitives that they may hit, front to back."""
         window, r = (slice(y, y + h), slice(x, x + w)), self.rays
         rays = ReferenceRays(
             r.directions[window].reshape(-1, 3), r.near[window].reshape(-1), r.depth[window].reshape(-1)
@@ -237,7 +242,7 @@ def pixel_ray_directions(camera: Camera) -> Tensor:
 
 
 class _PinholeRays(FrameRays):
-    """Pinhole rays: near is a camera-z plane, depth is camera-z, order by centre z, culling by exact screen boxes."""
+    """Rays of a pinhole camera: near, depth and order are in camera-z; culling by exact screen boxes."""
 
     def __init__(self, camera: Camera, geometry: Geometry, center: Tensor, near: float) -> None:
         d = pixel_ray_directions(camera)
@@ -279,7 +284,7 @@ class _CentralRays(FrameRays):
 
 
 def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
-    """Return the frame's rays; ``center`` (N, 3) are the primitives' centres in camera axes, float64."""
+    """Return the rays of a camera; ``center``: (N, 3) float64 centres of the primitives in camera axes."""
     make = _CentralRays if isinstance(camera, RayCamera) else _PinholeRays
     return make(camera, geometry, center, near)  # type: ignore[arg-type]
 
@@ -289,7 +294,7 @@ def screen_boxes(geometry: Geometry, camera: Camera, near: float) -> Tensor:
 
     In the plane of image axis i and the optical axis, the tangents are x_i/z = (k +- sqrt(D))/(z^2 - S_zz) with
     k = c_i z - S_iz, D = z^2 S_ii - 2 c_i z S_iz + c_i^2 S_zz - (S_ii S_zz - S_iz^2), S = B diag(s^2) B^T and centre c.
-    An ellipsoid cut by the near plane gets the whole screen, one behind it an empty box (x1 < x0).
+    An ellipsoid cut by the near plane gets the whole screen, an ellipsoid behind it an empty box (x1 < x0).
     """
     view = camera.viewmat.detach().double()
     R = view[:3, :3]

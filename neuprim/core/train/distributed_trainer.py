@@ -1,8 +1,8 @@
-"""The trainer of one of several ranks that train a model together.
+"""A trainer for training one model on several ranks (processes), each of which holds the whole model.
 
-Every rank draws all random numbers of a step, renders its own views, and gets the gradients of all of them, added in
-the order of the views. From there all ranks compute the same, population and learning rates included. R ranks with V
-views a step equal one process with R x V views, bit for bit.
+Every rank draws all random numbers of a step, renders its own views, and receives the sum of the gradients of all
+views, added in a fixed order. All ranks then make the same update, population control included. R ranks with V views
+per step give the same bits as one process with R x V views per step.
 """
 
 from __future__ import annotations
@@ -34,11 +34,11 @@ class _RankMessage(NamedTuple):
     """Message of a rank to the others in a step.
 
     Attributes:
-        checksum: checksum of the positions before the step, to detect a rank that computes differently.
-        elapsed: seconds of training; those of rank 0 count.
+        checksum: checksum of the positions before the step; a difference reveals a rank that computes differently.
+        elapsed: seconds of training; all ranks use the value of rank 0.
         stop: whether this rank was asked to stop.
-        present: which parameters have a gradient.
-        views: results of its views, in their order.
+        present: for each parameter, whether it has a gradient.
+        views: results of the rank's views, in order.
     """
 
     checksum: int
@@ -49,13 +49,13 @@ class _RankMessage(NamedTuple):
 
 
 class DistributedTrainer(Trainer):
-    """One of several ranks that train a model together; each renders ``train.views_per_step`` views of every step.
+    """Trainer of one rank; every rank renders ``train.views_per_step`` views per step.
 
     Args:
-        group: the ranks.
+        group: connection to the other ranks.
 
-    Raises:
-        ConfigError: also for a training without views, which ranks could not share.
+        Raises:
+            ConfigError: as Trainer, and for training without views, which cannot be divided among ranks.
     """
 
     def __init__(
@@ -84,7 +84,7 @@ class DistributedTrainer(Trainer):
         """Check that all ranks start with the same settings, data and parameters.
 
         Raises:
-            RankError: names the rank and what differs.
+            RankError: a rank differs; names the rank and what differs.
         """
         views, digest = self.dataset.train, hashlib.sha256()
         for name, value in sorted(self.state()[0].items()):
@@ -103,7 +103,7 @@ class DistributedTrainer(Trainer):
         """Take one training step with the other ranks, as :meth:`~neuprim.core.train.trainer.Trainer.train_step`.
 
         Raises:
-            RankError: another rank ended, or computes differently. The state is that before the step.
+            RankError: another rank ended or computes differently. This trainer's state is that before the step.
         """
         order, generator = self.order, self.generator.get_state()
         try:
@@ -116,7 +116,7 @@ class DistributedTrainer(Trainer):
 
     @property
     def stopping(self) -> bool:
-        """Whether any rank was asked to stop before the step just done; the same on all ranks."""
+        """Whether any rank was asked to stop before the last step ran; all ranks return the same."""
         return self._stopping
 
     def _draw_views(self) -> list[ViewTask]:
@@ -157,7 +157,7 @@ class DistributedTrainer(Trainer):
         return every, self._sums.finish(self.model.params, present)
 
     def _stop_clock(self, start: float) -> float:
-        """Return rank 0's clock as of :meth:`_combine_views`; later time of the step counts in the next one."""
+        """Return rank 0's training time at :meth:`_combine_views`; the rest of the step counts in the next step."""
         self._after = time.perf_counter() - self._agreed_at
         return self._agreed
 
@@ -169,10 +169,10 @@ def _pad_gradient_exchange(numbers: int) -> int:
 class GradientSum:
     """Sum of gradients and contributions over the views of all ranks, in the order of the views.
 
-    An all-reduce adds in an order of its own, which changes the bits. Here every rank owns a slice of a flat buffer,
-    receives that slice of every view, adds the views one after the other as one process does, and sends the sum to the
-    others, which moves as many bytes as a ring all-reduce. The buffers are reused: new memory pages cost as much as
-    sending them.
+    The order of additions in an all-reduce is not fixed, which changes the bits. Here every rank owns a slice of a flat
+    buffer. It receives this slice of every view, adds the views one after the other, as a single process does, and
+    sends the sum to the other ranks. This moves as many bytes as a ring all-reduce. The buffers are reused, because
+    allocating new memory pages takes as long as sending them.
     """
 
     def __init__(self, params: Mapping[str, Tensor], group: ProcessGroup) -> None:
@@ -192,12 +192,14 @@ class GradientSum:
         *self._gradients, self._weight, self._error = parts
 
     def fits(self, params: Mapping[str, Tensor]) -> bool:
-        """Return whether it was made for parameters of these shapes."""
+        """Return whether the buffers fit parameters of these shapes."""
         return self.shapes == {name: value.shape for name, value in params.items()}
 
     def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:
-        """Add one view of every rank, in the order of the ranks. The parameters lose their gradients; returns which of
-        them had one."""
+        """Add one view of every rank, in the order of the ranks, and clear the gradients of ``params``.
+
+        Returns, for each parameter, whether it had a gradient.
+        """
         present = []
         for value, part in zip(params.values(), self._gradients, strict=True):
             present.append(value.grad is not None)
@@ -219,8 +221,10 @@ class GradientSum:
         return present
 
     def finish(self, params: Mapping[str, Tensor], present: Sequence[bool]) -> Contributions:
-        """Give the sums to the parameters that have a gradient, and return the summed contributions; both are valid
-        until the next :meth:`add`, which starts a new sum."""
+        """Set the summed gradients of the ``present`` parameters, and return the summed contributions.
+
+        Both are valid until the next :meth:`add`, which starts a new sum.
+        """
         self._empty = True
         self.group.all_gather(self._buffer, self._sum)
         for value, part, has_gradient in zip(params.values(), self._gradients, present, strict=True):

@@ -1,4 +1,4 @@
-"""A fresh model: primitives on a data set's starting points."""
+"""Create the initial model of a training: primitives at the starting points of a data set."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ _USUAL_OPACITY = 0.5
 def initial_model_to_train(
     density: DensityField, colour: ColourField, dataset: Dataset, settings: ModelSettings, seed: int
 ) -> Primitives:
-    """Return a new model on starting points; the size of a primitive is the RMS distance to its 3 nearest neighbours.
+    """Return an untrained model on starting points; a primitive's size is the RMS distance to its 3 nearest points.
 
-    ``model.init.points``: "matter" (the data set's own), "box" (anywhere in its box), or a .ply file of points or 3D
-    Gaussians in the coordinates of the data's files; Gaussians also give sizes, orientations and opacities.
-    ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default: share of the primitives that
-    start where photographs show something and the data set has no points.
+    ``model.init.points``: "matter" (the points of the data set), "box" (random in the data set's box), or a .ply file
+    of points or 3D Gaussians in the coordinate system of the data files; Gaussians also set sizes, orientations and
+    opacities. ``model.init.scale`` multiplies all sizes. ``model.init.surroundings``, 0 by default: fraction of the
+    primitives placed where photographs show something and the data set has no points.
 
     Raises:
-        ConfigError: a setting does not exist or has an impossible value.
+        ConfigError: a setting does not exist or has an invalid value.
         DataError: the data set has no starting point, or the file is damaged.
     """
     for key in settings.init:
@@ -88,7 +88,7 @@ def initial_model_to_train(
 def _add_initial_surroundings(
     cloud: PointCloud, dataset: Dataset, settings: ModelSettings, generator: torch.Generator
 ) -> PointCloud:
-    """Replace a share of the points (``model.init.surroundings``) by points on what views show where none are."""
+    """Replace a fraction (``model.init.surroundings``) of the points by points on visible surfaces that have none."""
     share = settings.init.get("surroundings", 0.0)
     if isinstance(share, bool) or not isinstance(share, int | float) or not 0 <= share < 1:
         raise ConfigError(

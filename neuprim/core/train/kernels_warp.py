@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Kernels of the training step on a GPU: Adam in two launches, and L1 + SSIM with its gradient in four.
+"""Warp kernels for training steps on a GPU: Adam in two launches, and L1 + SSIM with its gradient in four.
 
-In torch code a step of Adam is a hundred launches, which take longer than a small frame. SSIM is the twin of
-:mod:`neuprim.core.train.ssim_cpu`, which has the derivation. Warp is imported with this module.
+In torch, a step of Adam takes about a hundred launches, longer than rendering a small frame. For the derivation of
+SSIM's gradient see :mod:`neuprim.core.train.ssim_cpu`. Warp is imported with this module.
 """
 
 import functools
@@ -53,7 +53,7 @@ def _step_number(
 def adam_kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def check(grads: _POINTERS, ends: _LONGS, bad: wp.array(dtype=wp.int32)):
-        """Set ``bad`` if a gradient is not finite; one thread per number. ``ends``: cumulative sizes of parameters."""
+        """Set ``bad`` if a gradient is not finite; one thread per element. ``ends``: cumulative sizes of parameters."""
         n = wp.int64(wp.tid())
         k = int(0)
         begin = wp.int64(0)
@@ -70,10 +70,10 @@ def adam_kernels() -> tuple[Any, Any]:
         beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64),
         bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
-        """Take an Adam step unless ``bad``; one thread per number.
+        """Take an Adam step unless ``bad`` is set; one thread per element.
 
-        ``widths``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
-        the betas; ``age``: steps of each row, this one included.
+        ``widths``: elements per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
+        the betas; ``age``: steps of each row, including this one.
         """
         n = wp.int64(wp.tid())
         if bad[0] == 0:
@@ -99,13 +99,13 @@ def adam_rows(
     rates: Sequence[float],
     age: Tensor, betas: tuple[float, float],
 ) -> bool:  # fmt: skip
-    """Take one Adam step in place and return True, or change nothing and return False if a gradient is not finite.
+    """Take one Adam step in place and return True; if a gradient is not finite, change nothing and return False.
 
-    The host waits for the device once.
+    Synchronises with the device once.
 
     Args:
         values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.
-        age: (N,) int64, this step included.
+        age: (N,) int64, steps of each row, including this one.
     """
     device = age.device
     bad = torch.zeros(1, dtype=torch.int32, device=device)
@@ -144,7 +144,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def along_rows(
         a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)
     ):
-        """Blur (x, y, xx, yy, xy) along rows of pixels; (H, W - 10, C)."""
+        """Blur (x, y, xx, yy, xy) of images x and y along pixel rows, to (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -162,7 +162,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def compare(
         rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)
     ):
-        """Compute SSIM of every window, (H - 10, W - 10, C), and its derivatives by the means of x, x^2 and x y."""
+        """Compute SSIM, (H - 10, W - 10, C), and its derivatives with respect to the window means of x, x^2 and x y."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -179,7 +179,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def back_along_columns(maps: wp.array3d(dtype=wp.vec3), window: _Window, out: wp.array3d(dtype=wp.vec3)):
-        """Apply the adjoint of the blur along columns; (H, W - 10, C)."""
+        """Apply the adjoint of the blur along columns, to (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = wp.vec3()
         for k in range(SSIM_TAPS):
@@ -194,9 +194,9 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
         by_l1: float, by_ssim: float,
         difference: wp.array3d(dtype=float), grad: wp.array3d(dtype=float),
     ):  # fmt: skip
-        """Write |a - b| and the gradient of the loss by ``a``, with the adjoint of the blur along rows.
+        """Write |a - b| and dloss/da, applying the adjoint of the blur along rows.
 
-        ``by_l1``, ``by_ssim``: weights over the numbers of pixels and of windows, times channels.
+        ``by_l1``: weight of L1 / (pixels x channels); ``by_ssim``: weight of SSIM / (windows x channels).
         """
         y, x, c = wp.tid()
         total = wp.vec3()
@@ -219,12 +219,12 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
 
 
 def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """Return mean absolute difference and mean SSIM, (2,) float64, and the (H, W, C) gradient of the loss.
+    """Return (mean absolute difference, mean SSIM) as (2,) float64, and the (H, W, C) gradient of the loss.
 
     The loss is (1 - weight) L1 + weight (1 - SSIM).
 
     Args:
-        rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels, on one device.
+        rendered, truth: (H, W, C) float32, at least 11 x 11 pixels, on the same device.
     """
     a, b = rendered.contiguous(), truth.contiguous()
     (H, W, C), device = a.shape, a.device

@@ -1,8 +1,8 @@
-"""Losses of images and of points, and regularisers of sizes.
+"""Losses for images and for points in a volume, and regularisers of the primitives' sizes.
 
 Images: the photometric loss, (1 - lambda) L1 + lambda (1 - SSIM), and three for linear light of high dynamic range.
-Each factory takes the settings that a :class:`~neuprim.core.extensions.LossExtension` or a task's ``loss`` gets. Image
-losses ignore masks: masked pixels are equal in both images.
+Each function that makes a loss takes the settings of a :class:`~neuprim.core.extensions.LossExtension` or of a task's
+``loss``. Image losses need no masks: masked pixels are made equal in both images.
 """
 
 from __future__ import annotations
@@ -38,13 +38,13 @@ depend on it, and hardly moves primitives."""
 
 
 def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
-    """Compute the photometric loss by kornia and autograd, on any device and dtype; reference of the fused versions.
+    """Compute the photometric loss with kornia and autograd, on any device and dtype; the reference for the kernels.
 
     Args:
         rendered: (H, W, C) rendered image, values nominally in 0..1.
         truth: (H, W, C) true image.
-        ssim_weight: lambda. SSIM uses an 11 x 11 Gaussian window (sigma 1.5) without padding, averaged over windows;
-            images smaller than the window use L1 alone.
+        ssim_weight: lambda in (1 - lambda) L1 + lambda (1 - SSIM). SSIM uses an 11 x 11 Gaussian window (sigma 1.5)
+            without padding. Images smaller than the window use L1 alone.
     """
     l1 = (rendered - truth).abs().mean()
     if ssim_weight == 0 or min(rendered.shape[:2]) < _WINDOW:
@@ -59,7 +59,7 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
 
 
 class _Photometric(torch.autograd.Function):
-    """The photometric loss by kernels, which compute the gradient with the value."""
+    """The photometric loss, by kernels that compute value and gradient together."""
 
     @staticmethod
     def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
@@ -79,7 +79,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric(settings: Mapping[str, Any]) -> Loss:
-    """Return the loss (1 - lambda) L1 + lambda (1 - SSIM), from ``{"ssim_weight": lambda}``."""
+    """Return the loss (1 - lambda) L1 + lambda (1 - SSIM); ``settings``: ``{"ssim_weight": lambda}``."""
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
@@ -95,12 +95,12 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
 
 
 def l1(settings: Mapping[str, Any]) -> Loss:
-    """Return the mean absolute difference as a loss."""
+    """Return the loss mean |rendered - true|."""
     return _image_loss("l1", lambda rendered, truth: (rendered - truth).abs().mean())
 
 
 def compressed_loss(settings: Mapping[str, Any]) -> Loss:
-    """Return the L1 loss of log(1 + mu x) / log(1 + mu), mu = 16, which weights shadows more than highlights."""
+    """Return the L1 loss of log(1 + mu x) / log(1 + mu), mu = 16, which gives shadows more weight than highlights."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         scale = torch.log1p(torch.tensor(_MU))
@@ -111,7 +111,7 @@ def compressed_loss(settings: Mapping[str, Any]) -> Loss:
 
 
 def relative_loss(settings: Mapping[str, Any]) -> Loss:
-    """Return squared error over squared rendered value, which has no gradient (Mildenhall et al. 2022, RawNeRF)."""
+    """Return the loss squared error / squared rendered value, the divisor detached (Mildenhall 2022, RawNeRF)."""
 
     def measure(rendered: Tensor, truth: Tensor) -> Tensor:
         return ((rendered - truth) / (rendered.detach().clamp_min(0.0) + _DARK)).square().mean()
@@ -132,14 +132,15 @@ def _image_loss(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:
 
 @dataclass(frozen=True)
 class PointLossResult:
-    """One frame's points, evaluated and compared.
+    """Result of :func:`point_loss` at the points of one frame.
 
     Attributes:
-        loss: scalar with gradient.
+        loss: differentiable scalar.
         parts: named parts of the loss, for the log.
-        psnr: PSNR of the extinction at the points, relative to the largest true one.
+        psnr: PSNR of the extinction at the points, relative to the largest true extinction.
         name: name of the frame.
-        rows, shares: those of the active primitives, see :func:`~neuprim.core.volumes.points.volume_values_at`.
+        rows, shares: active primitives and their parts of the values, from
+            :func:`~neuprim.core.volumes.points.volume_values_at`.
     """
 
     loss: Tensor
@@ -150,17 +151,17 @@ class PointLossResult:
     shares: PointShares
 
     def contributions(self) -> Contributions:
-        """Return the contributions of the primitives to the points; call it after the backward pass."""
+        """Return how much each primitive contributes to the points; call this method after the backward pass."""
         return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
 
 def point_loss(
     model: Primitives, dataset: Dataset, samples: PointSamples, settings: TrainSettings, threads: int = 0
 ) -> PointLossResult:
-    """Compare a model with known extinction and source radiance at points.
+    """Compare the extinction and source radiance of a model with known values at points.
 
-    The loss is the mean square of errors over their scale: the extinction's, plus a small share of each of its
-    components, plus ``train.voxel_colour`` times the source's.
+    The loss is a mean squared error, each error divided by its scale: of the extinction, plus a small fraction of that
+    of each extinction component, plus ``train.voxel_colour`` times that of the source radiance.
     """
     check_point_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
@@ -186,21 +187,24 @@ def point_loss(
 
 
 def scale_anisotropy(log_scales: Tensor) -> Tensor:
-    """Return the mean over primitives of the standard deviation over axes of s / min s (the authors' regulariser); 0
-    for spheres."""
+    """Return the mean over primitives of std(s / min s), s the three semi-axes; 0 for spheres.
+
+    This is the regulariser of the authors of the method.
+    """
     ratio = (log_scales - log_scales.min(dim=-1, keepdim=True).values).exp()
     return ratio.std(dim=-1).mean()
 
 
 class MaxScreenSize:
-    """Limit every primitive's largest semi-axis to a share of its distance to the nearest training camera.
+    """Limits the largest semi-axis of each primitive to a fraction of its distance to the nearest training camera.
 
-    A primitive close to one camera covers few pixels of the others, so images alone do not stop its growth: it learns
-    the mean of what is behind it and veils views from between two cameras. A distant primitive may be large.
+    A primitive close to one camera covers few pixels of other cameras, so images alone do not stop its growth. It
+    learns the mean colour behind it, and then covers the image of a camera between two training cameras. A distant
+    primitive may be large.
 
     Args:
-        share: largest semi-axis over distance.
-        every: steps between two applications.
+        share: upper bound of largest semi-axis / distance.
+        every: number of steps between two applications.
     """
 
     def __init__(self, views: ViewSet, share: float, every: int = 10) -> None:
@@ -208,7 +212,7 @@ class MaxScreenSize:
         self.share, self.every, self._eyes = share, every, cKDTree(eyes.numpy())
 
     def apply(self, step: int, means: Tensor, log_scales: Tensor) -> None:
-        """Shrink (N, 3) ``log_scales`` in place where they exceed the limit, all axes of a primitive alike."""
+        """Shrink primitives beyond the limit, all three axes by one factor: changes ``log_scales`` (N, 3) in place."""
         if step % self.every:
             return
         distance = torch.from_numpy(self._eyes.query(means.detach().cpu().numpy())[0]).to(log_scales)

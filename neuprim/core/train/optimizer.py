@@ -1,7 +1,8 @@
 """Adam with a step count for each row, that is, for each primitive.
 
-Population control creates primitives in the middle of a run. A fresh row with zero moments but an old step count would
-take a first step 3.2 times its rate (method: "splitting exactly"), so bias correction counts per row.
+Population control creates primitives in the middle of a run. With one count for all rows, a new row with zero moments
+would take a first step of 3.2 times its rate (method: "splitting exactly"). So the bias correction uses a count for
+each row.
 """
 
 from __future__ import annotations
@@ -29,8 +30,10 @@ _INFINITY = 0x7F800000  # bits of a float32
 def adam_step_reference(
     value: Tensor, grad: Tensor, m: Tensor, v: Tensor, rate: float, age: Tensor, beta2: float = 0.999
 ) -> None:
-    """Take an Adam step (Kingma and Ba 2015) in place on an (N, ...) tensor; ``age`` (N,) counts each row's steps, this
-    one included."""
+    """Take one Adam step (Kingma and Ba 2015) in place on an (N, ...) tensor.
+
+    ``age``: (N,) number of steps of each row, including this one.
+    """
     shape = (-1, *[1] * (value.dim() - 1))
     m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
     v.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
@@ -42,8 +45,8 @@ def adam_step_reference(
 def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, correction, root):  # type: ignore[no-untyped-def]
     """Take the step of :func:`adam_step_reference` on flat float32 arrays of ``width`` numbers per row.
 
-    ``correction`` is 1 / c1 and ``root`` is sqrt(1 / c2) of each age. Neighbouring rows mostly have one age, so they
-    are taken in runs that end at ``breaks``: long loops, which vectorise.
+    ``correction`` is 1 / c1 and ``root`` is sqrt(1 / c2) of each age. Neighbouring rows mostly have the same age. Runs
+    of equal age end at ``breaks``: one long loop each, which vectorises.
     """
     b1, b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(EPS)
     one_b1, one_b2 = np.float32(1 - BETA1), np.float32(1 - beta2)
@@ -65,7 +68,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 @exact_kernel
 def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
-    """Return the largest bit pattern of float32 numbers without sign: at least infinity's if one is not finite."""
+    """Return the largest bit pattern of |x|, x float32: at least that of infinity if an element is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
     for k in range(bits.shape[0]):  # a maximum of integers vectorises, a sum of floats does not
@@ -82,8 +85,10 @@ def _all_gradients_finite(gradients: list[Tensor]) -> bool:
 
 @lru_cache(maxsize=4)
 def _bias_corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return 1 / c1 and sqrt(1 / c2) of the ages 0 to ``ages`` - 1; cached, as powers take longer than the rest of a
-    step per row."""
+    """Return the bias corrections 1 / c1 and sqrt(1 / c2) for ages 0 to ``ages`` - 1.
+
+    Cached, because the powers take longer than the rest of a row's step.
+    """
     age = np.arange(1.0, ages)
     return np.append(0.0, 1 / (1 - BETA1**age)), np.append(0.0, np.sqrt(1 / (1 - beta2**age)))
 
@@ -98,11 +103,11 @@ class _ParameterUpdate(NamedTuple):
 
 
 class RowAdam:
-    """Adam over the parameters of a model.
+    """Adam optimizer of a model's parameters, with a step count for each primitive.
 
     Attributes:
         m, v: first and second moments by parameter name.
-        age: (N,) int64, the steps that every row has taken.
+        age: (N,) int64, number of steps of each primitive.
         beta2: decay of the second moment; short runs do better with a shorter memory.
     """
 
@@ -117,7 +122,8 @@ class RowAdam:
         """Update ``params`` in place from their ``.grad``, and clamp them to the lower bounds of their specs.
 
         Raises:
-            NonFiniteError: a gradient is NaN or infinite; names parameter and primitive, and changes nothing.
+            NonFiniteError: a gradient is NaN or infinite. Nothing is changed; the message names parameter and
+                primitive.
         """
         updates = []
         for name in (spec.name for spec in self.specs):
@@ -144,7 +150,7 @@ class RowAdam:
             adam_step_reference(update.value, update.grad, update.m, update.v, update.rate, self.age, self.beta2)
 
     def _step_on_gpu(self, updates: list[_ParameterUpdate]) -> bool:
-        """Step in two launches; False, with nothing changed, if a gradient is not finite."""
+        """Update in two kernel launches and return True; False, with nothing changed, if a gradient is not finite."""
         from neuprim.core.train.kernels_warp import adam_rows
 
         age, betas = self.age + 1, (BETA1, self.beta2)
@@ -172,7 +178,7 @@ class RowAdam:
         parallel_for(step_rows, len(work), 1, 0)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
-        """Apply a population change: take ``rows`` in their new order, and reset moments and age where ``fresh``."""
+        """Apply a population change: row i takes the state of old row ``rows[i]``, or zeros where ``fresh``."""
         for moments in (self.m, self.v):
             for name in moments:
                 moments[name] = moments[name][rows]
@@ -185,13 +191,13 @@ class RowAdam:
         return {**{f"m.{k}": t for k, t in self.m.items()}, **{f"v.{k}": t for k, t in self.v.items()}, "age": self.age}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore a :meth:`state` whose tensors are on the right device."""
+        """Restore the result of :meth:`state`, with tensors on the device of the model."""
         self.m, self.v = ({name: state[f"{moment}.{name}"] for name in self.m} for moment in "mv")
         self.age = state["age"]
 
 
 def _describe_bad_gradient(updates: list[_ParameterUpdate]) -> str:
-    """Name the first primitive whose gradient is not finite."""
+    """Return an error text that names the first primitive whose gradient is not finite."""
     for update in updates:
         bad = (~torch.isfinite(update.grad.reshape(len(update.grad), -1)).all(dim=1)).nonzero()
         if len(bad):

@@ -1,4 +1,4 @@
-"""Population control: how primitives are added, moved and removed during a training. All splits are exact."""
+"""Population control: strategies that add, move and remove primitives during a training. All splits are exact."""
 
 from __future__ import annotations
 
@@ -38,13 +38,14 @@ _MIN_GROWTHS = 3
 def split_population(
     model: Primitives, parents: Tensor, shift: float, long_factor: float, other_factor: float
 ) -> dict[str, Tensor]:
-    """Make two children per parent, all first ones then all second ones, each carrying its parent's fields unchanged.
+    """Split each parent primitive in two; return the children's parameters, all first children, then all second ones.
 
-    Children sit at +-shift x the longest semi-axis from the parent's centre; that axis shrinks by ``long_factor``,
-    the others by ``other_factor``.
+    Each child keeps its parent's density and colour as functions of space. The children lie at +-``shift`` x the
+    longest semi-axis from the parent's centre. This axis is multiplied by ``long_factor``, the other two by
+    ``other_factor``.
 
     Raises:
-        FormError: ``on_split`` returned something of another shape.
+        FormError: ``on_split`` of a field returned tensors of other shapes.
     """
     rows = torch.cat([parents, parents])
     old = {n: v.detach()[rows].clone() for n, v in model.params.items()}
@@ -68,8 +69,10 @@ def split_population(
 
 @dataclass(frozen=True)
 class PopulationChange:
-    """A new population: row i of ``params`` descends from old row ``origin[i]``; ``fresh`` rows start without
-    momentum."""
+    """A new set of primitives: row i of ``params`` comes from old row ``origin[i]``.
+
+    ``fresh``: (N,) bool, rows that start with zero Adam moments.
+    """
 
     params: dict[str, Tensor]
     origin: Tensor
@@ -78,30 +81,30 @@ class PopulationChange:
 
 
 class Population(ABC):
-    """Base class of strategies: observes every step, and proposes a :class:`PopulationChange` when :meth:`due`."""
+    """Base class of strategies, which observe every step and return a :class:`PopulationChange` when :meth:`due`."""
 
     def __init__(self, settings: PopulationSettings) -> None:
         self.settings = settings
 
     def due(self, step: int, progress: float) -> bool:
-        """Return whether to intervene after this step."""
+        """Return whether :meth:`intervene` should run after this step."""
         s = self.settings
         return s.start <= progress < s.stop and step % s.every == 0
 
     @abstractmethod
     def observe(self, model: Primitives, contributions: Contributions) -> None:
-        """Collect statistics after the backward passes of a step, while ``.grad`` is set."""
+        """Collect statistics of a step, after its backward passes and before ``.grad`` is cleared."""
 
     @abstractmethod
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
-        """Return the next population, or None to leave it; resets the statistics."""
+        """Return the change of the population, or None for no change; resets the statistics."""
 
     def state(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint needs."""
         return {}
 
     def load_state(self, state: dict[str, Tensor]) -> None:  # noqa: B027 - a strategy without statistics has none
-        """Restore a :meth:`state`."""
+        """Restore the result of :meth:`state`."""
 
 
 class FixedPopulation(Population):
@@ -115,11 +118,12 @@ class FixedPopulation(Population):
 
 
 class RelocatePopulation(Population):
-    """Strategy that moves primitives of least weight to where weight x error is largest, and adds missing ones.
+    """Strategy that moves the primitives of least weight to where weight x error is largest, and adds primitives.
 
-    The primitive with the largest error splits in two, one child in its own row and one in the idle row; ``idle``
-    limits which ones move. While there are fewer primitives than ``grow_to``, further ones split without an idle row, a
-    quarter of all at a time, or as many as the remaining interventions need. Short budgets intervene sooner.
+    Each primitive with a large error splits in two: one child takes its row, one the row of a primitive with little
+    weight. ``idle`` limits which primitives are replaced. Below ``grow_to`` primitives, further ones split into an old
+    and a new row: a quarter of all at a time, or as many as the remaining interventions need. Short budgets intervene
+    sooner.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -200,8 +204,10 @@ class RelocatePopulation(Population):
 def _split_population_into_rows(
     model: Primitives, parents: Tensor, others: Tensor, births: int, text: str
 ) -> PopulationChange:
-    """Split ``parents`` (P,): first children take their parents' rows, second ones the rows ``others`` (P,), of which
-    the last ``births`` are new."""
+    """Split ``parents`` (P,): the first child takes the row of its parent, the second a row in ``others`` (P,).
+
+    The last ``births`` rows in ``others`` are new.
+    """
     children = split_population(model, parents, SPLIT_SHIFT, SPLIT_LONG, SPLIT_OTHERS)
     rows = torch.cat([parents, others])
     origin = torch.arange(model.count + births, device=parents.device)
@@ -216,11 +222,12 @@ def _split_population_into_rows(
 
 
 class GradientPopulation(Population):
-    """The authors' rule on the density network's gradient, with exact splits (method: "Population").
+    """Strategy of the authors of the method: clone, split and prune by the gradient of the density network.
 
-    g = mean over views that saw the primitive of |dW1| + |db1| + |dw2| + |db2|, one view per step. g >= grow_threshold:
-    clone in place, both copies at half density, if max s <= clone_scale x extent, else split in two (s/1.6).
-    Prune if g < prune_threshold, max s > prune_scale x extent, or no view saw the primitive.
+    Splits are exact (method: "Population"). g = mean over views that show the primitive of |dW1| + |db1| + |dw2| +
+    |db2|, one view per step. g >= grow_threshold: clone in place, both copies at half density, if max s <= clone_scale
+    x extent, else split in two (s/1.6). Prune if g < prune_threshold, max s > prune_scale x extent, or no view shows
+    the primitive.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -297,17 +304,17 @@ STRATEGIES: dict[str, type[Population]] = {
 
 
 def check_strategy(name: object) -> None:
-    """Raise ConfigError unless the setting ``train.population.strategy`` may have this value."""
+    """Raise ConfigError unless ``name`` is a valid value of ``train.population.strategy``."""
     if name not in STRATEGIES:
         *others, last = STRATEGIES
         raise ConfigError(f"train.population.strategy={name!r}: expected {', '.join(others)} or {last}")
 
 
 def make_population(settings: PopulationSettings) -> Population:
-    """Make the strategy that the settings name.
+    """Create the population control strategy that the settings name.
 
     Raises:
-        ConfigError: there is none of this name.
+        ConfigError: no strategy has this name.
     """
     check_strategy(settings.strategy)
     return STRATEGIES[settings.strategy](settings)

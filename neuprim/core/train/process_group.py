@@ -23,11 +23,11 @@ _VARIABLES = (*_NUMBERS, "MASTER_ADDR", "MASTER_PORT")
 
 @dataclass(frozen=True)
 class TorchrunRank:
-    """Rank of this process among those that torchrun started.
+    """Rank of this process among the processes that torchrun started.
 
     Attributes:
         rank, size: number of this process, and number of processes on all machines.
-        local_rank, local_size: the same on this machine.
+        local_rank, local_size: the same, counting only processes on this machine.
         address: host and port where the processes connect.
     """
 
@@ -39,10 +39,10 @@ class TorchrunRank:
 
 
 def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunRank | None:
-    """Return this process's rank; None for a single process.
+    """Return the rank of this process from torchrun's environment variables; None for a single process.
 
     Raises:
-        ConfigError: the environment has some of torchrun's variables, or values that cannot be.
+        ConfigError: only some of torchrun's variables are set, or values are invalid.
     """
     # an address alone does not count: it is often set for a whole machine
     if not any(name in environment for name in ("RANK", "WORLD_SIZE", "LOCAL_RANK")):
@@ -84,7 +84,7 @@ _FAILED = "failed"  # key of the store: the first failure of any rank
 
 
 class ProcessGroup:
-    """The connected ranks of a training.
+    """The connected ranks of a training; the methods communicate among all of them.
 
     Args:
         place: rank of this process.
@@ -118,7 +118,7 @@ class ProcessGroup:
     # ------------------------------------------------------------ communication
 
     def gather(self, value: Any) -> list[Any]:
-        """Return the values of all ranks, by rank.
+        """Return the list of ``value`` of all ranks, in the order of ranks.
 
         Raises:
             RankError: another rank ended.
@@ -129,7 +129,7 @@ class ProcessGroup:
         return values
 
     def share_number(self, name: str, make: Callable[[], int]) -> int:
-        """Return the result of ``make`` on rank 0, the only rank to call it, shared under the key ``name``.
+        """Call ``make`` on rank 0 only; return its result on all ranks. ``name``: a key that is used once.
 
         Raises RankError.
         """
@@ -150,7 +150,7 @@ class ProcessGroup:
             dist.all_gather(list(received.unbind(0)), own)
 
     def check_equal(self, facts: Mapping[str, Any], hint: str) -> None:
-        """Refuse ranks that differ in ``facts``.
+        """Check that all ranks pass the same ``facts``.
 
         Raises:
             RankError: names the rank and what differs; ``hint`` says what was expected.
@@ -163,8 +163,10 @@ class ProcessGroup:
 
     @contextmanager
     def in_turn(self) -> Iterator[None]:
-        """Let rank 0 go first, then the first rank of every other machine, then the rest, so that files in caches are
-        made once. Raises RankError."""
+        """Run the block on rank 0 first, then on the first rank of every other machine, then on all other ranks.
+
+        So only one rank writes a cache file. Raises RankError.
+        """
         turn = 0 if self.is_first else 1 if self.place.local_rank == 0 else 2
         for _ in range(turn):
             self.gather(None)
@@ -175,8 +177,10 @@ class ProcessGroup:
     # ------------------------------------------------------------ failures
 
     def record_failure(self, line: str) -> bool:
-        """Record in the shared store why this rank ends; return whether it is the first one, which must report to the
-        user."""
+        """Record in the shared store why this rank ends; return True if no rank failed before.
+
+        The first rank that fails must report the error to the user.
+        """
         own = json.dumps([self.rank, line[:4000]])
         try:
             return bool(self.store.compare_set(_FAILED, "", own).decode() == own)
@@ -191,8 +195,7 @@ class ProcessGroup:
             raise self.explain_broken_connection(error) from error
 
     def explain_broken_connection(self, error: Exception) -> RankError:
-        """Return the reason for a broken connection: the recorded failure of another rank, or that one ended without a
-        record."""
+        """Return the error for a broken connection: the failure that another rank recorded, or a general message."""
         try:
             if self.store.check([_FAILED]):
                 rank, line = json.loads(self.store.get(_FAILED))
@@ -203,6 +206,6 @@ class ProcessGroup:
         return RankError(f"another rank ended without a message, see torchrun's report ({reason})")
 
     def close(self) -> None:
-        """Leave the group."""
+        """Disconnect from the other ranks."""
         if dist.is_initialized():
             dist.destroy_process_group()

@@ -1,9 +1,9 @@
 """Estimate the error in images, or at points, of removing a primitive or a unit of it, by one backward pass per view.
 
-To first order an image changes by J delta when numbers change by delta. For random signs z per pixel and channel, the
-mean of (z . J delta)^2 is the sum of squares |J delta|^2 (Hutchinson 1990), and z . J is what a backward pass gives. A
-whole primitive's part in a pixel is its weight w = alpha T times how much its colour differs from what is behind it.
-Its sum of w^2 predicts the loss better than its sum of w.
+To first order an image changes by J delta when parameters change by delta. For random signs z per pixel and channel,
+the mean of (z . J delta)^2 is |J delta|^2 (Hutchinson 1990). A backward pass computes z . J. Removing a primitive
+changes a pixel by the primitive's weight w = alpha T times the difference of its colour from the colour behind it. The
+sum of w^2 over pixels predicts the loss better than the sum of w.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from neuprim.core.volumes.points import volume_values_at
 
 @dataclass(frozen=True)
 class Sensitivity:
-    """Mean squared effects over the pixels and channels of some views, or over points.
+    """Mean squared effects of changes to a model, over the pixels and channels of some views, or over points.
 
     Attributes:
-        whole: (N,) effect of removing each primitive; in views, if its colour differs by 1 from what is behind it.
+        whole: (N,) effect of removing each primitive; in views, if its colour differs by 1 from the colour behind it.
         seen: (N,) number of views, or frames, that show the primitive; where it is 0, the effects are unknown.
         pieces: name of a unit -> (N,) effect of setting each primitive's unit to zero.
-        columns: parameter -> (C,) float64 effect of each of its numbers, if those of all primitives change by
-            independent amounts of variance 1; for "quats", by amounts perpendicular to a quaternion of unit norm.
+        columns: parameter -> (C,) float64 effect of each column, if the values of all primitives change by independent
+            amounts of variance 1; for "quats", perpendicular to the quaternion, at unit norm.
     """
 
     whole: Tensor
@@ -41,14 +41,14 @@ class Sensitivity:
     columns: dict[str, Tensor]
 
     def combine(self, other: Sensitivity, weight: float) -> Sensitivity:
-        """Return the sum of these effects and ``weight`` times those of ``other``."""
+        """Return these effects plus ``weight`` times the effects in ``other``."""
         pieces = {name: value + weight * other.pieces[name] for name, value in self.pieces.items()}
         columns = {name: value + weight * other.columns[name] for name, value in self.columns.items()}
         return Sensitivity(self.whole + weight * other.whole, self.seen + other.seen, pieces, columns)
 
 
 class _SensitivitySums:
-    """Sums over backward passes of random signs."""
+    """Sums the squared gradients of backward passes from random signs."""
 
     def __init__(self, model: Primitives) -> None:
         self._model, self._pieces = model, prunable_units_of_model(model.density, model.colour)
@@ -56,7 +56,7 @@ class _SensitivitySums:
         self.columns = {spec.name: torch.zeros(spec.size, dtype=torch.float64) for spec in model.specs}
 
     def add_pass(self, params: dict[str, Tensor]) -> None:
-        """Add the gradients of ``params`` from one backward pass."""
+        """Add the squared effects from the gradients of ``params`` after one backward pass."""
         gradients = {
             name: torch.zeros_like(value) if value.grad is None else value.grad for name, value in params.items()
         }
@@ -77,7 +77,7 @@ class _SensitivitySums:
 def sensitivity(
     model: Primitives, dataset: Dataset, views: Sequence[int], settings: RenderSettings, seed: int = 0
 ) -> Sensitivity:
-    """Return the effects on the images of training views, as CPU tensors.
+    """Estimate the effects of changes to a model on the images of training views; returns CPU tensors.
 
     Args:
         views: indices of training views.
@@ -103,12 +103,12 @@ def sensitivity(
 
 
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
-    """Return the effects on the extinction at points, in units of its typical size, as CPU tensors.
+    """Estimate the effects on the extinction at points, relative to typical extinction; returns CPU tensors.
 
-    For volumes whose inside is known; images do not show these effects.
+    For volumes with known extinction. Images do not show these effects.
 
     Args:
-        draws: points, each sample of one frame.
+        draws: samples of points, each from one frame.
         seed: seed of the random signs.
         threads: CPU threads; 0 uses all cores.
     """

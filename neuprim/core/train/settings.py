@@ -1,7 +1,7 @@
-"""Settings of a run under ``train`` and ``model``, and the tracking of which plugin reads them.
+"""Settings of a run under ``train`` and ``model``, and checks of which settings a plugin reads.
 
-The settings in :data:`OPTIONAL` are read by a task's ``build`` or by a loss, if at all, and declared there in ``uses``.
-Setting one that nobody reads is an error, and a function gets only those that it declared.
+Only a task's ``build`` or a loss can read the settings in :data:`OPTIONAL`. Both declare in ``uses`` which of these
+settings they read, and get no others of them. Setting one that neither reads is an error.
 """
 
 from __future__ import annotations
@@ -73,10 +73,12 @@ class ModelSettings:
         return self.primitives
 
     def with_count_for(self, train: TrainSettings, pace: float | None = None) -> ModelSettings:
-        """Return the settings with "auto" replaced by the number for a budget of steps or of seconds, the smaller one.
+        """Return the settings with ``primitives="auto"`` replaced by the number for the budget in ``train``.
+
+        If both steps and seconds are limited, the smaller number is taken.
 
         Args:
-            pace: seconds of a step per primitive; None leaves "auto" to budgets of seconds.
+            pace: seconds per step and primitive; with None, "auto" stays if ``train.max_seconds`` is set.
         """
         if self.primitives != "auto" or (pace is None and train.max_seconds is not None):
             return self
@@ -228,12 +230,12 @@ OPTIONAL = ("model.neurons", "model.sh_degree", "model.sh_every", "train.ssim_we
 
 
 class TrackedMapping(dict[str, Any]):
-    """A group of settings for a plugin's function; reading a setting that the plugin did not declare is a ConfigError.
+    """The settings that a plugin's function gets. Reading a setting that the plugin did not declare is a ConfigError.
 
     Args:
-        owner: e.g. ``"task 'glow'"``.
+        owner: the plugin, for messages, e.g. ``"task 'glow'"``.
         group: dotted name of the group, e.g. ``"model"``.
-        member: name of the member that declares what the plugin reads, "uses" or "options".
+        member: attribute of the plugin that declares what it reads, "uses" or "options".
     """
 
     def __init__(self, values: Mapping[str, Any], owner: str, group: str, member: str) -> None:
@@ -247,10 +249,10 @@ class TrackedMapping(dict[str, Any]):
 
 
 def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return what a task's ``build`` and ``check`` get: the model settings that it uses, and its options as "options".
+    """Return what a task's ``build`` and ``check`` get: the model settings that the task uses, and "options".
 
     Args:
-        options: values by name; missing ones take their defaults, unknown ones are left out.
+        options: values by name; missing options take their defaults, unknown ones are ignored.
     """
     return _track_used_settings("model", vars(model), task, options, f"task {task.name!r}")
 
@@ -258,7 +260,7 @@ def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, A
 def loss_settings(
     owner: TaskSpec | LossExtension, train: TrainSettings, options: Mapping[str, Any]
 ) -> Mapping[str, Any]:
-    """Return what makes the loss of ``owner``, a task or a ``train.loss``: settings and options, as build_settings."""
+    """Return what a loss of ``owner`` (a task or a ``train.loss``) gets: settings that it uses, and "options"."""
     who = f"the loss of task {owner.name!r}" if hasattr(owner, "build") else f"loss {owner.name!r}"
     return _track_used_settings("train", vars(train), owner, options, who)
 

@@ -1,9 +1,9 @@
-"""L1 + SSIM with its analytic gradient, fused and separable, on all cores.
+"""L1 + SSIM loss of two images and its analytic gradient, in fused separable passes on all CPU cores.
 
 SSIM over an 11-tap Gaussian window (sigma 1.5), valid windows only. With window means a = E[x], b = E[y],
 A = 2ab + c1, B = 2(E[xy] - ab) + c2, C = a^2 + b^2 + c1, D = E[xx] - a^2 + E[yy] - b^2 + c2: SSIM = AB/(CD). Its
-derivatives with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur. Where the images
-are equal, as in front of an empty background, SSIM is 1 and their gradient 0: those columns are left out.
+derivatives with respect to E[x], E[xx] and E[xy] are spread back with the adjoint of the same blur. Where both images
+are equal, as in an empty background, SSIM is 1 and the gradient 0; these columns are skipped.
 """
 
 from __future__ import annotations
@@ -71,8 +71,10 @@ def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
 
 @inline
 def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
-    """Replace E[x], E[xx], E[xy] in the blocks E[x], E[y], E[xx], E[yy], E[xy] by the derivatives of scale x SSIM with
-    respect to them; return the sum of SSIM."""
+    """Replace E[x], E[xx] and E[xy] in ``s`` by the derivatives of scale x SSIM; return the sum of SSIM.
+
+    ``s``: blocks E[x], E[y], E[xx], E[yy], E[xy].
+    """
     total = f(0)
     for j in range(n):
         a, b = s[_EX + j], s[_EY + j]
@@ -91,7 +93,7 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
-    """Set unequal[i] to the range [first, end) of numbers that differ in image row i, or [n, 0); rows start:stop."""
+    """Set unequal[i] to the range [first, end) of elements that differ in row i, or [n, 0); rows start:stop."""
     n = x.shape[0] // height
     for i in range(start, stop):
         first, end = 0, n
@@ -104,8 +106,10 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 
 @inline
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
-    """Return the range [first, end) of the unequal numbers of image rows start:stop, extended by ``before`` and
-    ``after`` within [0, most); end is first without any."""
+    """Return the range [first, end) that contains the unequal elements of image rows start:stop.
+
+    The range is extended by ``before`` and ``after`` within [0, most). If no elements differ, end is first.
+    """
     first, end = most, np.int64(0)
     for i in range(start, stop):
         first, end = min(first, unequal[i, 0] - before), max(end, unequal[i, 1] + after)
@@ -147,7 +151,7 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
 
 @inline
 def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
-    """Write the gradient of L1 and SSIM into ``gr``, from the three spread maps; return the sum of |x - y|."""
+    """Write the gradient of L1 and SSIM into ``gr``, from the three blurred maps; return the sum of |x - y|."""
     line = f(0)
     for j in range(n):
         a, b = x[j], y[j]
@@ -189,7 +193,7 @@ _buffers = threading.local()
 
 
 def _bordered_loss_maps(rows: int, columns: int) -> Any:
-    """Return three maps with a zero border; the next image of the same size in this thread reuses them."""
+    """Return memory for three maps with a zero border; this thread reuses it for the next image of this size."""
     maps = getattr(_buffers, "maps", None)
     if maps is None or maps.shape != (3, rows, columns):
         maps = _buffers.maps = np.zeros((3, rows, columns), np.float32)
@@ -197,12 +201,12 @@ def _bordered_loss_maps(rows: int, columns: int) -> Any:
 
 
 def ssim_loss_with_gradient(rendered: Tensor, truth: Tensor, weight: float) -> tuple[Tensor, Tensor]:
-    """Return mean absolute difference and mean SSIM, (2,) float64, and the (H, W, C) gradient of the loss.
+    """Return (mean absolute difference, mean SSIM) as (2,) float64, and the (H, W, C) gradient of the loss.
 
     The loss is (1 - weight) L1 + weight (1 - SSIM).
 
     Args:
-        rendered, truth: (H, W, C) float32 of at least 11 x 11 pixels and at most 51 channels.
+        rendered, truth: (H, W, C) float32, at least 11 x 11 pixels, at most 51 channels.
     """
     H, W, C = rendered.shape
     x, y = (np.ascontiguousarray(image.numpy()).reshape(-1) for image in (rendered, truth))

@@ -1,9 +1,9 @@
 """The training loop of every task.
 
-A step draws a view, renders it, compares it with the image, runs the backward pass, updates the parameters and applies
-population control. ``train.supervision`` adds points of known extinction, or replaces the view by them. All that
-affects the next step is in :meth:`Trainer.state`: a run that is stopped and resumed equals one that was not, bit for
-bit.
+A step draws a view, renders it, compares it with its image, runs the backward pass, updates the parameters and applies
+population control. ``train.supervision`` can add points of known extinction to the view, or use points alone.
+:meth:`Trainer.state` has everything that affects the next step, so a resumed run gives the same bits as an
+uninterrupted one.
 """
 
 from __future__ import annotations
@@ -54,8 +54,8 @@ class StepReport:
 
     Attributes:
         seconds: training time up to the end of this step.
-        psnr: PSNR of the training view (mean of several), or of the extinction at points in a step without views.
-        change: what population control changed, if anything.
+        psnr: PSNR of the training view (mean over views), or of the extinction at points in a step without views.
+        change: text about what population control changed; None if nothing.
     """
 
     step: int
@@ -69,7 +69,7 @@ class StepReport:
 
 
 class ViewTask(NamedTuple):
-    """A view to render by its index, its background, its pixels, and the index of the view after it, if known."""
+    """A training view to render: its index, background and pixels, and the index of the next view, if known."""
 
     view: int
     background: Tensor
@@ -78,10 +78,10 @@ class ViewTask(NamedTuple):
 
 
 class ViewResult(NamedTuple):
-    """Numbers of one view of a step.
+    """Results of one view of a step.
 
     Attributes:
-        loss: its share of the step's loss; that of the last view includes points and regularisers.
+        loss: the view's part of the step's loss; the part of the last view includes points and regularisers.
         gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
         correction: gradient of the view's corrections; None without them.
     """
@@ -97,7 +97,7 @@ class ViewResult(NamedTuple):
 
 
 class _RenderedView(NamedTuple):
-    """A view, rendered and compared; the backward pass fills ``contributions``."""
+    """A rendered view and its loss; the backward pass fills ``contributions``."""
 
     loss: Tensor
     parts: dict[str, float]
@@ -110,19 +110,19 @@ class _RenderedView(NamedTuple):
 class Trainer:
     """Trains a model on the training views of a data set.
 
-    The model's tensors move to the device that the render settings choose. Random numbers are drawn on the CPU, so that
-    they are the same on every device.
+    The model's tensors move to the device that the render settings choose. Random numbers are drawn on the CPU, so all
+    devices use the same ones.
 
     Attributes:
-        extent: unit of learning rates "extent" and of size limits, scene units.
-        pixel: unit of learning rates "pixel", scene units.
-        step: number of steps done.
+        extent: extent of the scene, in scene units; unit of "extent" learning rates and of size limits.
+        pixel: size of a pixel at the median depth of the scene, in scene units; unit of "pixel" learning rates.
+        step: number of finished steps.
         elapsed: seconds of training, without held-out evaluations and file writes.
-        fake_quantize: function (parameters) -> parameters as a file would store them, with gradients; None for none.
-        zero_masks: parameter -> (N, ...) bool of the numbers that stay zero.
-        rank: number of this process among those that train the model.
+        fake_quantize: differentiable function that rounds parameters as a file would store them; None for none.
+        zero_masks: parameter -> (N, ...) bool, True for values that stay zero.
+        rank: rank of this process among all processes that train the model.
         ranks: number of processes that train the model.
-        stop_requested: function that is called after every step; see :attr:`stopping`.
+        stop_requested: function called after every step; True ends the training, see :attr:`stopping`.
     """
 
     rank, ranks = 0, 1
@@ -163,7 +163,7 @@ class Trainer:
 
     @property
     def progress(self) -> float:
-        """Used fraction of the budget of steps or seconds, the larger of both; schedules depend on it."""
+        """Used fraction of the budget, of steps or of seconds, whichever is larger; schedules depend on this value."""
         steps = self.settings.iterations
         done = 0.0 if steps is None else self.step / steps if steps else 1.0
         if self.settings.max_seconds is not None:
@@ -176,7 +176,7 @@ class Trainer:
 
     @property
     def stopping(self) -> bool:
-        """Whether the last step was the final one, because a stop was requested."""
+        """Whether training should stop after the last step, because a stop was requested."""
         return self.stop_requested()
 
     def rates(self) -> dict[str, float]:
@@ -194,7 +194,7 @@ class Trainer:
     # ------------------------------------------------------------ the loop
 
     def run(self) -> Iterator[StepReport]:
-        """Iterate over training steps until the budget is used; the loop may save the state or end early."""
+        """Run steps until the budget is used, yielding each result; the caller may save the state or stop."""
         while not self.finished:
             yield self.train_step()
 
@@ -202,8 +202,8 @@ class Trainer:
         """Take one training step and return its result.
 
         Raises:
-            NonFiniteError: a loss, gradient or parameter is NaN or infinite; this step updated nothing.
-            DeviceMemoryError: the memory of the GPU is too small for a step; files are intact.
+            NonFiniteError: a loss, gradient or parameter is NaN or infinite; the step changes no parameter.
+            DeviceMemoryError: the GPU has too little memory for a step; files are intact.
         """
         with self._limit_resources():
             start, model, progress = time.perf_counter(), self.model, self.progress
@@ -289,7 +289,7 @@ class Trainer:
         return [ViewTask(*view, then) for view, then in zip(drawn, upcoming, strict=True)]
 
     def _exchange_gradients(self, contributions: Contributions) -> Contributions:
-        """Return ``contributions``; called after each view's backward pass. ``.grad`` already sums over the views."""
+        """Hook after each view's backward pass; returns ``contributions``. ``.grad`` already sums over views."""
         return contributions
 
     def _combine_views(
@@ -297,7 +297,7 @@ class Trainer:
     ) -> tuple[list[ViewResult], Contributions]:
         """Return the results of all views of the step, in order, and the sum of their contributions.
 
-        ``start``: time at which the step began.
+        ``start``: time at the beginning of the step.
         """
         return results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
 
@@ -307,7 +307,7 @@ class Trainer:
     # ------------------------------------------------------------ parts of a step
 
     def _draw_view(self) -> tuple[int, Tensor, PixelStride]:
-        """Draw the next view, in random order without replacement, its background and its pixels."""
+        """Draw the next view (random order, without replacement), its background and its pixels."""
         train, settings = self.dataset.train, self.settings
         if len(self.order) == 0:
             self.order = torch.randperm(len(train), generator=self.generator)
@@ -325,8 +325,10 @@ class Trainer:
         return torch.full((channels,), 1.0 if choice == "white" else 0.0)
 
     def _draw_points(self) -> PointSamples | None:
-        """Draw the points of this step, or return None. With ``both``, steps whose number in logs is a multiple of
-        ``voxels_every`` use points."""
+        """Draw the points of this step; None if the step uses none.
+
+        With ``train.supervision=both``, steps whose number in logs is a multiple of ``voxels_every`` use points.
+        """
         source = self.settings.supervision
         if source == "images" or (source == "both" and (self.step + 1) % self.settings.voxels_every):
             return None
@@ -334,7 +336,7 @@ class Trainer:
         return self.dataset.points.draw(self.settings.voxels_per_step, self.generator)
 
     def _quantized_model(self) -> Primitives:
-        """Return the model to render: its parameters are quantised if :attr:`fake_quantize` is set."""
+        """Return the model to render, with quantized parameters if :attr:`fake_quantize` is set."""
         if self.fake_quantize is None:
             return self.model
         return Primitives(self.model.density, self.model.colour, self.fake_quantize(self.model.params))
@@ -367,7 +369,7 @@ class Trainer:
         return point_loss(self._quantized_model(), self.dataset, samples, self.settings, self.renderer.threads)
 
     def _total_loss(self, loss: Tensor | None, points: PointLossResult | None) -> Tensor:
-        """Add the losses of points and regularisers to that of the views, if there are views."""
+        """Return the sum of the losses of views, points (None: none in this step) and regularisers."""
         if points is not None:
             loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
         assert loss is not None
@@ -378,10 +380,10 @@ class Trainer:
         return loss
 
     def _backward(self, loss: Tensor, view: _RenderedView | None, points: PointLossResult | None) -> float:
-        """Add the gradients of ``loss`` to the parameters'; returns its value.
+        """Run the backward pass of ``loss``, which adds to ``.grad`` of the parameters; return the loss as a float.
 
         Raises:
-            NonFiniteError: the value is NaN or infinite; names the view or points.
+            NonFiniteError: the loss is NaN or infinite; names the view or points.
         """
         cost = loss.item()
         if not math.isfinite(cost):
@@ -407,7 +409,7 @@ class Trainer:
     # ------------------------------------------------------------ exact state
 
     def state(self) -> tuple[dict[str, Tensor], dict[str, Any]]:
-        """Return CPU tensors and JSON-able numbers from which :meth:`load_state` continues exactly, on any device."""
+        """Return the training state, CPU tensors and JSON values, from which :meth:`load_state` continues exactly."""
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
@@ -421,10 +423,11 @@ class Trainer:
         return tensors, header
 
     def load_state(self, tensors: dict[str, Tensor], header: dict[str, Any], where: str) -> None:
-        """Continue from a :meth:`state`.
+        """Restore the result of :meth:`state`, on any device.
 
         Raises:
-            CheckpointError: the state is of other settings or data; names the difference. The trainer is unchanged.
+            CheckpointError: the state belongs to other settings or data; names the difference. The trainer is
+                unchanged.
         """
         check_state(tensors, header, where, *self.state())
         moved = {name: value.to(self.device, copy=True) for name, value in tensors.items()}
@@ -443,7 +446,7 @@ class Trainer:
 
 
 def _check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
-    """Check that settings fit the model and the data; return them with ``train.supervision=auto`` resolved."""
+    """Check the settings against the model and the data; return them with ``supervision="auto"`` replaced."""
     if len(dataset.train) == 0:
         raise DataError(f"{dataset.name}: the training split is empty")
     names = [spec.name for spec in model.specs]
@@ -466,7 +469,7 @@ def _check_training_settings(settings: TrainSettings, model: Primitives, dataset
 
 
 def _summarize_training_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
-    """Return loss, mean parts, mean PSNR and name of a step, from its views in their order."""
+    """Return summed loss, mean parts, mean PSNR and name of a step, from the results of its views."""
     last, count = views[-1], len(views)
     parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}
     name = last.name if count == 1 else f"{last.name} and {count - 1} more"

@@ -1,4 +1,4 @@
-"""Check a training's state, as :meth:`~neuprim.core.train.trainer.Trainer.state` makes it."""
+"""Check the state of a training, which :meth:`~neuprim.core.train.trainer.Trainer.state` returned."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _FIXED = ("params", "adam", "exposure", "correction")
 
 
 def select_state_tensors(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
-    """Return the tensors whose names begin with ``prefix``, by names without it."""
+    """Return the tensors whose names begin with ``prefix``; the returned names lack the prefix."""
     return {name.removeprefix(prefix): value for name, value in tensors.items() if name.startswith(prefix)}
 
 
@@ -27,13 +27,13 @@ def check_state(
     own_tensors: Mapping[str, Tensor],
     own_header: Mapping[str, Any],
 ) -> None:
-    """Check a state against that of the trainer which is to continue from it.
+    """Check that a saved state fits the trainer that will continue from it.
 
     Args:
-        where: file of the state, for messages.
+        where: file of the saved state, for messages.
 
     Raises:
-        CheckpointError: it belongs to other settings or data; names what differs.
+        CheckpointError: the saved state belongs to other settings or data; names what differs.
     """
     step, elapsed, views = (header.get(name) for name in ("step", "elapsed", "views"))
     if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):

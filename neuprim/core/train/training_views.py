@@ -1,5 +1,4 @@
-"""Training views: prefetching for a GPU, pixel strides, and numbers learned per view: the gain of a photograph, and
-corrections of its camera and conditions."""
+"""Training views: prefetching, pixel strides, and learned exposures and corrections of cameras and conditions."""
 
 from __future__ import annotations
 
@@ -39,7 +38,7 @@ _CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [3e-4] * 6, "offset"
 
 
 class PixelLoader:
-    """Loader of the pixels of training views.
+    """Loads the pixels of training views.
 
     For a GPU, a thread loads the next view in advance, which does not change the order of the views. Views that fit in
     a quarter of the free memory are cached, as loading a large view again takes longer than a step.
@@ -59,7 +58,7 @@ class PixelLoader:
         return pixels if self._device.type == device.CPU else pixels.to(self._device)
 
     def take(self, index: int, upcoming: int | None) -> Pixels:
-        """Return a view's pixels and start loading those of ``upcoming``, if known; raises the errors of loading."""
+        """Return the pixels of view ``index`` and start loading view ``upcoming``; raises the errors of loading."""
         if self._device.type == device.CPU:
             return self._load(index)
         pending, self._pending = self._pending, None
@@ -77,21 +76,21 @@ class PixelLoader:
 
 
 class PixelStride(NamedTuple):
-    """Every ``step``-th pixel of a view in x and y, the first at (``column``, ``row``)."""
+    """Selects every ``step``-th pixel of a view in x and y, the first at (``column``, ``row``)."""
 
     step: int = 1
     column: int = 0
     row: int = 0
 
     def take(self, view: View, pixels: Pixels) -> tuple[View, Pixels]:
-        """Return the view and the pixels reduced to the selected pixels; rays and colours are exact, not averaged."""
+        """Return the view and its pixels, reduced to the selected pixels; rays and colours are exact, not averaged."""
         if self.step == 1:
             return view, pixels
         return replace(view, camera=view.camera.strided(*self)), pixels.strided(*self)
 
 
 def count_covered_pixels(views: ViewSet) -> float:
-    """Return the mean number of pixels with alpha above 0 that are not masked, over at most 16 of the views."""
+    """Return the mean number of unmasked pixels with alpha above 0 per view, over at most 16 of the views."""
     chosen = range(0, len(views), -(-len(views) // _COUNTED_VIEWS))
     total = 0
     for index in chosen:
@@ -103,10 +102,10 @@ def count_covered_pixels(views: ViewSet) -> float:
 
 
 def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int, progress: float) -> int:
-    """Return the stride at ``progress``, the used fraction of the budget.
+    """Return the stride of pixels at ``progress``, the used fraction of the budget.
 
-    ``auto`` balances the work per pixel, which falls with the square of the stride, and that per primitive, which does
-    not: away from the balance a step learns less for its time. It depends on sizes alone.
+    ``auto`` balances the work per pixel, which falls with the square of the stride, and the work per primitive, which
+    does not. Other strides learn less per second. The result depends only on the arguments, not on measured times.
     """
     if stride != "auto":
         return stride
@@ -116,7 +115,7 @@ def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int
 
 
 def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:
-    """Draw the first pixel of a stride. Strides that leave fewer than 11 pixels a side are lowered; 1 draws nothing."""
+    """Draw a random first pixel for a stride. The stride is lowered until 11 pixels a side remain."""
     stride = max(min(stride, min(view.camera.width, view.camera.height) // _MIN_SIDE), 1)
     if stride == 1:
         return PixelStride()
@@ -125,13 +124,13 @@ def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStr
 
 
 def hash_training_views(views: ViewSet) -> str:
-    """Return a hash of the names of views, by which different data of the same size differ."""
+    """Return a hash of the names of all views, to detect other data with the same number of views."""
     text = "\n".join(views.view(i).name for i in range(len(views)))
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 class _NumbersOfViews:
-    """Numbers per training view that Adam learns with the model, in the steps that use the view."""
+    """Parameters of each training view, which Adam learns with the model in the steps that use the view."""
 
     def __init__(self, views: int, rates: list[float], device: torch.device) -> None:
         self.rates = torch.tensor(rates, device=device)
@@ -141,17 +140,17 @@ class _NumbersOfViews:
         self._rows: dict[int, Tensor] = {}
 
     def row(self, index: int) -> Tensor:
-        """Return a view's numbers as a leaf tensor; :meth:`gradient` reads its gradient after the backward pass."""
+        """Return the parameters of a view as a leaf tensor; call :meth:`gradient` after the backward pass."""
         self._rows[index] = row = self.numbers[index].clone().requires_grad_()
         return row
 
     def gradient(self, index: int) -> list[float] | None:
-        """Return the gradient of a view's numbers, after its backward pass; None without one."""
+        """Return the gradient of a view's parameters after the backward pass; None if there is none."""
         grad = self._rows.pop(index).grad
         return None if grad is None else [float(x) for x in grad.tolist()]
 
     def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
-        """Update the numbers of the views of a step by their gradients; ``factor`` multiplies the rates."""
+        """Update the parameters of views by ``gradients``, keyed by view; ``factor`` multiplies the rates."""
         for index, numbers in gradients.items():
             if numbers is None:
                 continue
@@ -164,27 +163,27 @@ class _NumbersOfViews:
             self.numbers[index] -= self.rates * scale * self.m[index] / (self.v[index].sqrt() + _EPS)
 
     def state(self) -> dict[str, Tensor]:
-        """Return the tensors from which :meth:`load_state` continues."""
+        """Return the tensors that a checkpoint needs."""
         return {"numbers": self.numbers, "m": self.m, "v": self.v, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Continue from a checked state."""
+        """Restore the result of :meth:`state`, which must fit."""
         self.numbers, self.m, self.v = state["numbers"], state["m"], state["v"]
         self.seen = state["seen"].cpu()
 
 
 class Exposures(_NumbersOfViews):
-    """Gains per training view and channel, which multiply a rendered image before it is compared.
+    """A learned gain per training view and channel, which multiplies the rendered image before the loss.
 
-    Their logarithms are learned. The geometric mean over the views stays 1, so that the model keeps the photographs'
-    mean exposure, with which held-out views are rendered.
+    Adam updates the logarithms of the gains. The geometric mean over the views stays 1, so that the model has the mean
+    exposure of the photographs. Held-out views are rendered with this exposure.
     """
 
     def __init__(self, views: int, channels: int, rate: float, device: torch.device) -> None:
         super().__init__(views, [rate] * channels, device)
 
     def apply(self, index: int, rgb: Tensor) -> Tensor:
-        """Return the (H, W, C) image with the exposure of view ``index``."""
+        """Return the rendered image (H, W, C) multiplied by the gains of view ``index``."""
         return rgb * self.row(index).exp()
 
     def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
@@ -194,11 +193,11 @@ class Exposures(_NumbersOfViews):
 
 
 class ViewCorrections(_NumbersOfViews):
-    """Learned corrections of cameras and conditions that a data set knows only roughly (``Dataset.refine``).
+    """Learned corrections of cameras and conditions whose given values are inexact (``Dataset.refine``).
 
     Args:
-        kinds: "camera" or a condition -> "pose", "offset" or "factor". A pose has a rotation vector and a shift on the
-            camera's axes, an offset is added to a position, and of a factor the logarithm is learned.
+        kinds: "camera" or a condition -> "pose", "offset" or "factor". A pose is a rotation vector and a shift in
+            camera axes. An offset is added to a position. For a factor, the logarithm is learned.
         unit: unit of shifts and offsets, in scene units.
     """
 
@@ -208,7 +207,7 @@ class ViewCorrections(_NumbersOfViews):
         self.kinds, self.unit = kinds, unit
 
     def apply(self, index: int, view: View) -> View:
-        """Return the view with its current corrections."""
+        """Return view ``index`` with its corrections applied."""
         row, conditions, camera = self.row(index).double(), dict(view.conditions), view.camera
         for name, part in zip(self.kinds, row.split(self._sizes()), strict=True):
             if name in conditions:
@@ -231,7 +230,7 @@ class ViewCorrections(_NumbersOfViews):
         return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
     def summary(self) -> str:
-        """Return a line for the log with the root mean square of each correction over the views."""
+        """Return a log line: the root mean square over the views of each correction."""
         found = []
         for name, part in zip(self.kinds, self.numbers.split(self._sizes(), 1), strict=True):
             kind, sizes = self.kinds[name], part.square().unflatten(1, (-1, 3 if part.shape[1] > 1 else 1)).sum(-1)

@@ -1,9 +1,9 @@
 """The model's extinction on a regular grid: sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside
-their ellipsoids. A primitive's negative f is clamped here point by point; a renderer clamps its integral along a ray.
+their ellipsoids. A negative f is clamped to 0 at every point; a renderer clamps the integral of f along a ray instead.
 
-A neuron's phase is linear in the index along each axis, so its cosine at a grid point is a product of one complex
-number per axis: a primitive that spans n^3 points costs 3 n sines and cosines per neuron, and two multiplications per
-neuron and point.
+A neuron's phase is linear in the index along each axis. So its cosine at a grid point is the real part of a product of
+one complex number per axis. A primitive that spans n^3 points needs 3 n sines and cosines per neuron, and two
+multiplications per neuron and point.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ _PLANES_PER_JOB = 8
 _PAIRS = 1 << 17  # pairs (point, primitive) that torch code evaluates at once
 
 POINTS_LIMIT = 2**30
-"""Most points of a grid, 4 GiB of float32."""
+"""Largest number of points of a grid, 4 GiB of float32."""
 
 
 def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
-    """Return a regular grid of cell centres that fills a (2, 3) box, with ``resolution`` cells on its longest side.
+    """Return a regular grid of cell centres that fills the box ``bounds``, (2, 3) lower and upper corner.
 
-    The grid is a (4, 4) scene_from_index and a shape.
+    The longest side has ``resolution`` cells. The grid is a (4, 4) matrix scene_from_index and a shape.
     """
     low, high = np.asarray(bounds, np.float64)
     step = float((high - low).max()) / resolution
@@ -44,8 +44,10 @@ def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, t
 
 
 def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
-    """Return (4, 4) scene_from_index and shape of the voxels whose centres lie in a (2, 3) box of the scene, or in a
-    box of voxels around it if the grid is rotated."""
+    """Return (4, 4) scene_from_index and shape of the part of a grid whose voxel centres lie in the box ``bounds``.
+
+    ``bounds`` is (2, 3), in scene units. For a rotated grid, the part is a block of voxels around the box.
+    """
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)
     index = corners @ back[:3, :3].T + back[:3, 3]
@@ -62,7 +64,7 @@ def density_grid(
     """Return (X, Y, Z) float32 extinctions, 1/scene unit, at ``scene_from_index @ (i, j, k, 1)``; on the CPU.
 
     A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on all cores; any other
-    density is evaluated in blocks. Needs a few MB in addition to the grid.
+    density is evaluated in blocks. Memory in addition to the grid is a few MB.
 
     Args:
         conditions: conditions of the frame, e.g. ``{"time": tensor(0.5)}``.
@@ -94,7 +96,7 @@ def density_grid(
 
 
 def density_at(model: Primitives, conditions: Conditions, points: Tensor) -> Tensor:
-    """Return (M,) float64 extinctions, 1/scene unit, at (M, 3) points. Slow, as it visits every primitive."""
+    """Return the model's (M,) float64 extinctions, 1/scene unit, at (M, 3) points. Slow: visits every primitive."""
     with torch.no_grad():
         active = model.to(device.HOST).active(conditions, torch.float64)
         geometry = active.geometry

@@ -1,4 +1,4 @@
-"""Ground truth of a model's extinction: the voxel files of a scene, their placement, and errors against them."""
+"""Ground truth for a model's extinction: the voxel files of a scene, their placement, and errors of a model."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ from neuprim.core.volumes.density_grid import density_grid
 __all__ = ["DensityGridPlacement", "DensityGridSource", "DensityTruth", "GridExtent", "TruthFrame"]
 
 DENSITY_ERRORS = ("correlation", "relative_l2", "psnr_active", "max_error")
-"""Names of the numbers of :meth:`DensityComparison.errors`."""
+"""Names of the errors that :meth:`DensityComparison.errors` returns."""
 
 _BLOCK_POINTS = 1 << 22  # 16 MiB of each grid
 _MIN_SQUARED_ERROR = 1e-20  # share of the squared peak: 200 dB, so that no number is infinite
 
 
 class GridExtent(NamedTuple):
-    """Largest value and bounding box of the absorbing grid of one frame."""
+    """Largest value and bounding box of the absorbing grid (the grid of extinctions) in one frame."""
 
     largest: float  # largest value
     box: np.ndarray | None  # (2, 3) box around the active voxels, world units; None without any
 
     @staticmethod
     def around(extents: Sequence[GridExtent]) -> GridExtent:
-        """Return the extent of several frames together."""
+        """Return the extent that covers several frames: the largest value and the common bounding box."""
         boxes = [extent.box for extent in extents if extent.box is not None]
         box = np.stack([np.min([b[0] for b in boxes], 0), np.max([b[1] for b in boxes], 0)]) if boxes else None
         return GridExtent(max((extent.largest for extent in extents), default=0.0), box)
@@ -42,16 +42,16 @@ class GridExtent(NamedTuple):
 
 @dataclass(frozen=True)
 class DensityGridPlacement:
-    """Placement of the voxel files of a scene, and meaning of their values.
+    """Position of a scene's voxel files in scene coordinates, and meaning of their values.
 
     Attributes:
         scene_from_world: (4, 4) float64 transform.
-        numbers: numbers of the frames.
-        times: name -> value per frame of the condition that tells frames apart, e.g. ``{"time": [0.0, 0.5, 1.0]}``.
+        numbers: number of each frame.
+        times: condition that differs between frames -> its value per frame, e.g. ``{"time": [0.0, 0.5, 1.0]}``.
         sigma_per_unit: extinction, 1/scene unit, of a grid value of 1.
         grid: name of the absorbing grid.
-        exact: whether that grid alone makes the extinction; if not, other grids add to it.
-        component: name of the grid's part of the extinction in models.
+        exact: whether the extinction comes from that grid alone; if False, other grids add to the extinction.
+        component: name, in models, of the part of the extinction that comes from the grid.
         extents: extents of the grid in every frame; empty if unknown.
     """
 
@@ -65,13 +65,13 @@ class DensityGridPlacement:
     extents: Sequence[GridExtent] = ()
 
     def matches(self, other: DensityGridPlacement) -> bool:
-        """Return whether both describe the same frames, places and values."""
+        """Return whether ``other`` describes the same frames, positions and values."""
         keys = ("scene_from_world", "numbers", "sigma_per_unit", "grid", "exact")
         mine, theirs = self.to_json(), other.to_json()
         return all(mine[key] == theirs[key] for key in keys)
 
     def to_json(self) -> dict[str, Any]:
-        """Return plain numbers, exact when read back."""
+        """Return the placement as JSON-able values, which :meth:`from_json` restores exactly."""
         return {
             "scene_from_world": self.scene_from_world.tolist(),
             "numbers": list(self.numbers),
@@ -135,8 +135,8 @@ class DensityTruth(ABC):
     """Base class of ground-truth extinctions, which can be sampled on any regular grid.
 
     Attributes:
-        frames: frames in order, one or more.
-        bounds: (2, 3) float64 box around everything, scene units.
+        frames: the frames in order, one or more.
+        bounds: (2, 3) float64 box around the extinction of all frames, scene units.
     """
 
     frames: Sequence[TruthFrame]
@@ -144,9 +144,9 @@ class DensityTruth(ABC):
 
     @abstractmethod
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
-        """Return the grid on which models are compared with a frame, the voxels of a file; None for an empty frame.
+        """Return the grid on which a model is compared with a frame, e.g. a file's voxels; None for an empty frame.
 
-        The grid is a (4, 4) float64 scene_from_index and a shape.
+        The grid is a (4, 4) float64 matrix scene_from_index and a shape.
         """
 
     @abstractmethod
@@ -156,7 +156,7 @@ class DensityTruth(ABC):
         """Return the (X, Y, Z) float32 extinction, 1/scene unit, at the points ``scene_from_index @ (i, j, k, 1)``.
 
         Args:
-            component: name of a source grid, for its part alone; None for all.
+            component: name of a source grid, for the extinction from this grid alone; None for all of it.
         """
 
 
@@ -171,10 +171,10 @@ class DensityGridSource(DensityTruth):
 
     @abstractmethod
     def open_files(self, path: Path) -> DensityTruth:
-        """Return another file or folder of frames, read by the same rules and placed like these.
+        """Return the ground truth in another file or folder, with the same reading rules and placement.
 
         Raises:
-            DataError: nothing in ``path`` fits.
+            DataError: no file in ``path`` can be read by these rules.
         """
 
 
@@ -182,7 +182,7 @@ class DensityGridSource(DensityTruth):
 
 
 class DensityComparison:
-    """Float64 sums over the points of a grid, added block by block, that determine all errors."""
+    """Accumulate errors of a model's extinction against the truth, block by block, as float64 sums over grid points."""
 
     def __init__(self) -> None:
         self.points = self.active = 0
@@ -203,11 +203,11 @@ class DensityComparison:
         self.worst = max(self.worst, float(np.abs(wrong).max(initial=0.0)))
 
     def errors(self) -> dict[str, float] | None:
-        """Return name -> number of each of :data:`DENSITY_ERRORS`; None if the truth is the same everywhere.
+        """Return name -> value for each of :data:`DENSITY_ERRORS`; None if the truth is the same everywhere.
 
-        ``correlation`` is Pearson's, ``relative_l2`` |values - truth| / |truth|, both over all points; ``psnr_active``
-        is over those where the truth is not 0, relative to its largest value; ``max_error`` is the largest error
-        anywhere, as a share of that value.
+        ``correlation`` is Pearson's and ``relative_l2`` is |values - truth| / |truth|, both over all points.
+        ``psnr_active`` is over the points where the truth is not 0, with the largest true value as peak. ``max_error``
+        is the largest error of all points, divided by that peak.
         """
         n = max(self.points, 1)
         a, b, aa, bb, ab = (float(x) for x in self.sums)
@@ -229,10 +229,12 @@ def measure_density_errors(
     threads: int = 0,
     component: str | None = None,
 ) -> dict[str, float] | None:
-    """Compare the model under ``conditions`` with a frame of the truth, see :meth:`DensityComparison.errors`.
+    """Return the errors of the model under ``conditions`` against a frame of the truth.
+
+    The result is that of :meth:`DensityComparison.errors`.
 
     Args:
-        component: compare this part of both extinctions.
+        component: name of a source grid; compares only the extinction from this grid. None: all.
     """
     place = truth.points(frame)
     if place is None:
@@ -248,7 +250,7 @@ def measure_density_errors(
 def split_density_grid_planes(
     scene_from_index: Tensor, shape: tuple[int, int, int]
 ) -> list[tuple[Tensor, tuple[int, int, int]]]:
-    """Return the grid in parts of whole planes, each a scene_from_index and a shape."""
+    """Split a grid into blocks of whole planes; return scene_from_index and shape of each block."""
     planes = max(1, _BLOCK_POINTS // max(1, shape[1] * shape[2]))
     parts = []
     for x in range(0, shape[0], planes):

@@ -1,9 +1,9 @@
 """A model's extinction and source radiance at scattered points of one frame, differentiable.
 
-sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside their ellipsoids, and the source q(x) = sum of
-sigma_i(x) c_i, whose image along a ray is the integral of T q. c_i is the part of a primitive's colour that does not
-depend on direction. A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in compiled code on the
-CPU; on a GPU, and for any other density, torch code evaluates it pair by pair.
+The extinction is sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside their ellipsoids. The source
+radiance is q(x) = sum of sigma_i(x) c_i; the colour of a ray is the integral of T q. c_i is the part of a primitive's
+colour that does not depend on direction. A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in
+compiled code on the CPU. On a GPU, and for any other density, torch code evaluates each pair of point and primitive.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from neuprim.core.volumes.points_cpu import NOT_FINITE, CosinePointValues, Point
 
 
 class PointShares:
-    """Each primitive's contribution to the values and to an error; the backward pass fills it.
+    """Contribution of each primitive of a frame to the extinction at points, and to an error.
+
+    The backward pass fills ``weight`` and ``error_weight``.
 
     Attributes:
-        error: (M,) any measure of error at each point.
-        weight, error_weight: (N,) sums over points of sigma_i, and of sigma_i x error, of the primitives of the frame.
+        error: (M,) error at each point, in any measure.
+        weight, error_weight: (N,) sums over points of sigma_i, and of sigma_i x error.
     """
 
     def __init__(self, count: int, device: torch.device) -> None:
@@ -41,9 +43,9 @@ class PointValues(NamedTuple):
     Attributes:
         sigma: (M,) extinction, 1/scene unit.
         source: (M, C) sigma times colour; None if not requested, or if all of the colour depends on direction.
-        rows: (N,) int64 rows of the model that are active in the frame, None for all.
-        shares: of these primitives; zeros until a backward pass.
-        components: name -> (M,) the part of sigma that comes from the source grid of that name.
+        rows: (N,) int64 rows of the primitives that are active in the frame, None for all.
+        shares: contributions of the active primitives; zeros until a backward pass.
+        components: name of a source grid -> (M,) part of sigma that comes from this grid.
     """
 
     sigma: Tensor
@@ -53,7 +55,10 @@ class PointValues(NamedTuple):
     components: dict[str, Tensor]
 
     def request_shares(self, error: Tensor) -> PointShares:
-        """Return the shares of each primitive in an ``error`` (M,) without gradient; the backward pass fills them."""
+        """Return the contribution of each primitive to ``error`` (M,), which gets no gradient.
+
+        The backward pass fills the result.
+        """
         self.shares.error = error.detach()
         return self.shares
 
@@ -61,14 +66,16 @@ class PointValues(NamedTuple):
 def volume_values_at(
     model: Primitives, conditions: Conditions, points: Tensor, colour: bool = True, threads: int = 0
 ) -> PointValues:
-    """Return the values at (M, 3) ``points``, scene units, in one frame; no gradient for the points.
+    """Return extinction and source radiance of a model at ``points`` (M, 3), scene units, in one frame.
+
+    Differentiable with respect to the parameters, not the points.
 
     Args:
-        colour: whether to compute the source.
-        threads: 0 for all cores; the result does not depend on it.
+        colour: whether to compute the source radiance.
+        threads: number of threads, 0 for all cores; the result does not depend on it.
 
     Raises:
-        NonFiniteError: a parameter is NaN or infinite, or so large that the values are.
+        NonFiniteError: a parameter is NaN or infinite, or so large that the values are NaN or infinite.
     """
     active = model.active(conditions)
     geometry, count = active.geometry, active.geometry.count
@@ -132,8 +139,8 @@ def _torch_density_point_values(
 
 
 def find_point_pairs(geometry: Geometry, cells: PointCells) -> tuple[Tensor, Tensor]:
-    """Return (P,) int64 rows of ``cells.points`` and of primitives that contain them, primitive by primitive, on the
-    device of the geometry; synchronises three times."""
+    """Return the P pairs of a point and a primitive that contains it: (P,) int64 rows of ``cells.points``, and of
+    primitives, primitive by primitive. Runs on the device of the geometry; synchronises three times."""
     means, scales, axes = (x.detach().double() for x in (geometry.means, geometry.scales, geometry.rotations.double()))
     starts, low, counts, points = (
         device.copy_to_device(torch.from_numpy(x), means.device)

@@ -24,9 +24,9 @@ class PointCells(NamedTuple):
     """Points sorted into a uniform grid.
 
     Attributes:
-        order: (M,) int64, the points cell by cell.
-        points: (M, 3) float64 in that order.
-        starts: (X Y Z + 1,) int64, where each cell's points begin.
+        order: (M,) int64 indices of the given points, cell by cell.
+        points: (M, 3) float64 points in that order.
+        starts: (X Y Z + 1,) int64 position in ``points`` of each cell's first point.
         low: (3,) float64 corner; step: edge of a cell; counts: (3,) int64.
     """
 
@@ -39,7 +39,7 @@ class PointCells(NamedTuple):
 
 
 def sort_points_into_cells(points: np.ndarray) -> PointCells:
-    """Return a grid over (M, 3) points, fine enough that a cell holds few of them."""
+    """Sort (M, 3) points into a grid, so fine that each cell contains few points."""
     if len(points) == 0:
         points, low, step, counts = np.zeros((0, 3)), np.zeros(3), 1.0, np.ones(3, np.int64)
     else:

@@ -1,6 +1,6 @@
-"""Executors of tasks: processes of this machine (concurrent.futures), a Ray cluster, or Slurm (submitit).
+"""Executors of a launcher's tasks: processes of this machine (concurrent.futures), a Ray cluster, or Slurm (submitit).
 
-All machines of a cluster need neuprim, and the output directory under the same path.
+Every machine of a cluster needs neuprim, and access to the output directory under the same path.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ _SLURM_MINUTES = 24 * 60
 
 
 class WorkerDied(Exception):
-    """The worker process of a task died; the text says what is known."""
+    """The worker process of a task died. The message says what is known about the cause."""
 
 
 def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """Return (parallel jobs, threads per job) on this machine.
+    """Divide this machine's cores among jobs; return (parallel jobs, threads per job).
 
     Raises:
-        ConfigError: together they would need more than the cores of this machine.
+        ConfigError: the requested jobs and threads need more cores than this machine has.
     """
     cores, workers, threads = machine_cores(), settings.workers, settings.threads
     if workers is None:
@@ -61,10 +61,10 @@ def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int,
 
 
 def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """Return (parallel jobs, threads per job, 0 for all) to plan with; raises as :func:`divide_cores_among_jobs`.
+    """Return the expected (parallel jobs, threads per job) of a launcher; 0 threads means all cores.
 
-    The free resources of a cluster are unknown. There the user's settings count; the default is as many jobs as this
-    machine has cores, with one thread each.
+    On a cluster, whose free resources are unknown, these are the user's settings. Their defaults are as many jobs as
+    this machine has cores, and one thread per job. Raises the errors of :func:`divide_cores_among_jobs`.
     """
     if settings.name == "inline":
         return 1, settings.threads or 0
@@ -79,14 +79,14 @@ def _one_line(error: BaseException) -> str:
 
 
 def _cannot_begin(error: BaseException) -> JobResult:
-    """Return the result of a job whose worker lacks a package; errors of the job itself are results already."""
+    """Return the failed result of a job whose worker lacks a package. Errors inside a job are results already."""
     return JobResult("failed", line=f"the worker cannot do it: {str(error).strip().splitlines()[-1]}", trace=str(error))
 
 
 class ProcessExecutor:
     """Executor of ``launcher=processes``: worker processes that are reused from one task to the next.
 
-    Each is a pool of one process: when the system kills a process, its pool breaks and no other.
+    Each worker is a pool with one process. If the system kills the process, only that pool breaks.
 
     Args:
         folder: folder for the workers' logs.
@@ -103,7 +103,7 @@ class ProcessExecutor:
         self._busy: dict[Future[JobResult], ProcessPoolExecutor] = {}
 
     def submit(self, task: WorkerTask) -> Future[JobResult]:
-        """Start a task."""
+        """Start a task in an idle worker, or in a new one."""
         pool = self._idle.pop() if self._idle else self._new_pool()
         try:
             future = pool.submit(task)
@@ -114,7 +114,7 @@ class ProcessExecutor:
         return future
 
     def result(self, future: Future[JobResult]) -> JobResult:
-        """Return the result of a future that is done. Raises WorkerDied."""
+        """Return the result of a finished task. Raises WorkerDied."""
         pool = self._busy.pop(future)
         try:
             result = future.result()
@@ -128,10 +128,10 @@ class ProcessExecutor:
         return result
 
     def cancel(self, future: Future[JobResult]) -> None:
-        """Remove a task that has not begun from the queue. Here there is no queue: tasks stop by themselves."""
+        """Remove a task that has not started from the queue. Does nothing here, because this executor has no queue."""
 
     def close(self, now: bool) -> None:
-        """Release all workers; ``now`` kills those that still work."""
+        """End all workers; ``now`` kills workers that still run a task."""
         for pool in self._busy.values() if now else ():
             for process in list((pool._processes or {}).values()):
                 process.kill()
@@ -154,8 +154,8 @@ class RayExecutor:
     """Executor of ``launcher=ray``: tasks of Ray, on this machine or on a cluster.
 
     Raises:
-        BackendUnavailable: no Ray answers at the address.
-        ConfigError: options that Ray refuses, or more threads than any of its machines has.
+        BackendUnavailable: no Ray cluster answers at the address.
+        ConfigError: Ray refuses an option, or a job needs more threads than any machine of the cluster has.
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:
@@ -214,7 +214,7 @@ def _connect_to_ray(ray: Any, address: str) -> None:
 
 
 def _check_ray_address(address: str) -> None:
-    """Raise BackendUnavailable where nothing listens at ``HOST:PORT`` or ``ray://HOST:PORT``."""
+    """Raise BackendUnavailable if nothing listens at the address ``HOST:PORT`` or ``ray://HOST:PORT``."""
     if address == "auto":
         return
     try:
@@ -228,7 +228,7 @@ def _check_ray_address(address: str) -> None:
 
 
 def _divide_ray_cluster_among_jobs(ray: Any, settings: LauncherSettings, jobs: int) -> tuple[int, int]:
-    """Return (parallel jobs, threads per job); jobs that the cluster has no cores for wait in Ray's queue."""
+    """Return (parallel jobs, threads per job) on a Ray cluster. Jobs without free cores wait in Ray's queue."""
     machines = [node["Resources"].get("CPU", 0) for node in ray.nodes() if node["Alive"]]
     if len(machines) == 1 and settings.address is None:
         return divide_cores_among_jobs(settings, jobs)
@@ -248,11 +248,11 @@ class SlurmExecutor:
     """Executor of ``launcher=slurm``: Slurm jobs, or with ``launcher.address=local`` processes of this machine.
 
     Args:
-        folder: folder for submitit's files, which workers can access.
+        folder: folder for submitit's files; workers need access to it.
 
     Raises:
-        BackendUnavailable: there is no Slurm here.
-        ConfigError: parameters that submitit does not know.
+        BackendUnavailable: Slurm is not available on this machine.
+        ConfigError: submitit does not know an option.
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:

@@ -1,9 +1,9 @@
 """Jobs, their status and results, and the worker process that performs a job.
 
-A job names a function and has plain values as its arguments. A worker has its share of the cores. It communicates with
-its launcher by files in a shared folder: one has the status of a job, another one asks the worker to stop. This works
-between processes, containers and machines alike. This module imports nothing heavy, so that a worker can set its
-number of threads before libraries read it.
+A job is the name of a function and plain values as its arguments. A worker communicates with its launcher by files in
+a shared folder: one file has the status of a job, another one asks the worker to stop. Files work between processes,
+containers and machines. This module imports no large library, so that a worker can set its number of threads before
+such a library reads it.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ if TYPE_CHECKING:
     from neuprim.runs.fit import Event, Events
 
 ENDED = ("done", "failed", "interrupted")
-"""States of a job that is over."""
+"""States of a job that has ended."""
 
 _CACHE_VARIABLES = ("NEUPRIM_CACHE_DIR", "NUMBA_CACHE_DIR")
-"""Environment variables that the launcher passes to its workers; a cluster may not do that."""
+"""Environment variables that the launcher passes to its workers, because a cluster may not pass them."""
 
 _THREAD_VARIABLES = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS")
 """Environment variables with the number of threads; libraries read them when they are loaded."""
@@ -55,10 +55,10 @@ class LaunchJob:
     """A function call that a worker performs.
 
     Attributes:
-        name: unique among those launched together, and valid as a file name.
-        call: ``module:function``, which is called with ``data``, the number of times that its worker died before, and a
-            listener of events. If its worker died before, it should continue where it was left.
-        data: numbers, texts, lists, dictionaries and paths. Objects of plugins are named, not sent.
+        name: unique name among the jobs launched together, valid as a file name.
+        call: ``module:function``. The function is called with ``data``, the number of times that the job's worker died
+            before, and a listener of events. After a worker died, it should continue where the worker stopped.
+        data: numbers, texts, lists, dictionaries and paths. Plugins are passed by name.
     """
 
     name: str
@@ -72,10 +72,10 @@ class JobResult:
 
     Attributes:
         state: done, failed or interrupted.
-        value: what its function returned.
-        line: why it failed.
-        trace: traceback of a bug; empty if the input is at fault.
-        seconds: from its start to its end in the worker.
+        value: return value of the job's function.
+        line: one line that says why the job failed.
+        trace: traceback of a bug; empty if the input is wrong.
+        seconds: time from the job's start to its end in the worker.
         attempts: number of starts.
     """
 
@@ -89,14 +89,14 @@ class JobResult:
 
 @dataclass(frozen=True)
 class JobStatus:
-    """Status of a job.
+    """Status of a job: its state and progress while it runs.
 
     Attributes:
         state: waiting, starting, preparing, training, finishing, or one of :data:`ENDED`.
-        text: what it does, or why it ended.
+        text: what the job does now, or why it ended.
         step, progress: training step, and the used fraction of the training's budget, 0..1.
-        psnr: last point of the held-out curve, dB.
-        attempt: how often its worker died before.
+        psnr: PSNR at the last measurement of held-out views, dB.
+        attempt: how often the job's worker died before.
     """
 
     state: str = "waiting"
@@ -107,12 +107,12 @@ class JobStatus:
     attempt: int = 0
 
     def end(self, result: JobResult) -> JobStatus:
-        """Return the last status of a job with this result."""
+        """Return the final status of a job that ended with this result."""
         return replace(self, state=result.state, text=result.line, attempt=result.attempts - 1)
 
 
 def perform_job(job: LaunchJob, attempt: int, events: Events) -> JobResult:
-    """Perform a job in this process and return its result, which includes errors and Ctrl-C."""
+    """Perform a job in this process; return its result. Errors and Ctrl-C become a part of the result."""
     start = time.monotonic()
 
     def result(state: str, value: Any = None, line: str = "", trace: str = "") -> JobResult:
@@ -134,7 +134,7 @@ def perform_job(job: LaunchJob, attempt: int, events: Events) -> JobResult:
 
 
 class StatusListener:
-    """Event listener that turns the events of a run into its status, and passes it to ``on_status``."""
+    """Listener that turns the events of a run into the status of its job, and calls ``on_status`` with it."""
 
     def __init__(self, attempt: int = 0, on_status: Callable[[JobStatus], None] = lambda status: None) -> None:
         self.status, self._on_status = JobStatus("starting", attempt=attempt), on_status
@@ -158,7 +158,7 @@ class StatusListener:
 
 
 def write_status(file: Path, status: JobStatus) -> None:
-    """Replace a status file. Errors are ignored: a full disk must not end a run because of its display."""
+    """Replace a status file. Errors are ignored, because a run must not end when its status cannot be written."""
     staged = file.with_name(f".{file.name}.{os.getpid()}")
     try:
         staged.write_text(json.dumps(asdict(status)), encoding="utf-8")
@@ -180,25 +180,25 @@ def read_status(file: Path) -> JobStatus | None:
 
 
 def worker_cache_variables() -> dict[str, str]:
-    """Return the environment variables that a worker gets from its launcher."""
+    """Return the environment variables that set cache folders; a launcher passes them to its workers."""
     return {name: os.environ[name] for name in _CACHE_VARIABLES if name in os.environ}
 
 
 def worker_environment(threads: int) -> dict[str, str]:
-    """Return the environment variables of a worker with this number of threads."""
+    """Return a worker's environment variables: cache folders, and the number of threads of numerical libraries."""
     return worker_cache_variables() | dict.fromkeys(_THREAD_VARIABLES, str(threads))
 
 
 @dataclass(frozen=True)
 class WorkerTask:
-    """A job with everything that its worker needs; the worker calls it.
+    """A job with the settings of its worker. The worker calls the task to perform the job.
 
     Attributes:
-        threads: its share of the cores.
-        status: file for its status. stop: file whose presence asks it to stop.
+        threads: number of threads that the job may use.
+        status: file for the job's status. stop: the job stops when this file exists.
         cwd: folder that relative paths refer to.
-        variables: environment variables, set before anything heavy is imported.
-        attempt: how often its worker died before.
+        variables: environment variables, set before large libraries are imported.
+        attempt: how often the job's worker died before.
     """
 
     job: LaunchJob
@@ -210,7 +210,7 @@ class WorkerTask:
     attempt: int = 0
 
     def checkpoint(self) -> Any:
-        """Return the continued task, which submitit queues when Slurm preempts the job or its time is up."""
+        """Return a task that continues this one; submitit queues it after Slurm preempted the job or its time is up."""
         from submitit.helpers import DelayedSubmission
 
         return DelayedSubmission(replace(self, attempt=self.attempt + 1))
@@ -234,7 +234,7 @@ class WorkerTask:
 
 @contextmanager
 def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]:
-    """Run a thread that writes the task's status, and interrupts the main thread when the stop file appears."""
+    """Run a thread that writes the task's status, and that interrupts the main thread when the stop file appears."""
     over, blocked = threading.Event(), _worker_blocks_interrupts()
 
     def watch() -> None:
@@ -264,11 +264,11 @@ def _report_status(task: WorkerTask, listener: StatusListener) -> Iterator[None]
 
 @contextmanager
 def interruptible_run(terminated: bool = False) -> Iterator[threading.Event]:
-    """Yield an event that the first Ctrl-C sets; the second one interrupts at once. Outside the main thread nothing
-    changes.
+    """Yield an event that the first Ctrl-C sets; a second Ctrl-C raises KeyboardInterrupt. Outside the main thread the
+    handling of Ctrl-C does not change.
 
     Args:
-        terminated: whether SIGTERM counts as Ctrl-C: torchrun sends it when it is stopped, or one of its processes
+        terminated: whether SIGTERM acts like Ctrl-C. torchrun sends SIGTERM when it is stopped or one of its processes
             ended.
     """
     stop = threading.Event()
@@ -291,10 +291,10 @@ def interruptible_run(terminated: bool = False) -> Iterator[threading.Event]:
 
 
 def _interrupt_worker_main_thread(blocked: bool = False) -> None:
-    """Interrupt the main thread as Ctrl-C does: a run finishes its step and writes a checkpoint.
+    """Interrupt the main thread like Ctrl-C: a run finishes its step and writes a checkpoint.
 
     Args:
-        blocked: whether the main thread blocks that signal, as under Ray; then it first finishes a wait.
+        blocked: whether the main thread blocks SIGINT, as under Ray; a wait in progress is then finished first.
     """
     main = threading.main_thread().ident
     if hasattr(signal, "pthread_kill") and main is not None and not blocked:
@@ -304,8 +304,8 @@ def _interrupt_worker_main_thread(blocked: bool = False) -> None:
 
 
 def _worker_blocks_interrupts() -> bool:
-    """Return whether the main thread, which calls this, blocks SIGINT. If SIGINT is ignored, as in the background of a
-    script, restore its default handler first."""
+    """Return whether the main thread blocks SIGINT; call it from the main thread. If SIGINT is ignored, as in a
+    background job of a script, the default handler is restored first."""
     if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     return hasattr(signal, "pthread_sigmask") and signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ())
@@ -315,8 +315,8 @@ def _worker_blocks_interrupts() -> bool:
 
 
 def start_worker_process(log: Path, variables: Mapping[str, str]) -> None:
-    """Prepare a new process: it does not receive the terminal's Ctrl-C, which the launcher passes on, writes its output
-    to a file, and ends when the launcher is gone."""
+    """Prepare a new worker process: ignore the terminal's Ctrl-C (the launcher forwards it), write the output to a
+    file, and end when the launcher has ended."""
     os.environ.update(variables)
     if hasattr(os, "setsid"):
         os.setsid()

@@ -1,4 +1,4 @@
-"""Launch many jobs: in this process, in others, on a Ray cluster or under Slurm."""
+"""Launch many jobs: in this process, in other processes, on a Ray cluster or under Slurm."""
 
 from __future__ import annotations
 
@@ -29,28 +29,28 @@ from neuprim.runs.launch.jobs import (
 )
 
 LAUNCH_FOLDER = "launch"
-"""Folder in a sweep's directory: status files while it works, and the logs of workers that printed something."""
+"""Folder in a sweep's directory for status files during the work, and for logs of workers that printed something."""
 
 OnStatus = Callable[[int, JobStatus], None]
-"""Called with the number of a job and its status, whenever it is new."""
+"""Called with the number of a job and its status, whenever the status changes."""
 
 OnResult = Callable[[int, JobResult], None]
-"""Called with the number of a job and its result, before its last status."""
+"""Called with the number of a job and its result, before the final status of the job."""
 
 _INTERVAL = 0.1
 """Seconds between two checks of the running jobs."""
 
 
 def ignore_status(number: int, status: JobStatus) -> None:
-    """Do nothing."""
+    """Ignore a job's status: the default of ``on_status``."""
 
 
 def check_launcher(settings: LauncherSettings, jobs: int) -> None:
-    """Raise an error if the launcher cannot work here, before anything is written.
+    """Check that the launcher can run ``jobs`` jobs here, before any file is written.
 
     Raises:
         BackendUnavailable: the launcher needs a package that is not installed.
-        ConfigError: more workers than this machine has cores.
+        ConfigError: the workers need more cores than this machine has.
     """
     if settings.name == "processes":
         divide_cores_among_jobs(settings, jobs)
@@ -66,7 +66,7 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
 
 
 def use_launcher_threads_for_runs(settings: LauncherSettings) -> AbstractContextManager[None]:
-    """Limit this process to ``launcher.threads`` if runs work in it (``launcher=inline``); otherwise do nothing."""
+    """Limit this process to ``launcher.threads`` threads if runs work in it (``launcher=inline``); else do nothing."""
     own = settings.name == "inline" and settings.threads is not None
     return limit_process_threads(settings.threads or 1) if own else nullcontext()
 
@@ -81,20 +81,19 @@ def launch_jobs(
 ) -> list[JobResult | None]:
     """Perform all jobs with a launcher.
 
-    The first Ctrl-C stops every job as it stops a run, which finishes its step and writes a checkpoint; the second ends
-    their processes.
+    At the first Ctrl-C every run finishes its step and writes a checkpoint. A second Ctrl-C ends the processes.
 
     Args:
-        folder: shared folder of launcher and workers, under the same path for all. It is removed afterwards, unless
-            workers printed something.
-        stop_at_failure: whether the first job that fails stops the others as Ctrl-C does.
+        folder: shared folder of launcher and workers, under the same path on all machines. It is removed afterwards,
+            unless workers printed something.
+        stop_at_failure: whether the first job that fails stops the others like Ctrl-C.
 
     Returns:
-        results in the order of the jobs; None for those that did not start.
+        Results in the order of the jobs; None for jobs that did not start.
 
     Raises:
         BackendUnavailable: the launcher needs a package that is not installed, or cannot be reached.
-        ConfigError: more workers than this machine has cores, or an option that the launcher refuses.
+        ConfigError: the workers need more cores than this machine has, or the launcher refuses an option.
     """
     check_launcher(settings, len(jobs))
     if not jobs:
@@ -120,7 +119,7 @@ def launch_jobs(
 def _launch_inline(
     jobs: Sequence[LaunchJob], on_status: OnStatus, on_result: OnResult, stop_at_failure: bool
 ) -> list[JobResult | None]:
-    """Perform one job after the other in this process, until Ctrl-C or, with ``stop_at_failure``, a failure."""
+    """Perform the jobs one after the other in this process, until Ctrl-C or, with ``stop_at_failure``, a failure."""
     results = list[JobResult | None]([None] * len(jobs))
     for number, job in enumerate(jobs):
         listener = StatusListener(on_status=partial(on_status, number))
@@ -175,7 +174,7 @@ class _JobLoop:
         return self.results
 
     def _step(self) -> None:
-        """Submit waiting tasks to free workers, and check the running ones."""
+        """Submit waiting tasks to free workers, and check the status of running tasks."""
         while self.waiting and len(self.running) < self.executor.workers:
             number, task = self.waiting.popleft()
             task.status.unlink(missing_ok=True)

@@ -1,14 +1,14 @@
 """The built-in smoke scenes, simulated as sequences of OpenVDB files.
 
-    NAME_0.vdb ... NAME_{T-1}.vdb     fog volumes of half floats, Blosc, numbers not padded, as EmberGen writes them
+    NAME_0.vdb ... NAME_{T-1}.vdb     fog volumes of half floats, Blosc; numbers without padding, as by EmberGen
 
     density        amount of smoke
-    temperature    0 is the air's
-    flames         fuel that is burning (scenes with fire)
+    temperature    0 is the temperature of the air
+    flames         burning fuel (scenes with fire)
     color          albedo of the smoke, vec3s, not multiplied by density (scenes with colours)
 
-Values are about 0 to 1. Voxels are cubes; the box is one world unit wide and deep, centred at x = y = 0, its ground at
-z = 0, z up. A scene gives sources and forces over time, with smooth random turbulence.
+Values are about 0 to 1. Voxels are cubes. The box is one world unit wide and deep, centred at x = y = 0, its ground at
+z = 0, z up. Each scene defines sources and forces over time, with smooth random turbulence.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ _PERIOD = 16  # lattice nodes per axis before the noise repeats
 class TurbulenceNoise:
     """Value noise (random numbers on a lattice, smoothly interpolated) with mean 0 and unit variance at the nodes.
 
-    A pure function of seed, channel, place and time, whatever the steps and the resolution. Channels are independent.
-    ``cells`` are lattice cells per world unit; ``tempo`` is how often per second one field has turned into the next.
+    The noise depends only on seed, channel, position and time, not on time steps or resolution. Channels are
+    independent. ``cells``: lattice cells per world unit. ``tempo``: new random fields per second.
     """
 
     def __init__(self, seed: int) -> None:
@@ -66,7 +66,7 @@ class TurbulenceNoise:
         return torch.from_numpy(numbers.astype(np.float32))
 
     def field(self, channel: int, axes: Axes, cells: float, tempo: float, time: float) -> Tensor:
-        """Return (X, Y, Z) noise of one channel at a time in seconds."""
+        """Return (X, Y, Z) noise of one channel at ``time``, seconds."""
         phase = max(time, 0.0) * tempo
         key = math.floor(phase)
         angle = (phase - key) * math.pi / 2
@@ -81,13 +81,13 @@ class TurbulenceNoise:
         return torch.stack([field * 0.5**k for k, field in enumerate(fields)]).sum(0)
 
     def vector(self, channel: int, axes: Axes, cells: float, tempo: float, time: float, octaves: int = 2) -> Tensor:
-        """Return three independent :meth:`fractal` fields, (3, X, Y, Z)."""
+        """Return a (3, X, Y, Z) vector field of three independent :meth:`fractal` fields."""
         channels = (channel + 1009 * (k + 1) for k in range(3))
         return torch.stack([self.fractal(c, axes, cells, tempo, time, octaves) for c in channels])
 
 
 def _smoke_lattice_weights(places: Tensor) -> Tensor:
-    """Return (n, _PERIOD) lattice weights; a cubic fade makes slopes continuous."""
+    """Return (n, _PERIOD) interpolation weights of lattice nodes; cubic, so that slopes are continuous."""
     lower = places.floor()
     part = places - lower
     part = part * part * (3 - 2 * part)
@@ -100,9 +100,9 @@ def _smoke_lattice_weights(places: Tensor) -> Tensor:
 
 
 class SmokeStage:
-    """Simulation box with coordinates of its cells' centres, noise, and (X, Y, Z) ``fade`` per second.
+    """Simulation box of a smoke scene: coordinates of cell centres, noise, and (X, Y, Z) ``fade``, 1/s.
 
-    Near the sides and the top gas vanishes at the rate ``fade``, so that nothing is cut off there.
+    ``fade`` is the rate at which gas vanishes near the sides and the top, so that nothing is cut off there.
     """
 
     def __init__(self, box: SmokeBox, seed: int) -> None:
@@ -115,7 +115,7 @@ class SmokeStage:
     def region(
         self, low: tuple[float, float, float], high: tuple[float, float, float]
     ) -> tuple[tuple[slice, slice, slice], Axes]:
-        """Return slices and coordinates of the cells with centres in a world box, at least one per axis."""
+        """Return slices and coordinates of the cells whose centres lie in a world box, at least one per axis."""
         slices, axes = [], []
         for axis, (a, b) in enumerate(zip(low, high, strict=True)):
             line = self.axes[axis].reshape(-1)
@@ -129,9 +129,9 @@ class SmokeStage:
 
 @dataclass(frozen=True)
 class SmokeScene:
-    """A simulated scene: number of frames, seconds per frame, grids to write, and gas.
+    """A simulated smoke scene: number of frames, seconds per frame, grids to write, and gas properties.
 
-    The module describes the grids. ``forcing`` returns sources and forces at a time in seconds.
+    The module describes the grids. ``forcing`` returns sources and forces at a given time, seconds.
     """
 
     name: str
@@ -143,7 +143,7 @@ class SmokeScene:
 
     @property
     def coloured(self) -> bool:
-        """Whether the smoke has colours."""
+        """Whether smoke has colours, i.e. the scene writes the grid ``color``."""
         return "color" in self.grids
 
 
@@ -265,7 +265,7 @@ def _force_ground_explosion(stage: SmokeStage, time: float) -> GasForcing:
 
 
 def _fade_out(time: float, end: float, length: float) -> float:
-    """Return 1, falling linearly to 0 at ``end`` over the last ``length`` seconds."""
+    """Return a factor: 1, falling linearly to 0 at ``end`` over the last ``length`` seconds."""
     return min(1.0, max(0.0, (end - time) / length))
 
 
@@ -285,7 +285,7 @@ GROUND_EXPLOSION = SmokeScene(
 
 
 def _whirl_axis(height: Tensor, time: float) -> tuple[Tensor, Tensor]:
-    """Return x and y of the whirl's axis by height; the ground leads, the top follows and wanders less."""
+    """Return x and y of the whirl's axis at each height; higher parts follow with a delay and move less."""
     late = time - 0.55 * height
     reach = 0.13 * torch.exp(-0.35 * height)
     return reach * torch.sin(1.5 * late + 0.4), reach * torch.sin(1.05 * late + 2.0)
@@ -349,18 +349,18 @@ def simulate_smoke(
     cache_dir: Path,
     progress: Progress = lambda text, fraction: None,
 ) -> Path:
-    """Run a simulation unless its sequence is complete; return the folder ``cache_dir/sim-NAME-KEY``.
+    """Simulate a smoke scene unless its files exist; return the folder ``cache_dir/sim-NAME-KEY``.
 
     Equal arguments give equal grids on one machine for any number of threads.
 
     Args:
         name: one of :data:`SMOKE_SCENES`.
-        frames: number of frames from the start, at most :data:`MAX_TIMESTEPS`; None for all.
+        frames: number of frames from the start, at most :data:`MAX_TIMESTEPS`; None for the scene's number.
         resolution: cells across the box, which is 1.5 times as high as wide.
         seed: seed of the turbulence; not negative.
 
     Raises:
-        ConfigError: unknown scene.
+        ConfigError: there is no scene ``name``.
         DataError: the cache directory cannot be written.
     """
     if name not in SMOKE_SCENES:
@@ -386,7 +386,7 @@ def simulate_smoke(
 
 
 def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -> str:
-    """Return a hash of everything that the files depend on."""
+    """Return a hash of everything that the files of a simulation depend on."""
     settings = {
         "version": SOLVER_VERSION,
         "scene": scene.name,
@@ -402,12 +402,12 @@ def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -
 
 
 def smoke_box(resolution: int) -> SmokeBox:
-    """Return the box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
+    """Return the simulation box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
     return SmokeBox((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
 
 
 def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[VdbGrid]:
-    """Convert a state to the grids of the scene, in half floats, with faint values set to the background."""
+    """Convert a gas state to the scene's OpenVDB grids, in half floats; faint values become background."""
     half = box.cell * 0.5
     corner = (half - box.shape[0] * half, half - box.shape[1] * half, half)  # the centre of voxel 0
     transform = vdb_scale_transform(box.cell, corner)
@@ -428,7 +428,7 @@ def make_smoke_grids(state: GasState, scene: SmokeScene, box: SmokeBox) -> list[
 
 @contextmanager
 def _solve_smoke_on_one_thread() -> Iterator[None]:
-    """Run torch on one thread: the solver divides its work itself, and results must not depend on threads."""
+    """Run torch on one thread, since the solver uses its own threads and results must not depend on their number."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     try:

@@ -1,10 +1,10 @@
-"""The fluid solver: a staggered grid in a box, semi-Lagrangian transport, combustion, and an exact pressure projection.
+"""Fluid solver for smoke and fire: staggered grid in a box, semi-Lagrangian advection, combustion, exact projection.
 
 Marker-and-cell layout (Harlow and Welch 1965): scalars at the cells' centres, each velocity component at the centres of
-the faces that it crosses. Divergence and gradient are differences over one cell, and their product, the 7-point
-Laplacian, is a sum of one tridiagonal matrix per axis. Diagonalising these three small matrices solves Poisson's
+the faces that it crosses. Divergence and gradient are differences over one cell. Their product, the 7-point Laplacian,
+is a sum of one tridiagonal matrix per axis. Diagonalising these three small matrices solves the pressure's Poisson
 equation directly (Lynch, Rice and Thomas 1964, "Direct solution of partial difference equations by tensor product
-methods"): no iteration, no tolerance, and any mix of solid and open ends.
+methods"). The solution needs no iteration and no tolerance, and allows any combination of solid and open ends.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ _ENDS = ((True, True), (True, True), (False, True))
 
 @dataclass(frozen=True)
 class SmokeBox:
-    """X x Y x Z cubic cells over a solid ground; z is up.
+    """Simulation box of X x Y x Z cubic cells over a solid ground; z is up.
 
-    It is centred at x = y = 0 and stands on z = 0. Beyond its sides and its top the pressure is zero, and air goes in
-    and out; nothing flows through the ground. ``cell`` is the edge of a cell in world units.
+    The box is centred at x = y = 0 and stands on z = 0. Outside its sides and top, the pressure is zero and air can
+    flow in and out. Nothing flows through the ground. ``cell`` is the edge of a cell in world units.
     """
 
     shape: tuple[int, int, int]
@@ -53,9 +53,9 @@ class SmokeBox:
 
     @cached_property
     def _modes(self) -> tuple[tuple[Tensor, ...], Tensor]:
-        """Eigenvectors (n, n), in columns, of each axis' second difference; inverse eigenvalues.
+        """Eigenvectors of each axis' second-difference matrix, and inverse eigenvalues of the Laplacian.
 
-        The latter, (X, Y, Z), are those of the Laplacian.
+        The eigenvectors are the columns of (n, n) matrices. The inverse eigenvalues are (X, Y, Z).
         """
         vectors, total = [], torch.zeros(self.shape, dtype=torch.float64)
         for axis, (count, (low, high)) in enumerate(zip(self.shape, _ENDS, strict=True)):
@@ -70,7 +70,7 @@ class SmokeBox:
         return tuple(vectors), 1 / total
 
     def solve_pressure(self, right: Tensor) -> Tensor:
-        """Return the (X, Y, Z) float64 pressure whose Laplacian is ``right``."""
+        """Solve Poisson's equation: return the (X, Y, Z) float64 pressure whose Laplacian is ``right``."""
         (x, y, z), inverse = self._modes
         return _apply_smoke_solver_modes(_apply_smoke_solver_modes(right.double(), x.T, y.T, z.T) * inverse, x, y, z)
 
@@ -87,7 +87,7 @@ def flow_divergence(velocity: Faces, box: SmokeBox) -> Tensor:
 
 
 def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
-    """Return the divergence-free part of a flow, u - grad p with laplace p = div u; closed at the ground."""
+    """Return the divergence-free part of a flow: u - grad p with laplace p = div u, closed at the ground."""
     u, v, w = velocity
     w = w.clone()
     w[:, :, 0] = 0
@@ -95,9 +95,10 @@ def project_velocity(velocity: Faces, box: SmokeBox) -> Faces:
 
 
 def expansion_flow(source: Tensor, box: SmokeBox) -> Faces:
-    """Return the irrotational flow with divergence ``source`` (X, Y, Z), 1/s, as of heated gas.
+    """Return the irrotational flow with divergence ``source`` (X, Y, Z), 1/s, e.g. of heated gas that expands.
 
-    It is added for transport alone and not to the divergence-free flow, so that it does not outlast its cause.
+    The solver adds this flow for advection only. The stored velocity remains divergence-free, so that the expansion
+    ends with its cause.
     """
     return _subtract_gradient(box.air_at_rest(), -box.solve_pressure(source), box)
 
@@ -113,13 +114,13 @@ def _subtract_gradient(velocity: Faces, pressure: Tensor, box: SmokeBox) -> Face
 
 
 def _smoke_solver_flow_at_centres(velocity: Faces) -> Tensor:
-    """Return the (3, X, Y, Z) velocity at the cells' centres, the mean of opposite faces."""
+    """Interpolate velocity from faces to cell centres, (3, X, Y, Z): the mean of opposite faces."""
     u, v, w = velocity
     return torch.stack([u[1:] + u[:-1], v[:, 1:] + v[:, :-1], w[:, :, 1:] + w[:, :, :-1]]).mul_(0.5)
 
 
 def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
-    """Interpolate from centres to faces: the mean of both cells; at the ends the cell's own value."""
+    """Interpolate velocity from cell centres to faces: the mean of both cells, or the single cell's value at an end."""
     parts = []
     for axis, field in enumerate(centred):
         first, last, count = field.narrow(axis, 0, 1), field.narrow(axis, -1, 1), field.shape[axis] - 1
@@ -139,13 +140,13 @@ class GasProperties:
         buoyancy: upward acceleration at temperature 1.
         weight: downward acceleration at density 1.
         confinement: strength of vorticity confinement; 0 is none, above 1 is noise.
-        cooling, dissipation, drag: shares of the temperature, the density and the velocity lost per second.
-        radiation: further loss of temperature per second, at temperature 1; it goes with the fourth power.
-        burn: fuel that burns per second, whatever its concentration; 1 / burn is the life of a flame.
-        heat, soot, expansion: temperature, density and volume that burning a unit of fuel makes.
-        smoothing: share of the face velocities, per step, that is replaced by the means of those at the centres.
-        cfl: cells that gas may cross in one step; faster gas makes more steps per frame.
-        most_steps: steps per frame at most.
+        cooling, dissipation, drag: relative losses of temperature, density and velocity per second.
+        radiation: further loss of temperature per second at temperature 1, proportional to its fourth power.
+        burn: fuel burnt per second, at any concentration; a flame burns for 1 / burn seconds.
+        heat, soot, expansion: temperature, density and volume produced per unit of burnt fuel.
+        smoothing: 0..1, how far each step replaces face velocities by means of centre velocities.
+        cfl: cells that gas may cross in one step; faster gas leads to more steps per frame.
+        most_steps: maximum number of steps per frame.
     """
 
     buoyancy: float = 2.0
@@ -169,10 +170,10 @@ class GasState:
     """State of the gas ``time`` seconds after the start.
 
     Attributes:
-        velocity: at the faces, free of divergence.
+        velocity: at the faces, divergence-free.
         density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 as it leaves the source, 0
             when burnt.
-        colour: (3, X, Y, Z) albedo times density, so that where two smokes mix, each counts by its amount; or None.
+        colour: (3, X, Y, Z) albedo times density, so that mixed smoke has a weighted mean albedo; or None.
     """
 
     velocity: Faces
@@ -184,18 +185,18 @@ class GasState:
 
     @staticmethod
     def clear_air(box: SmokeBox, coloured: bool = False) -> GasState:
-        """Return clear, cold air at rest."""
+        """Return the initial state of a box: clear, cold air at rest."""
         zeros = torch.zeros(box.shape)
         return GasState(box.air_at_rest(), zeros, zeros, zeros, torch.zeros(3, *box.shape) if coloured else None)
 
 
 class GasSource(NamedTuple):
-    """A region where gas approaches given values. Fields that are None do not change.
+    """A region in which the gas approaches given values. Quantities that are None do not change.
 
     Attributes:
-        where: slices of the cells that the fields cover.
-        rate: (x, y, z) per second; after a time t the gas has gone 1 - exp(-rate * t) of the way.
-        density, temperature, fuel: the values it takes, numbers or fields over ``where``.
+        where: slices of the cells of the region.
+        rate: (x, y, z) per second; after a time t, the difference to the values is reduced by exp(-rate * t).
+        density, temperature, fuel: the given values, numbers or fields over ``where``.
         colour: albedo of the smoke, three numbers.
         velocity: (3, x, y, z), world units per second.
     """
@@ -214,9 +215,9 @@ class GasForcing(NamedTuple):
 
     Attributes:
         sources: applied in order.
-        gusts: (3, X, Y, Z) acceleration of smoke; full where density, temperature and fuel add up to 1/2.
-        expansion: (X, Y, Z) volume made per volume and second.
-        fade: (X, Y, Z) per second: how fast smoke, heat and fuel vanish near open ends.
+        gusts: (3, X, Y, Z) acceleration of smoke; in full where density, temperature and fuel add up to 1/2.
+        expansion: (X, Y, Z) volume produced per volume and second.
+        fade: (X, Y, Z) per second, rate at which smoke, heat and fuel vanish near open ends.
     """
 
     sources: Sequence[GasSource] = ()
@@ -226,7 +227,7 @@ class GasForcing(NamedTuple):
 
 
 def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
-    """Advance the gas by ``time`` seconds in as many equal steps as its speed needs, up to ``most_steps``."""
+    """Advance the gas by ``time`` seconds; its speed determines the number of equal steps, up to ``most_steps``."""
     fastest = max(float(component.abs().max()) for component in state.velocity)
     count = min(max(math.ceil(fastest * time / box.cell / settings.cfl), 1), settings.most_steps)
     for _ in range(count):
@@ -235,7 +236,7 @@ def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing
 
 
 def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
-    """Advance the gas by one step of ``time`` seconds; the result is free of divergence, to rounding."""
+    """Advance the gas by one step of ``time`` seconds; the resulting velocity is divergence-free up to rounding."""
     before = _smoke_solver_flow_at_centres(state.velocity)
     wind = before
     making = forcing.expansion
@@ -283,9 +284,9 @@ def step_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: G
 def _burn_fuel(
     density: Tensor, temperature: Tensor, fuel: Tensor, settings: GasProperties, time: float
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Burn fuel, then cool the gas.
+    """Burn fuel for ``time`` seconds, then cool the gas; return the new fields.
 
-    The rate is constant (Nguyen, Fedkiw and Jensen 2002), so that flames end sharply.
+    Fuel burns at a constant rate (Nguyen, Fedkiw and Jensen 2002), so that flames have sharp ends.
     """
     burnt = fuel.clamp_max(settings.burn * time)
     density = density + (2 * settings.soot) * burnt * (1 - fuel).clamp_min(0)  # most of it at the flame's end
@@ -298,7 +299,7 @@ def _burn_fuel(
 def _gas_acceleration(
     velocity: Tensor, density: Tensor, temperature: Tensor, settings: GasProperties, box: SmokeBox
 ) -> Tensor:
-    """Return (3, X, Y, Z) acceleration: buoyancy, weight and vorticity confinement e h (N x w).
+    """Return the (3, X, Y, Z) acceleration of gas: buoyancy, weight and vorticity confinement e h (N x w).
 
     w = curl u and N = grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001). Confinement restores the small eddies that
     interpolation damps.
@@ -331,7 +332,7 @@ def _vorticity(velocity: Tensor, cell: float) -> Tensor:
 
 
 def _apply_source(state: GasState, velocity: Tensor, source: GasSource, time: float) -> tuple[GasState, Tensor]:
-    """Return state and velocity at the centres after a source has acted for ``time`` seconds."""
+    """Apply a source for ``time`` seconds; return the new gas state and the velocity at cell centres."""
     share = 1 - torch.exp(-source.rate * time)
 
     def towards(field: Tensor, value: Tensor | float) -> Tensor:
@@ -358,7 +359,7 @@ _INVISIBLE = 1e-4  # values up to this are not corrected; most of a box holds no
 
 
 class _SmokeSolverStencil(NamedTuple):
-    """Trilinear stencils of N points in a table (X * Y * Z, C).
+    """Trilinear interpolation stencils of N points in a table (X * Y * Z, C) of cell values.
 
     ``embedding_bag`` sums them several times faster than ``grid_sample`` in three dimensions, with the same result for
     any number of threads.
@@ -373,9 +374,9 @@ class _SmokeSolverStencil(NamedTuple):
 
 
 def _smoke_solver_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> _SmokeSolverStencil:
-    """Return the stencils of points, given as three (N,) tensors in cells.
+    """Return the interpolation stencils of points, given as three (N,) coordinates in units of cells.
 
-    The first centre is at 0; points are clamped to the outermost centres.
+    The centre of the first cell is at 0. Points are clamped to the outermost centres.
     """
     lower, parts = [], []
     for along, count in zip(points, shape, strict=True):
@@ -400,14 +401,14 @@ def _smoke_solver_stencil(points: list[Tensor], shape: tuple[int, int, int]) -> 
 def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blurred: int = 0) -> Tensor:
     """Advect (C, X, Y, Z) fields for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second.
 
-    Traces back with the midpoint rule, then corrects the interpolation's blur (MacCormack; Selle, Fedkiw, Kim, Liu and
-    Rossignac 2008, "An unconditionally stable MacCormack method"): carry forward, carry back, add half the difference
-    from the original,
+    Points are traced back with the midpoint rule. The blur of the interpolation is then corrected (MacCormack; Selle,
+    Fedkiw, Kim, Liu and Rossignac 2008, "An unconditionally stable MacCormack method"): advect forward, advect back,
+    and add half of the difference from the original,
 
         q1 = A(q),   q2 = A^-1(q1),   q' = q1 + (q - q2) / 2,
 
-    limited to the values of the eight cells that ``q1`` is made of, so that no new extremum can appear. The first
-    ``blurred`` fields are left uncorrected, as are cells with negligible values in all others.
+    limited to the range of the eight cells from which ``q1`` is interpolated, so that no new extremum appears. The
+    first ``blurred`` fields are not corrected, nor are cells in which all other fields are negligible.
     """
     shape = (fields.shape[1], fields.shape[2], fields.shape[3])
     table, winds = (x.reshape(len(x), -1).T.contiguous() for x in (fields, velocity))
@@ -447,10 +448,10 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
 
 
 def _advect_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
-    """Run jobs that write to different places in threads of our own.
+    """Run jobs, which write to different memory, in threads other than torch's.
 
-    Torch's threads wait for each other in a busy loop after every operation, which on a busy machine takes many times
-    longer than the work.
+    Torch's threads wait for each other in a busy loop after every operation. On a busy machine, the waiting takes many
+    times longer than the work.
     """
     with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
         list(pool.map(work, jobs))
@@ -458,11 +459,11 @@ def _advect_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None
 
 @lru_cache(maxsize=2)
 def _smoke_solver_cell_indices(shape: tuple[int, int, int]) -> tuple[Tensor, ...]:
-    """Return the cell indices of a table's rows along each axis, three of (X * Y * Z,) float32."""
+    """Return, for each axis, the cell index of every row of a table: three (X * Y * Z,) float32 tensors."""
     axes = torch.meshgrid(*(torch.arange(n, dtype=torch.float32) for n in shape), indexing="ij")
     return tuple(axis.reshape(-1) for axis in axes)
 
 
 def _smoke_solver_stencil_offsets(shape: tuple[int, int, int]) -> list[int]:
-    """Return the offsets, in rows of a table, of a stencil's eight cells from the first."""
+    """Return the offsets of a stencil's eight cells from its first cell, in rows of the table."""
     return [(a * shape[1] + b) * shape[2] + c for a in (0, 1) for b in (0, 1) for c in (0, 1)]

@@ -1,4 +1,4 @@
-"""The dynamic task: smoke and fire, from OpenVDB sequences or from images with a time each."""
+"""The task ``dynamic``: fit smoke and fire to OpenVDB sequences, or moving scenes to images with a time each."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ def _has_lights(scene: Mapping[str, Any]) -> bool:
 
 
 def parse_dynamic_time(text: str) -> list[Tensor]:
-    """Parse a time in 0..1 after ``--time``; raise ConfigError for anything else."""
+    """Parse the text after ``--time`` as a time 0..1; raise ConfigError for other text."""
     try:
         time = float(text)
     except ValueError:
@@ -106,7 +106,7 @@ def parse_dynamic_time(text: str) -> list[Tensor]:
 
 
 def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
-    """Return the volume sequence that the images were rendered from; None if there is none.
+    """Return the volume sequence from which a dataset's images were rendered; None if there is none.
 
     Raises:
         DatasetFault: the dataset's ``extra`` is something else.
@@ -119,13 +119,13 @@ def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
 
 
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Return pixels with matter in any frame of the view's camera; None without a volume sequence."""
+    """Return an (H, W) bool mask of pixels that matter covers in any frame of a test view's camera, or None."""
     recording = vdb_recording_of(dataset)
     return None if recording is None else recording.matter_mask(index)
 
 
 def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
-    """Return one video clip of all frames per test camera."""
+    """Return one video clip per test camera, of all frames; empty without a volume sequence."""
     recording = vdb_recording_of(dataset)
     if recording is None:
         return ()
@@ -134,7 +134,7 @@ def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
 
 
 def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Compare the model's extinction and size with those of the files."""
+    """Compare a model with its dataset's .vdb files: errors of extinction, bytes of files, invisible primitives."""
     recording = vdb_recording_of(dataset)
     if recording is None:
         return {}
@@ -151,10 +151,10 @@ def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str,
 
 
 def invisible_fraction_over_time(model: Primitives, times: Sequence[Tensor]) -> float:
-    """Return the share of primitives with opacity below 1/255 along all axes, at all ``times``.
+    """Return the fraction of primitives that are invisible: opacity below 1/255 along all three axes at all ``times``.
 
-    The chord along axis j through the centre has half length s_j, so its optical depth is I = (N_p s_j/m) (b2 + sum_k
-    w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)), r_j the axis' direction (:mod:`neuprim.core.model.edge`).
+    Along axis j, with direction r_j and semi-axis s_j, the optical depth of the chord through the centre is I = (N_p
+    s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)), see :mod:`neuprim.core.model.edge`.
     """
     most_opaque = torch.zeros(model.count, dtype=torch.float64)
     density, params = model.density, {k: v.detach() for k, v in model.of(model.density).items()}
@@ -200,7 +200,7 @@ _LAYERS = (
 
 
 def _import_dynamic_function(module: str, function: str) -> Callable[..., Any]:
-    """Return a function that imports its module when called, as loaders need many modules."""
+    """Return a wrapper of ``function`` that imports ``module`` only when called, since loaders import many others."""
 
     def call(*arguments: Any) -> Any:
         return getattr(import_module(f"{__package__}.{module}"), function)(*arguments)

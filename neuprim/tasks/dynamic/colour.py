@@ -1,4 +1,4 @@
-"""Colour that changes in time: :class:`TimeHarmonics`."""
+"""Colour field that changes in time: :class:`TimeHarmonics`."""
 
 from __future__ import annotations
 
@@ -28,11 +28,11 @@ _MIN_SINGULAR = 1e-7  # relative singular value of a fit; weaker coefficients wo
 
 
 class TimeHarmonics(ColourField):
-    """SH colour with a lowest band that changes in time: c = max(0, C0 S(xi) + higher bands + 1/2).
+    """SH colour whose lowest band changes in time: c = max(0, C0 S(xi) + higher bands + 1/2).
 
-    S(xi) = S0 + sum_i a_i xi^i + sum_i (b_i cos(w i xi) + c_i sin(w i xi)), i = 1..n and 1..l. S has 1 + n + 2 l
-    parameters per channel; the higher bands do not change. With n = l = 4, three channels and degree 3: 84 parameters,
-    39 at degree 0. ``frequencies`` chooses w, see :data:`FREQUENCIES`.
+    S(xi) = S0 + sum_{i=1..n} a_i xi^i + sum_{i=1..l} (b_i cos(w i xi) + c_i sin(w i xi)) has 1 + n + 2 l parameters
+    per channel. The higher bands do not change in time. Three channels with n = l = 4 (``powers``, ``waves``) have 84
+    parameters at degree 3 and 39 at degree 0. ``frequencies`` chooses w, see :data:`FREQUENCIES`.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class TimeHarmonics(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
-        """Fit fewer terms in time to all terms, by least squares over the sequence."""
+        """Return a smaller field: a lower degree, or fewer terms in time, fitted to all terms by least squares."""
         field = type(self)(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.truncate_sh_bands(params, "sh_rest", value)
@@ -95,7 +95,7 @@ class TimeHarmonics(ColourField):
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
-        """Return the float64 basis functions of each tensor at time ``xi``."""
+        """Return the basis functions of time at ``xi``, float64, by the name of their coefficient tensor."""
         turn = FREQUENCIES[self.frequencies] * xi
         waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)
@@ -105,7 +105,7 @@ class TimeHarmonics(ColourField):
         return self.lowest_band(params, conditions), params.get("sh_rest")
 
     def lowest_band(self, params: Params, conditions: Conditions) -> Tensor:
-        """Return (N, C) S(xi), the zero-order coefficient at the frame's time."""
+        """Return S(xi), (N, C): the SH coefficient of degree 0 at the frame's time."""
         dc, xi = params["sh_dc"], get_frame_time(conditions)
         terms = self._terms(xi) if self.powers or self.waves else {}  # none if colours do not change in time
         for name, basis in terms.items():
@@ -114,7 +114,7 @@ class TimeHarmonics(ColourField):
         return dc
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one unit per coefficient of the direction and channel, and one per term in time."""
+        """Return one prunable unit per SH coefficient above degree 0 and channel, and one per term in time."""
         terms = ((name, i) for name, count in self._term_counts() for i in range(count))
         units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
         return (*sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest"), *units)

@@ -1,8 +1,8 @@
-"""Load posed images of a moving scene: ``transforms`` files in the layout of D-NeRF, with a ``time`` in every frame.
+"""Load images of a moving scene with known cameras: ``transforms`` files as in D-NeRF, with a ``time`` per image.
 
-Either ``transforms_SPLIT.json`` per split, whose scenes have z upwards, or one ``transforms.json``, of which every n-th
-frame by name is a test view unless it lists ``train_filenames``, ``val_filenames`` or ``test_filenames``; if both
-exist, the splits count. Each view has the condition "time", a 0-dim float32 tensor, 0..1.
+There is either one ``transforms_SPLIT.json`` per split (z is up), or one ``transforms.json``. If both exist, the former
+are used. In a ``transforms.json``, every n-th image by name is a test view, unless the file lists ``train_filenames``,
+``val_filenames`` or ``test_filenames``. Each view has the condition "time", a 0-dim float32 tensor, 0..1.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ _TimeRange = tuple[float, float]
 
 
 def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load the scene in the folder ``settings["path"]``; sRGB from PNG and JPEG, linear light from OpenEXR.
+    """Load a moving scene from the folder ``settings["path"]``: sRGB from PNG and JPEG, linear light from OpenEXR.
 
     Raises:
         ConfigError: unknown or impossible settings.
@@ -92,7 +92,7 @@ def load_moving_multiview(settings: Mapping[str, Any], context: SceneContext) ->
 def _read_timed_frames(
     options: MultiviewSettings, document: JsonReader, records: list[JsonReader], time_range: _TimeRange
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """Return the records, and their frames with the condition "time", 0..1."""
+    """Parse JSON records of frames; return the used records, and their frames with the condition "time", 0..1."""
     layout = TransformsLayout(
         keys=("time", "train_filenames", "val_filenames", "test_filenames", "ply_file_path"), masks=True
     )
@@ -109,10 +109,10 @@ def _read_timed_frames(
 
 
 def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _TimeRange:
-    """Return the times that become 0 and 1; ``others``, further splits, count for "auto" only.
+    """Return the file times that become 0 and 1. ``others`` are files of further splits, used for "auto" only.
 
     Raises:
-        DataError: a frame without a time, times that are no finite numbers or out of range, "auto" with a single time.
+        DataError: a frame has no time, a time is not finite or out of range, or "auto" finds a single time.
     """
     if not any("time" in r.values for r in records):
         where = records[0].where.rsplit(": ", 1)[0]
@@ -149,7 +149,7 @@ def _read_time(record: JsonReader) -> float:
 
 
 def _parse_multiview_time_range(value: str) -> _TimeRange:
-    """Return the two numbers of "LOW:HIGH"; raises ValueError for other text."""
+    """Parse "LOW:HIGH" to two numbers; raises ValueError for other text."""
     low, high = (float(part) for part in value.split(":"))
     if not (math.isfinite(low) and math.isfinite(high) and low < high and math.isfinite(high - low)):
         raise ValueError(value)
@@ -194,14 +194,14 @@ _MIN_OPACITY = 0.1  # least opacity of matter; the edges of smoke are seldom mor
 def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a moving scene.
 
-    They are in scene units and the images' colour space. Visual hulls of single moments are united over time; one hull
-    of all masks would carve away whatever moves. If several cameras share each time, a moment is one time. If every
-    image has its own time, as in D-NeRF, a moment is a run of four neighbours in time: an object that moves by less
-    than its size during a run keeps its middle, and the next, overlapping runs supply the rest.
+    Positions are in scene units, colours in the images' colour space. Points lie on visual hulls. Each hull is
+    computed for one moment, since a hull of all masks would carve away whatever moves. Each point has the "time" and
+    the colour of its hull's moment. If several cameras share each time, a moment is one time. If every image has its
+    own time, as in D-NeRF, a moment is a run of four successive images, and runs overlap: the hull of an object that
+    moves by less than its size during a run contains its middle, and the other runs supply the rest.
 
-    Points lie on the surfaces of these hulls, each with the "time" and the colour of one moment. Cameras without a
-    common target give points along rays. Without alpha, or if every image has its own time and all hulls are empty,
-    points fill a box in front of the cameras at random times.
+    If the cameras have no common target, points lie along rays. Without alpha, or if every image has its own time and
+    all hulls are empty, points fill a box in front of the cameras at random times.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -222,7 +222,7 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
 
 
 def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: torch.Generator) -> PointCloud | None:
-    """Return points on the hulls; None if every image has its own time and all hulls are empty."""
+    """Return points on the hulls of all moments; None if every image has its own time and all hulls are empty."""
     moments, shared = _choose_moments(times)
     surfaces, owners, sides = [], [], []
     empty: EmptyHull | None = None
@@ -259,7 +259,7 @@ def _moving_hull_points(views: ViewSet, times: Tensor, count: int, generator: to
 
 
 def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]:
-    """Return at most _MAX_MOMENTS (views, time) in order of time, and whether each is one time."""
+    """Return at most _MAX_MOMENTS moments (views, time), sorted by time, and whether each moment is a single time."""
     values = times.tolist()
     sharing = Counter(values)
     shared = float(np.median(list(sharing.values()))) >= _MIN_SHARED
@@ -275,7 +275,7 @@ def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]
 
 
 def _draw_moving_point_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
-    """Return one random row per occupied cubic cell, as static surfaces repeat in all moments."""
+    """Return the index of one random point per cubic cell of edge ``side``; static surfaces occur in all moments."""
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()
     _, first = np.unique(cells, axis=0, return_index=True)

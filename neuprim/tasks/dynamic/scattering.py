@@ -1,4 +1,4 @@
-"""Colour of smoke and fire that scatter a light given as a condition: :class:`ScatteringHarmonics`."""
+"""Colour field of smoke and fire under a light that is a condition: :class:`ScatteringHarmonics`."""
 
 from __future__ import annotations
 
@@ -23,11 +23,11 @@ from neuprim.core.settings import RenderSettings
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 
 SHINES = "shines"
-"""Condition, 0 or 1: whether a frame includes emission; of several frames to be summed, one does."""
+"""Condition, 0 or 1: whether an image includes emission. Of several images to be summed, only one does."""
 
 
 def light_smoke_by_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
-    """Return the lights of an environment, with emission under the first light only.
+    """Convert an environment to ``count`` lights for smoke and fire; only the first light's image includes emission.
 
     See :func:`~neuprim.core.light_conditions.lights_from_environment`.
 
@@ -44,10 +44,10 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 class ScatteringHarmonics(TimeHarmonics):
     """Emission plus single scattering of one light, c = TimeHarmonics(xi, d) + T max(0, a) E/typical.
 
-    a (C,) per primitive is its albedo, times the share of its extinction that scatters, times the isotropic phase
-    function 1/4 pi. T is the transmittance of the model's own extinction from the primitive's centre to the light
-    (:func:`~neuprim.core.render.light.shade_volume_by_light`), without gradient; E is the condition
-    ``light_intensity``, the light's irradiance as it arrives, and ``typical`` that of a typical training light.
+    a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction times the isotropic
+    phase function 1/4 pi. T is the model's transmittance from the primitive's centre to the light, without gradient
+    (:func:`~neuprim.core.render.light.shade_volume_by_light`). E is the condition ``light_intensity``: the irradiance
+    of the unoccluded light. ``typical`` is the irradiance of a typical training light.
     """
 
     def __init__(self, *settings: Any, typical: float = 1.0, **more: Any) -> None:
@@ -65,7 +65,7 @@ class ScatteringHarmonics(TimeHarmonics):
         return [dc, scattered, *others]
 
     def harmonics(self, params: Params, conditions: Conditions) -> None:
-        """Return None: scattered light cannot be given by harmonics."""
+        """Return None, since spherical harmonics cannot represent scattered light."""
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
         return lowest_band_colors(self.lowest_band(params, conditions))

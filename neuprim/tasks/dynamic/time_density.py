@@ -1,15 +1,20 @@
-"""Cosine density that changes in time; in one frame it is a static one. Parts that can vary, joined by "+":
+"""Density field of cosine neurons that change in time; at a fixed time it is a static cosine density.
+
+The setting ``time`` names the time-dependent parts, joined by "+":
 
     phase    b1 + xi W_t                                        equation 13 of the paper; K parameters
     offset   b2 + sum_j p_j cos(pi j xi) + q_j sin(pi j xi)     j = 1..4; 8 parameters
     window   (w2, b2) (1 - u^2)^2, u = (xi - c)/tau, |u| < 1    active from c - tau to c + tau; 2 parameters
     motion   mu + v (xi - c) + a (xi - c)^2                     c of the window, else 1/2; 6 parameters
 
-xi is time over the sequence, 0..1. Primitives outside their window are dropped from a frame before anything is
-computed. A model joined from chunks of a sequence stores the chunk of every primitive; over an overlap in time the
-earlier chunk's weight falls linearly from 1 to 0 and the later one's rises from 0 to 1. Where several grids make the
-extinction (smoke and flames), each of ``components`` adds one parameter, share_NAME: the primitive's share of that
-grid, as a logit.
+xi is the time, 0..1 over the sequence. Primitives whose window does not contain xi are dropped from the frame before
+anything else is computed.
+
+A model joined from chunks of a sequence stores the chunk number of every primitive. Neighbouring chunks overlap in
+time. During an overlap, the earlier chunk's weight falls linearly from 1 to 0, and the later one's rises from 0 to 1.
+
+If the extinction comes from several grids (smoke and flames), each name in ``components`` adds one parameter,
+share_NAME: the fraction of the primitive's extinction that belongs to that grid, as a logit.
 """
 
 from __future__ import annotations
@@ -55,14 +60,14 @@ ChunkOverlaps = tuple[tuple[float, float], ...]
 
 
 def get_frame_time(conditions: Conditions) -> Tensor:
-    """Return the frame's time xi, 0-dim float64; raises KeyError without a condition "time"."""
+    """Return the condition "time" of a frame, 0-dim float64; raises KeyError if it is missing."""
     if "time" not in conditions:
         raise KeyError("a dynamic model needs the condition 'time'")
     return conditions["time"].detach().double().reshape(())
 
 
 def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverlaps:
-    """Return overlaps as tuples; raises ValueError unless all times ascend."""
+    """Convert overlaps of time chunks to tuples; raises ValueError unless all times ascend."""
     try:
         overlaps = tuple((float(begin), float(end)) for begin, end in seams)
     except (TypeError, ValueError):
@@ -74,10 +79,10 @@ def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverl
 
 
 def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
-    """Return the chunks' weights 0..1 at time ``xi`` (), float64 in the shape of ``chunk``.
+    """Return each primitive's weight 0..1 at time ``xi``, given the time chunk of each; float64, shape of ``chunk``.
 
     Args:
-        chunk: chunk numbers from 0 to len(overlaps), any dtype; rounded, as compressed files may change them slightly.
+        chunk: numbers 0 to len(overlaps), any dtype; they are rounded, since compression may change them slightly.
     """
     numbers = chunk.detach().double().round()
     weights = torch.ones_like(numbers)
@@ -88,16 +93,17 @@ def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Te
 
 
 class TimeDensity(DensityField):
-    """Density f(x~, xi) of K cosine neurons with ``time`` parts (see the module); 5K + 1 parameters and the parts'.
+    """Density field f(x~, xi) of K cosine neurons that change in time; ``time`` names the parts (see the module).
 
-    Keys of the setting ``model.init``: those of :class:`~neuprim.core.model.cosine.CosineDensity`, and
+    A primitive has 5K + 1 parameters plus the parameters of the parts. The setting ``model.init`` has the keys of
+    :class:`~neuprim.core.model.cosine.CosineDensity`, and
 
-    * ``window``: half width tau of a new window, in units of the sequence;
-    * ``window_frames``: largest tau in frames;
-    * ``rate``: bound of U(-rate, rate), from which W_t starts.
+    * ``window``: initial half width tau of windows, as a fraction of the sequence;
+    * ``window_frames``: upper limit of the initial tau, in frames;
+    * ``rate``: W_t is initialised uniformly from -rate..rate.
 
     Args:
-        seams: :data:`ChunkOverlaps` of a model joined from chunks; empty for others.
+        seams: :data:`ChunkOverlaps` of a model joined from chunks; empty for other models.
         components: names of the source grids whose share of the extinction each primitive stores.
     """
 
@@ -220,7 +226,7 @@ class TimeDensity(DensityField):
         return self.static.from_gaussians(alphas)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Return smaller numbers of neurons, and 0, i.e. removal, for each part of time."""
+        """Return possible reductions: smaller numbers of neurons, and 0 (removal) for each time-dependent part."""
         return self.static.reductions() | {part: (0,) for part in TIME_PARTS if part in self.parts}
 
     def reduce(
@@ -236,7 +242,7 @@ class TimeDensity(DensityField):
         return field, {key: value for key, value in remaining.items() if key in kept}
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return units of neurons, offset and motion per axis; zeros would not remove a window."""
+        """Return prunable units: neurons, offset, motion per axis. Windows have none: zeros would not remove them."""
         rates = ("W_t",) if "phase" in self.parts else ()
         units = [
             PrunableUnit(unit.name, {**unit.places, **dict.fromkeys(rates, unit.places["b1"])})
@@ -260,7 +266,7 @@ class TimeDensity(DensityField):
 
 
 def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
-    """Return b1 + xi W_t modulo 2 pi/omega0; float32-exact also for times far outside 0..1."""
+    """Return the phase b1 + xi W_t modulo 2 pi/omega0; exact to float32 even for times far outside 0..1."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
@@ -270,16 +276,16 @@ def _zero_time_parameters(width: int) -> Any:
 
 
 def _initial_time_window_center(ctx: InitContext) -> Tensor:
-    """Return the starting points' times, else random ones, uniform over the sequence."""
+    """Return (N, 1) initial window centres: the times of the starting points or, without times, random ones."""
     if "time" in ctx.conditions:
         return ctx.conditions["time"].float().reshape(-1, 1)
     return (ctx.uniform(1) + 1) / 2
 
 
 def _initial_log_time_window(ctx: InitContext) -> Tensor:
-    """Return (N, 1) log half widths of new windows.
+    """Return (N, 1) logarithms of the initial half widths of windows.
 
-    They are limited in frames, as longer sequences show more events, not longer ones.
+    ``window_frames`` limits the widths in frames, since longer sequences contain more events, not longer events.
     """
     half = ctx.number("window", 0.2, 0)
     if ctx.settings.get("window_frames") is not None and "time" in ctx.steps:
@@ -294,12 +300,11 @@ _MIDDLE = 0.5  # reference time of motion without a window
 
 
 def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
-    """Return a :class:`TimeDensity`'s tensors with one part replaced by its mean in time.
+    """Replace one time-dependent part of a :class:`TimeDensity` by its mean over time; return the new tensors.
 
-    They include "means" if these move. Averages are over xi in 0..1, weighted by the window if there is one. A phase
-    that advances by a over the sequence, cos(phi + xi a), has the mean R cos(phi + psi) with R e^(i psi) the mean of
-    e^(i xi a). A window leaves its mean factor, a motion its mean position. The dropped part's own tensors are still in
-    the result.
+    Means are over xi in 0..1, weighted by the window if there is one. A phase cos(phi + xi a) is replaced by its mean
+    R cos(phi + psi), where R e^(i psi) is the mean of e^(i xi a). A window is replaced by its mean factor, a motion by
+    the mean position, which changes "means". The result still contains the tensors of the replaced part.
     """
     if part == "phase":
         return {**params, **_mean_phase_over_time(params, omega0)}
@@ -313,13 +318,13 @@ def _sequence_mean_times(like: Tensor) -> Tensor:
 
 
 def _time_window_factor(params: Params, xi: Tensor) -> Tensor:
-    """Return the (N, 1) factors of the windows at time ``xi``."""
+    """Return (N, 1) window factors (1 - u^2)^2 of the primitives at time ``xi``."""
     u = (xi - params["window_center"].double()) / params["log_window"].double().exp()
     return (1 - u * u).clamp_min(0.0).square()
 
 
 def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
-    """Return pairs (time, (N, 1) weights); the weights of a primitive add up to 1."""
+    """Return sample times for means: pairs (time, (N, 1) weights), where each primitive's weights add up to 1."""
     times = _sequence_mean_times(params["b1"])
     if "window_center" not in params:
         even = torch.full_like(params["b2"].double(), 1.0 / _MEAN_TIMES)
@@ -378,7 +383,7 @@ WINDOW_EDGE = 2  # exponent of the window in time
 
 @exact_kernel
 def _rows_in_time_window_kernel(center, log_window, xi, rows):  # type: ignore[no-untyped-def]
-    """Write the rows whose window contains ``xi`` to the start of ``rows``; return their number."""
+    """Write the indices of primitives whose window contains ``xi`` to the start of ``rows``; return their number."""
     found = 0
     for n in range(center.shape[0]):
         if abs(xi - np.float64(center[n, 0])) < np.exp(np.float64(log_window[n, 0])):
@@ -388,9 +393,9 @@ def _rows_in_time_window_kernel(center, log_window, xi, rows):  # type: ignore[n
 
 
 def rows_in_time_window(center: Tensor, log_window: Tensor, xi: Tensor) -> Tensor:
-    """Return ascending int64 rows with |xi - center| < exp(log_window), computed in float64.
+    """Return the indices of primitives that are active at time ``xi``: |xi - center| < exp(log_window), in float64.
 
-    The tensors are (N, 1); there is no gradient.
+    The indices are int64, ascending. ``center`` and ``log_window`` are (N, 1); there is no gradient.
     """
     center, log_window = center.detach(), log_window.detach()
     if not device.on_numba(center, log_window):
@@ -422,9 +427,9 @@ class _TimeWindow(torch.autograd.Function):
 
 
 def apply_time_window(w2: Tensor, b2: Tensor, center: Tensor, log_window: Tensor, xi: Tensor) -> tuple[Tensor, Tensor]:
-    """Return w2 (N, K) and b2 (N, 1) times (1 - u^2)^2, u = (xi - center)/exp(log_window), 0 beyond |u| = 1.
+    """Multiply w2 (N, K) and b2 (N, 1) by (1 - u^2)^2, or 0 if |u| > 1; u = (xi - center)/exp(log_window).
 
-    ``center`` and ``log_window`` are (N, 1), all of one dtype; no gradient for the time ``xi`` ().
+    ``center`` and ``log_window`` are (N, 1); all have one dtype. The time ``xi`` () gets no gradient.
     """
     if not device.on_numba(w2, b2, center, log_window):
         weight = edge_weight(((xi.to(b2.dtype) - center) / log_window.exp()).square(), WINDOW_EDGE)
@@ -463,7 +468,7 @@ class _MoveInTime(torch.autograd.Function):
 def move_means(means: Tensor, velocity: Tensor, acceleration: Tensor, center: Tensor, xi: Tensor) -> Tensor:
     """Return (N, 3) means + velocity (xi - center) + acceleration (xi - center)^2.
 
-    ``center`` is (N, 1); all are of one dtype. No gradient for the time ``xi`` ().
+    ``center`` is (N, 1); all have one dtype. The time ``xi`` () gets no gradient.
     """
     if not device.on_numba(means, velocity, acceleration, center):
         since = xi.to(velocity.dtype) - center

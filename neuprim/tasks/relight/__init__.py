@@ -1,8 +1,8 @@
-"""The relighting task: fit images under one point light each, render under any light.
+"""The task ``relight``: fit images under one point light each, render under any light.
 
-Images are linear light over the exposure; 1 is the brightest value of a display. Scores clamp them to 0..1 first, as
-one highlight of 20 would dominate an image's error. "linear_clamped" compares these values, "display" their sRGB
-values. FLIP is measured where its package is installed (``neuprim[flip]``).
+Image values are linear light divided by the exposure; 1 is the brightest value of a display. Metrics clamp the values
+to 0..1, since a single highlight of 20 would dominate an image's error. Metrics with "linear_clamped" in the name
+compare the clamped values, those with "display" compare their sRGB values. FLIP needs ``neuprim[flip]``.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _OF_FORM: dict[str, dict[str, Any]] = {
     **dict.fromkeys(FORMS, _NETWORK),
     "harmonics": {"degree": 5},
 }
-"""Settings of each form of colour, with their defaults."""
+"""Settings of ``model.colour`` for each colour form, with their defaults."""
 
 
 def _light_colour_field(model: Mapping[str, Any], falloff: bool = False, typical: float = 1.0) -> ColourField:
@@ -90,7 +90,7 @@ def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[D
 
 
 def _load_relight_scene(function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Import the loaders on first use and call one of them."""
+    """Import the scene loaders on first use and call the loader ``function``."""
     from neuprim.tasks.relight import datasets
 
     loader: Callable[..., Dataset] = getattr(datasets, function)
@@ -101,7 +101,7 @@ _MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
 
 
 def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Return an (H, W) bool mask of a test view's pixels with matter; None for images without alpha."""
+    """Return an (H, W) bool mask of the covered pixels of a test view; None for images without alpha."""
     alpha = dataset.test.pixels(index).alpha
     return None if alpha is None else alpha > _MIN_ALPHA
 
@@ -109,7 +109,7 @@ def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
 def relight_metrics(
     dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True
 ) -> dict[str, float]:
-    """Return :func:`relight_scores`, and errors per pixel class and PSNR of the part if there are any."""
+    """Return the metrics of a test image: :func:`relight_scores`, PSNR of its test part, errors per pixel class."""
     known, result = dataset_lighting(dataset), relight_scores(rendered, truth, structure)
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
@@ -120,7 +120,7 @@ def relight_metrics(
 
 
 def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Return exposure, falloff, baseline scores, and classes in percent of the pixels with matter."""
+    """Return facts about a relighting run: exposure, falloff, baseline scores, and pixel classes in percent."""
     known = dataset_lighting(dataset)
     result: dict[str, Any] = {"exposure": dataset.exposure, "falloff": known.falloff}
     result["baselines"] = lighting_baseline_scores(dataset)
@@ -133,7 +133,7 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 
 
 def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """Return mean test scores of images without a model, by name; not SSIM and FLIP, which are slow."""
+    """Return mean test scores of the baselines, which use no model, by name; without SSIM and FLIP, which are slow."""
 
     found = {}
     for name, guess in {"black": None, **dataset_lighting(dataset).baselines}.items():
@@ -149,7 +149,7 @@ def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
 
 
 def relight_clips(dataset: Dataset) -> Sequence[Clip]:
-    """Return the dataset's video clips."""
+    """Return the video clips of a relighting dataset."""
     return dataset_lighting(dataset).clips
 
 
@@ -160,7 +160,7 @@ def light_facts(dataset: Dataset) -> dict[str, Any]:
 
 
 def light_orbit(dataset: Dataset, frames: int) -> list[View]:
-    """Return an orbit of views; the light orbits the other way at its mean distance and height."""
+    """Return views of an orbiting camera; the light orbits the opposite way, at its mean distance and height."""
     training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
     up, center = dataset.up.double() / dataset.up.double().norm(), dataset.center.double()
     offsets = torch.stack([c["light"] for c in training]).double() - center
@@ -182,7 +182,7 @@ def light_orbit(dataset: Dataset, frames: int) -> list[View]:
 
 
 def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> dict[str, float]:
-    """Return PSNR of light clamped to 0..1 and of display values; if ``structure``, SSIM and FLIP."""
+    """Return the PSNR of linear values clamped to 0..1 and of display values; if ``structure``, also SSIM and FLIP."""
     first, second = rendered.clamp(0.0, 1.0), truth.clamp(0.0, 1.0)
     result = {"psnr_linear_clamped": psnr(first, second)}
     first, second = linear_to_srgb(first), linear_to_srgb(second)
@@ -195,10 +195,10 @@ def relight_scores(rendered: Tensor, truth: Tensor, structure: bool = True) -> d
 
 
 def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor) -> dict[str, float]:
-    """Return MSE and pixel count of each class in the (H, W) map ``classes``.
+    """Return MSE and number of pixels for each pixel class in the (H, W) map ``classes``.
 
     Raises:
-        DataError: the map has another size or unknown classes.
+        DataError: the map differs from the image in size, or has unknown classes.
     """
     if classes.shape != truth.shape[:2] or int(classes.max()) >= len(PIXEL_CLASSES):
         raise DataError(
@@ -215,7 +215,7 @@ def relight_pixel_class_errors(rendered: Tensor, truth: Tensor, classes: Tensor)
 
 
 def relight_pixel_class_shares(maps: list[Tensor]) -> dict[str, float]:
-    """Return the share of each class, in percent of the pixels that are not background."""
+    """Return the frequency of each pixel class, in percent of the pixels that are not background."""
     counts = torch.stack([torch.bincount(m.reshape(-1).long(), minlength=len(PIXEL_CLASSES)) for m in maps]).sum(0)
     whole = max(float(counts[1:].sum()), 1.0)
     return {name: 100.0 * float(counts[i]) / whole for i, name in enumerate(PIXEL_CLASSES) if i}

@@ -1,14 +1,14 @@
-"""Colour under a point light: one hidden layer per primitive (equation 14), or spherical harmonics of the light.
+"""Colour fields under a point light: a network per primitive (equation 14 of the paper), or spherical harmonics.
 
     h = cos(beta (W_x x~ + W_d d + W_l l + b))             x~ the local middle of the chord; d and l unit vectors at the
                                                            centre: from the camera, and to the light
     additive         c = V E max(0, c_dc + W_out h)        equation 14: 9 -> H -> 3, 107 parameters at H = 8
     multiplicative   c = V E max(0, albedo (1 + w_out . h))    no tinting: 91 parameters
 
-E is the light's intensity, divided by the squared distance where the dataset says so, over that of a typical training
-light. V is the visibility of the light from the primitive (:mod:`neuprim.core.render.light`) or 1. Everything
-but W_x x~ is constant over a primitive, so it folds into the closed form
-:class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
+E is the strength of the light relative to a typical training light: the intensity, divided by the squared distance if
+the dataset's falloff is "inverse_square". V is the visibility of the light from the primitive
+(:mod:`neuprim.core.render.light`), or 1. All terms but W_x x~ are constant over a primitive. The field is therefore
+lowered to :class:`~neuprim.core.model.forms.RayNet`, which the renderer evaluates per pixel.
 """
 
 from __future__ import annotations
@@ -51,13 +51,13 @@ def check_count(value: object, low: int, high: float, name: str) -> None:
 
 
 class LightNetwork(ColourField):
-    """Colour network under a point light (see the module). H = 0 is the constant colour c_dc (times V and E).
+    """Colour network of each primitive under a point light (see the module). With H = 0, the colour is c_dc V E.
 
     Args:
-        hidden: H, 0..16.
+        hidden: H, number of hidden units, 0..16.
         form: one of :data:`FORMS`.
         visibility: one of :data:`VISIBILITY`; equation 14 as printed has "none".
-        boost: beta. 1 starts flat in the light's direction, 30 overfits.
+        boost: beta. With 1 the initial colour hardly depends on the light's direction; 30 overfits.
         falloff: divide the light's intensity by the squared distance, in scene units.
         typical: E of a typical training light, in the data's units.
     """
@@ -127,7 +127,7 @@ class LightNetwork(ColourField):
         return RayNet(self.boost * params["net_x"], self.boost * phase, out * factor[:, :, None], base * factor)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Keep the colour of the parent: x~' = x~ m/m' - (mu' - mu)/m'."""
+        """Adapt the parameters to a split, so that children have the parent's colour: x~' = x~ m/m' - (mu' - mu)/m'."""
         r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
         shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
         net_x = params["net_x"].double()
@@ -168,7 +168,7 @@ class LightNetwork(ColourField):
 def prune_light_network_units(
     params: Params, geometry: Geometry, keep: int, boost: float, multiplicative: bool
 ) -> dict[str, Tensor]:
-    """Prune a :class:`LightNetwork` to the ``keep`` units per primitive that change colour most.
+    """Prune a :class:`LightNetwork` to the ``keep`` hidden units per primitive that affect the colour most.
 
     A removed unit is replaced by its mean. With x~ over the ellipsoid, d and l over all directions, the mean of
     cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), b the
@@ -210,7 +210,7 @@ def prune_light_network_units(
 
 
 class LightHarmonics(ColourField):
-    """Baseline colour c = E max(0, SH(direction mu -> light)); no view dependence, no shadows."""
+    """Baseline colour field c = E max(0, SH(direction mu -> light)), without view dependence and shadows."""
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         check_count(degree, 0, 8, "spherical-harmonics degree")
@@ -252,7 +252,7 @@ class LightHarmonics(ColourField):
 
 
 def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
-    """Return (N, (degree + 1)^2) orthonormal real spherical harmonics of unit directions.
+    """Evaluate orthonormal real spherical harmonics at unit directions (N, 3): (N, (degree + 1)^2).
 
     Bands are in order, m = -l..l. By recurrence of the associated Legendre functions without the Condon-Shortley phase:
     P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m -

@@ -1,11 +1,16 @@
 """Load relighting data: one light at a time in the layout of GS³ and NRHints, and the generated ``lit_solids``.
 
-Keys of ``transforms_SPLIT.json``, in a frame or else in the file: the intrinsics of
-:mod:`neuprim.core.cameras.intrinsics` and ``pl_intensity`` (three numbers or one, default 1). In the file:
-``camera_near`` and ``camera_far``, which are only checked. In a frame: ``pl_pos``, the light's position; ``img_path``,
-whose longest existing tail is used, as GS³ saves paths of its machine, else ``file_path`` with ``file_ext``; and a
-pose, where [R_opt^T | T_opt], world to camera with OpenCV axes, wins over ``transform_matrix``. PNG and JPEG hold sRGB
-with straight alpha and become linear light; OpenEXR is linear and premultiplied.
+Keys of ``transforms_SPLIT.json``:
+
+* in each frame, or for all frames at the top level: the intrinsics of :mod:`neuprim.core.cameras.intrinsics`, and
+  ``pl_intensity`` (three numbers or one, default 1)
+* at the top level: ``camera_near`` and ``camera_far``, which are only checked
+* in each frame: ``pl_pos``, the position of the light
+* in each frame, the image: ``img_path``, else ``file_path`` with ``file_ext``. GS³ writes absolute paths of its
+  machine, so the longest tail of ``img_path`` that exists is used.
+* in each frame, the pose: [R_opt^T | T_opt], world to camera with OpenCV axes, else ``transform_matrix``
+
+PNG and JPEG files contain sRGB with straight alpha and are converted to linear light. OpenEXR is linear, premultiplied.
 """
 
 from __future__ import annotations
@@ -77,7 +82,7 @@ class OlatSettings(FolderSettings):
 
 
 def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load the OLAT scene in the folder ``settings["path"]``, in linear light over the exposure."""
+    """Load ``scene=olat`` from ``settings["path"]``; image values are linear light divided by the exposure."""
     options = validate_settings(OlatSettings, settings, "scene")
     folder = find_data_folder(options.path)
     train, test = read_image_splits(
@@ -102,7 +107,7 @@ def load_olat(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 
 
 def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[ImageFrame]:
-    """Read the frames of one split, with lights as conditions; DataError for missing or wrong fields."""
+    """Read the views of one split, with their lights as conditions; DataError for missing or wrong fields."""
     document = JsonReader.open(folder / f"transforms_{split}.json")
     near = document.number_or("camera_near", 3.0, "a distance above 0", 0.0)
     if document.number_or("camera_far", max(10.0, 2.0 * near), f"a distance above camera_near, {near:g}") <= near:
@@ -127,7 +132,7 @@ def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[Ima
 
 
 def _light_of_camera(camera: Camera, light: Tensor) -> Tensor:
-    """Return the (3,) world position of a point in camera coordinates: x right, y up, z backward."""
+    """Convert a point from camera coordinates (x right, y up, z backward) to (3,) world coordinates."""
     view = camera.viewmat.double()
     return view[:3, :3].T @ (light.double() * light.new_tensor([1, -1, -1]) - view[:3, 3])
 
@@ -137,7 +142,7 @@ def _olat_frame_name(record: JsonReader) -> str:
 
 
 def _find_olat_image(folder: Path, record: JsonReader) -> Path | None:
-    """Return the image file of a frame; None if it does not exist."""
+    """Return the image file of an entry in ``frames``; None if it does not exist."""
     if record.has("img_path"):
         parts = record.text("img_path").replace("\\", "/").split("/")
         tails = (
@@ -163,7 +168,7 @@ def _existing_olat_file(path: Path) -> Path | None:
 
 
 def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
-    """Return the (4, 4) float64 world-to-camera matrix of a frame, OpenCV axes."""
+    """Return the (4, 4) float64 world-to-camera matrix of an entry in ``frames``, OpenCV axes."""
     corrected = record.has("R_opt") or record.has("T_opt")
     if not corrected or ignore_corrections:
         if corrected and not record.has("transform_matrix"):
@@ -198,14 +203,14 @@ _Background = Annotated[
 
 @dataclass(frozen=True)
 class LitSolidsSettings(LitSettings):
-    """Settings of ``scene=lit_solids``: what changes the images, and how they are read."""
+    """Settings of ``scene=lit_solids``, for rendering the images and for reading them."""
 
     background: _Background = "black"  # "black", or "random": training composites random colours
     hold_out: HoldOut = 0  # n: every n-th training view is the test split, for tuning; 0 for the split that is drawn
 
 
 def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=lit_solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
+    """Load ``scene=lit_solids``. The first use renders images to ``context.cache_dir``; later uses read them."""
     options = validate_settings(LitSolidsSettings, settings, "scene")
     drawn = LitSettings(**{f.name: getattr(options, f.name) for f in fields(LitSettings)})
     folder = generate_lit_solids(drawn, context.cache_dir, context.progress)
@@ -224,7 +229,7 @@ def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneCo
 
 
 def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
-    """Return pixel classes, test parts, two baselines without a model, and a clip of a circling light."""
+    """Return the facts about ``lit_solids``: pixel classes, test parts, two baselines, a clip of a circling light."""
     names = {"no_cast_shadows": "unshadowed.exr", f"nearest_light_of_{NEAR_LIGHTS}": "nearest.exr"}
     baselines = {name: partial(_read_lit_companion_image, ending) for name, ending in names.items()}
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))
@@ -234,7 +239,7 @@ def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
 
 
 def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
-    """Return (H, W) uint8 pixel classes of a view, indices of :data:`~neuprim.scenes.PIXEL_CLASSES`."""
+    """Read the (H, W) uint8 pixel classes of a view: indices into :data:`~neuprim.scenes.PIXEL_CLASSES`."""
     path = _lit_companion_path(views, "classes.png", index)
     try:
         with Image.open(path, formats=("PNG",)) as image:
@@ -244,9 +249,9 @@ def read_lit_pixel_classes(views: ViewSet, index: int) -> Tensor:
 
 
 def _read_lit_companion_image(ending: str, views: ViewSet, index: int) -> Tensor | None:
-    """Read a further (H, W, 3) image of a view, linear light over the exposure; None if there is none.
+    """Read the (H, W, 3) image of a view whose file name ends with ``ending``; None if the view has none.
 
-    Training views lack "nearest".
+    Values are linear light divided by the exposure. Training views have no image "nearest".
     """
     camera, path = views.view(index).camera, _lit_companion_path(views, ending, index)
     return read_image(path, (camera.width, camera.height))[..., :3].float() if path.is_file() else None

@@ -1,4 +1,4 @@
-"""Facts about the lights of a relighting dataset: falloff, exposure, baselines.
+"""Properties of the lights of a relighting dataset: falloff, exposure, baselines.
 
 Every view has two conditions: "light" (3,), position in scene units, and "light_intensity" (3,), radiant intensity.
 """
@@ -30,7 +30,7 @@ FALLOFF_SPREAD = 0.4  # largest standard error of a measured falloff exponent
 
 @dataclass(frozen=True)
 class Lighting:
-    """Optional facts about a relighting dataset besides images, cameras and lights: its ``extra``."""
+    """Optional facts about a relighting dataset besides images, cameras and lights; stored as its ``extra``."""
 
     # "inverse_square" if images darken with the square of the light's distance, so that a renderer divides by it;
     # "none" if intensities are given as they arrive, or unknown
@@ -47,12 +47,12 @@ class Lighting:
 
 
 def dataset_lighting(dataset: Dataset) -> Lighting:
-    """Return the dataset's lighting facts, or the defaults; DatasetFault if ``extra`` is other data."""
+    """Return the dataset's :class:`Lighting`, or the defaults; DatasetFault if ``extra`` is something else."""
     return get_extra(dataset, Lighting) or Lighting()
 
 
 def olat_percentile_exposure(views: ImageViews, where: str) -> float:
-    """Return the 99.5th percentile of premultiplied values in half precision; DataError if it is 0."""
+    """Return the exposure of images: the 99.5th percentile of premultiplied values; DataError if it is 0."""
     # counts per bit pattern, as patterns of non-negative half floats ascend with their values
     counts = torch.zeros(1 << 15, dtype=torch.int64)
     for i in range(len(views)):
@@ -71,11 +71,12 @@ def olat_percentile_exposure(views: ImageViews, where: str) -> float:
 
 
 def measure_falloff(dataset: Dataset) -> Falloff:
-    """Return whether images darken with the squared light distance; warn if they do not show it.
+    """Return "inverse_square" if images darken with the light's distance, else "none"; warn if the images do not tell.
 
-    A linear fit explains the logarithm of a view's mean value over its intensity by the logarithm of the light's
-    distance, harmonics of degree 2 of the directions to light and camera, and the cosine between the two and its
-    square. A slope below -1 is "inverse_square"; so is an unknown one, as point lights are.
+    The function fits log(mean value of a view / light intensity) by a linear combination of the logarithm of the
+    light's distance, harmonics up to degree 2 of the directions to light and camera, and the cosine between these
+    directions and its square. If the coefficient of the distance is below -1 or cannot be determined, the result is
+    "inverse_square", as for a point light.
     """
     center, views = dataset.center.double(), dataset.train
     rows, values = [], []

@@ -1,12 +1,13 @@
-"""Colour of a surface under a point light: a normal, an albedo, highlights, and light that arrives indirectly.
+"""Colour field of a surface under a point light: normal, albedo, highlights and indirect light.
 
     c = E [ V (max(0, a) s(n . l) + gate(n . l) sum_j max(0, k_j) exp(g_j (n . h - 1))) + max(0, b_0 + B l) ]
 
-n, l and v are unit vectors: the normal, and from the centre to the light and to the camera; h = unit(l + v) is between
-them. s(x) = (x + sqrt(x^2 + 0.01))/2 is a smooth max(0, x), gate(x) = 1/(1 + exp(-20 x)). The lobes are spherical
-Gaussians in the half vector (Wang et al. 2009, All-frequency rendering of dynamic, spatially-varying reflectance). V is
-the visibility of the light, which does not affect indirect light; E is the light's strength, as for
-:class:`~neuprim.tasks.relight.colour.LightNetwork`. All is constant over a primitive.
+n, l and v are unit vectors: the normal, and the directions from the primitive's centre to the light and to the camera.
+h = unit(l + v) is the half vector. s(x) = (x + sqrt(x^2 + 0.01))/2 is a smooth max(0, x), gate(x) = 1/(1 + exp(-20 x)).
+a is the albedo. The sum over j is over highlight lobes with colours k_j and sharpnesses g_j: spherical Gaussians in the
+half vector (Wang et al. 2009, All-frequency rendering of dynamic, spatially-varying reflectance). b_0 + B l is indirect
+light. V is the visibility of the light. E is the light's strength, as for
+:class:`~neuprim.tasks.relight.colour.LightNetwork`. The colour is constant over a primitive.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from neuprim.tasks.relight.colour import check_count
 from neuprim.tasks.relight.surface_constants import GATE, SHORTEST, WRAP
 
 INDIRECT = (0, 1, 4)
-"""Numbers per channel of the indirect light: none, b_0, or b_0 and B."""
+"""Possible numbers of coefficients of indirect light per channel: none, b_0, or b_0 and B."""
 
 _GLOSS = 20.0  # initial sharpness of the first lobe; each further one is six times as sharp
 _HIGHLIGHT, _INDIRECT = 0.1, 0.02
@@ -51,19 +52,20 @@ def surface_colors(
     light: Tensor,
     eye: Tensor,
 ) -> Tensor:
-    """Return (N, 2, C) colours of the module's equation for E = V = 1: direct and indirect part.
+    """Return (N, 2, C) linear colours of N primitives, direct and indirect: the module's equation for E = V = 1.
 
-    They are linear light. Fused on float32 tensors; differentiable in all but ``sizes``.
+    Float32 tensors are computed by fused kernels. Differentiable with respect to all inputs but ``sizes``.
 
     Args:
-        means: (N, 3) scene units. sizes: (N,) of the primitives, scene units.
+        means: (N, 3) centres, scene units.
+        sizes: (N,) sizes of the primitives, scene units.
         normal: (N, 3), of any length. albedo: (N, C).
-        highlight: (N, L, C), L from 0 to 8. log_gloss: (N, L) natural logarithms of g.
-        indirect: (N, B, C), B one of :data:`INDIRECT`; b_0, then B's columns for x, y and z.
-        light, eye: (3,) positions.
+        highlight: (N, L, C) colours of lobes, L from 0 to 8. log_gloss: (N, L) natural logarithms of g.
+        indirect: (N, n, C), n one of :data:`INDIRECT`: b_0, then the columns of B for x, y and z.
+        light, eye: (3,) positions, scene units.
 
     Raises:
-        FormError: a tensor does not fit.
+        FormError: a tensor has a wrong shape.
     """
     sizes_by_name: Sizes = {}
     fault = primitive_tensors_fault(
@@ -115,9 +117,9 @@ def _unit(vector: Tensor, shortest: Tensor | float) -> Tensor:
 
 
 def initial_normals(context: InitContext) -> Tensor:
-    """Return (N, 3) float32 unit normals of starting points.
+    """Estimate (N, 3) float32 unit normals of starting points.
 
-    A normal is the direction in which the point's neighbours vary least; it points away from the middle of all points.
+    A normal is the direction of least variance of the point's neighbours, oriented away from the mean of all points.
     """
     points = context.means.double()
     away = points - points.mean(0)
@@ -130,12 +132,12 @@ def initial_normals(context: InitContext) -> Tensor:
 
 
 class SurfaceColour(ColourField):
-    """Colour of a surface under a point light (see the module): 6 + 4 L + 3 B numbers of three channels.
+    """Colour field of a surface under a point light (see the module); 6 + 4 L + 3 n parameters for three channels.
 
     Args:
-        lobes: L, 0..8.
-        indirect: B, one of :data:`INDIRECT`.
-        visibility: "none" or "primitive": where the light's depth images are read.
+        lobes: L, number of highlight lobes, 0..8.
+        indirect: n, coefficients of indirect light per channel, one of :data:`INDIRECT`.
+        visibility: "none", or "primitive": the visibility of the light is computed once per primitive.
         falloff, typical: as in :class:`~neuprim.tasks.relight.colour.LightNetwork`.
     """
 
@@ -203,9 +205,9 @@ class SurfaceColour(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[SurfaceColour, dict[str, Tensor]]:
-        """Keep fewer numbers of indirect light, or fewer lobes.
+        """Return a smaller colour field: fewer coefficients of indirect light, or fewer lobes.
 
-        Lobes with the largest integral over the sphere times colour are kept.
+        The remaining lobes are those with the largest product of colour and integral over the sphere.
         """
         field, found = SurfaceColour(**{**self.settings(), name: value}), dict(params)
         if name == "indirect":
@@ -222,7 +224,7 @@ class SurfaceColour(ColourField):
         return field, found
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one unit per lobe, and one of the direction of indirect light."""
+        """Return one prunable unit per lobe, and one for the directional part of indirect light."""
         found = [PrunableUnit(f"lobe {j}", {"highlight": (j,), "log_gloss": (j,)}) for j in range(self.lobes)]
         if self.indirect > 1:
             found.append(PrunableUnit("direction of indirect light", {"indirect": (slice(1, None),)}))

@@ -19,9 +19,10 @@ _CHUNK = 2048  # primitives per unit of work
 
 @strict
 def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
-    """Return a vector over max(length, ``shortest``), that divisor's reciprocal, and 1.0 for unit length.
+    """Divide a vector by max(length, ``shortest``); return it, the reciprocal of the divisor, and 1.0 or 0.0.
 
-    The last is 0.0 for a shortened vector; the gradient of a unit vector has no part along it. NaN stays NaN.
+    The last value is 1.0 if the result has unit length. The backward pass needs it: the gradient of a normalised vector
+    has no component along the vector. NaN stays NaN.
     """
     length, whole = np.sqrt(x * x + y * y + z * z), 1.0
     if not length >= shortest:
@@ -32,7 +33,7 @@ def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
 
 @strict
 def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
-    """Convert row i of ``g`` from the gradient of the output of :func:`_unit` to that of its input."""
+    """Convert row i of ``g`` in place: from the gradient of the output of :func:`_unit` to that of the input."""
     x, y, z, over, whole = unit
     along = (g[i, 0] * x + g[i, 1] * y + g[i, 2] * z) * whole
     g[i, 0], g[i, 1], g[i, 2] = (g[i, 0] - along * x) * over, (g[i, 1] - along * y) * over, (g[i, 2] - along * z) * over
@@ -40,7 +41,7 @@ def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
 
 @strict
 def _directions(i, means, sizes, normal, light, eye):  # type: ignore[no-untyped-def]
-    """Return normal, directions to light and camera, and half vector, each as :func:`_unit` does."""
+    """Return the normal, the directions to light and camera, and the half vector of primitive i, by :func:`_unit`."""
     shortest = SHORTEST * np.float64(sizes[i])
     n = _unit(np.float64(normal[i, 0]), np.float64(normal[i, 1]), np.float64(normal[i, 2]), SHORTEST)
     l = _unit(light[0] - means[i, 0], light[1] - means[i, 1], light[2] - means[i, 2], shortest)
@@ -84,7 +85,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
     start, stop, means, sizes, normal, albedo, highlight, log_gloss, indirect, light, eye, grad,
     g_light, g_eye, g_normal, g_albedo, g_highlight, g_log_gloss, g_indirect,
 ):  # fmt: skip
-    """Write the gradients; g_light, g_eye (N, 3) are those of the vectors to light and camera."""
+    """Write the gradients of all inputs; g_light and g_eye (N, 3) are those of the vectors to light and camera."""
     lobes, numbers, channels = log_gloss.shape[1], indirect.shape[1], albedo.shape[1]
     g_l = np.empty(3)
     for i in range(start, stop):

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""GPU kernels of surface colours, one thread per primitive, float64 inside; on CPUs ``surface_cpu``."""
+"""CUDA kernels of ``surface.surface_colors``, one thread per primitive, in float64; for CPUs see ``surface_cpu``."""
 
 from typing import Any
 
@@ -163,7 +163,7 @@ class _SurfaceColors(torch.autograd.Function):
 def fused_surface_colors(*tensors: Tensor) -> Tensor:
     """Compute :func:`~neuprim.tasks.relight.surface.surface_colors` of float32 GPU tensors; differentiable.
 
-    Needs at least one lobe and one number of indirect light.
+    The tensors must have at least one lobe and one coefficient of indirect light.
     """
     result: Tensor = _SurfaceColors.apply(*tensors)
     return result

@@ -1,4 +1,4 @@
-"""The static task: a scene that does not change, from posed images."""
+"""The task ``static``: fit a scene that does not change to images with known cameras."""
 
 from __future__ import annotations
 
@@ -64,13 +64,13 @@ def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, .
 
 
 def _load_static_scene(module: str, function: str, settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Import a loader and call it; imported only when used, as each needs a library of its own."""
+    """Import a scene loader on first use and call it; each loader needs a library of its own."""
     loader: Callable[..., Dataset] = getattr(import_module(f"neuprim.tasks.static.{module}"), function)
     return loader(settings, context)
 
 
 def _static_dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
-    """Return file name and ``scene_from_file`` of a rendered mesh; empty for other data."""
+    """Return file name and ``scene_from_file`` of ``scene=mesh`` for the model's header; empty for other data."""
     return dataset.extra if isinstance(dataset.extra, dict) else {}
 
 

@@ -1,4 +1,4 @@
-"""Colours of static scenes, which depend on the direction of view: spherical harmonics or spherical Gaussian lobes."""
+"""View-dependent colour fields of static scenes: spherical harmonics (SH) or spherical Gaussian lobes."""
 
 from __future__ import annotations
 
@@ -23,7 +23,8 @@ _SHARPNESS = 2.0  # initial sharpness of a lobe: half as bright 49 degrees off i
 class SphericalHarmonics(ColourField):
     """SH colour c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; C (degree + 1)^2 parameters.
 
-    While training, one band is unlocked every ``sh_every`` of the budget; a loaded model uses all of them.
+    During training, one more SH band becomes active after every fraction ``sh_every`` of the training budget. A loaded
+    model uses all bands.
     """
 
     def __init__(self, degree: int = 3, channels: int = 3, sh_every: float = 0.0) -> None:
@@ -58,7 +59,7 @@ class SphericalHarmonics(ColourField):
         return params["sh_dc"], params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one unit per coefficient above degree 0 and channel."""
+        """Return one prunable unit per SH coefficient above degree 0 and channel."""
         return sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest")
 
     def script(self) -> str:
@@ -73,9 +74,9 @@ class SphericalHarmonics(ColourField):
 class SphericalLobes(ColourField):
     """Colour of 0..8 spherical Gaussian lobes, c = max(0, C0 sh_dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))).
 
-    d is the direction camera -> mu. C + L (C + 4) parameters: a lobe has an amplitude a_l per channel, an axis m_l
-    (three numbers, normalised when used) and the logarithm of its sharpness s_l. Lobes start at amplitude zero around
-    random axes.
+    d is the direction camera -> mu. L lobes and C channels have C + L (C + 4) parameters. A lobe has an amplitude a_l
+    per channel, an axis m_l (three parameters, normalised when used) and the logarithm of a sharpness s_l. Lobes start
+    with random axes and amplitude zero.
     """
 
     def __init__(self, lobes: int = 2, channels: int = 3) -> None:
@@ -106,7 +107,7 @@ class SphericalLobes(ColourField):
         return SphericalLobes(value, self.channels), lobes.reduce_lobes(params, value)
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one unit per lobe."""
+        """Return one prunable unit per lobe."""
         names = (AMPLITUDE, AXIS, LOG_SHARPNESS)
         return tuple(PrunableUnit(f"lobe {j}", dict.fromkeys(names, (j,))) for j in range(self.lobes))
 

@@ -1,4 +1,4 @@
-"""Load data sets of posed images: NeRF-synthetic ("blender"), nerfstudio and COLMAP folders, and generated scenes."""
+"""Load images with known cameras: NeRF-synthetic ("blender"), nerfstudio and COLMAP folders, and generated scenes."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ class BlenderSettings(FolderSettings):
 
 
 def load_blender(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a NeRF-synthetic folder; straight-alpha PNG is premultiplied in its stored sRGB values."""
+    """Load ``scene=blender``, a NeRF-synthetic folder. Straight-alpha PNGs are premultiplied in sRGB values."""
     asked = validate_settings(BlenderSettings, settings, "scene")
     folder = find_data_folder(asked.path)
 
@@ -96,7 +96,7 @@ class NerfstudioSettings(FolderSettings):
 
 
 def load_nerfstudio(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a nerfstudio or instant-ngp capture; photographs are undistorted and masked."""
+    """Load ``scene=nerfstudio``, a nerfstudio or instant-ngp capture. Photographs are undistorted and masked."""
     asked = validate_settings(NerfstudioSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     path = folder / "transforms.json"
@@ -127,7 +127,7 @@ class ColmapSettings(FolderSettings):
 
 
 def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a COLMAP project with its points; photographs are undistorted, pixels outside them masked."""
+    """Load ``scene=colmap``, a COLMAP project with points. Undistorts photographs and masks pixels outside them."""
     asked = validate_settings(ColmapSettings, settings, "scene")
     folder = find_data_folder(asked.path)
     model = folder / asked.model
@@ -178,7 +178,7 @@ def _read_colmap_frames(model: Path, folder: Path, reconstruction: Any, asked: C
 
 
 def _warn_of_unposed_images(place: Path, posed: set[Path], model: Path) -> None:
-    """Warn about images in the folder ``place`` that have no pose in the COLMAP model."""
+    """Warn about images in the folder ``place`` that have no pose in the COLMAP reconstruction ``model``."""
     images = {p for p in place.rglob("*") if p.suffix.lower() in IMAGE_SUFFIXES}
     others = [p for p in images - posed if not p.name.startswith("dynamic_mask_")]
     if others:
@@ -206,7 +206,7 @@ def _colmap_dataset_camera(where: str, image: Any, viewmat: Tensor, file: Path, 
 
 @dataclass(frozen=True)
 class _ColmapDatasetLens(Distortion):
-    """Distortion of any COLMAP camera model, scaled to the image files' size; pycolmap projects."""
+    """Lens distortion of any COLMAP camera model, computed by pycolmap and scaled to the size of the image files."""
 
     model: str
     width: int
@@ -229,7 +229,7 @@ class _ColmapDatasetLens(Distortion):
 
 
 def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud | None:
-    """Return the reconstruction's points in the order of their ids; None if there are none."""
+    """Return the points of a COLMAP reconstruction in the order of their ids; None if it has no points."""
     points = [p for _, p in sorted(reconstruction.points3D.items())]
     if not points:
         return None
@@ -243,13 +243,13 @@ def _read_colmap_dataset_points(reconstruction: Any, model: Path) -> PointCloud 
 
 
 def load_solids_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=solids``: drawn on first use, read from ``context.cache_dir`` afterwards."""
+    """Load ``scene=solids``. The first use renders the images to ``context.cache_dir``; later uses read them."""
     folder = generate_solids(validate_settings(SolidsSettings, settings, "scene"), context.cache_dir, context.progress)
     return replace(load_blender({"path": str(folder)}, context), name="solids", data_source="generated")
 
 
 def load_room_dataset(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=room``: drawn on first use, read from ``context.cache_dir`` afterwards."""
+    """Load ``scene=room``. The first use renders the images to ``context.cache_dir``; later uses read them."""
     folder = generate_room(validate_settings(RoomSettings, settings, "scene"), context.cache_dir, context.progress)
     dataset = load_nerfstudio({"path": str(folder)}, context)
     return replace(dataset, name="room", data_source="generated", up=torch.tensor([0.0, 0.0, 1.0]))

@@ -1,4 +1,4 @@
-"""Read and write OpenVDB files without the OpenVDB library: by numpy, zlib and the package ``blosc``.
+"""Read and write OpenVDB files with numpy, zlib and the package ``blosc``, without the OpenVDB library.
 
 Every failure is a DataError that names the file, what was found and what was expected. Memory is allocated only for
 data that a file's bytes can hold, whatever the file claims.

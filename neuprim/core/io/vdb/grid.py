@@ -1,4 +1,4 @@
-"""A sparse volume in memory: blocks of 8 x 8 x 8 voxels, larger constant tiles, and where they lie in the world."""
+"""A sparse volume in memory: blocks of 8 x 8 x 8 voxels, larger constant tiles, and the transform to world space."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Bounds = tuple[tuple[int, int, int], tuple[int, int, int]]
 
 @dataclass(frozen=True, eq=False)
 class VdbTiles:
-    """T constant tiles: cubes of voxels with one value each."""
+    """T constant tiles of a sparse volume: cubes in which all voxels have the same value."""
 
     origins: np.ndarray  # (T, 3) int32, the lowest index of each
     sizes: np.ndarray  # (T,) int32, edges in voxels, each one of TILE_SIZES
@@ -45,10 +45,10 @@ class VdbTiles:
 def vdb_scale_transform(
     voxel_size: float | Sequence[float] = 1.0, translation: Sequence[float] = (0.0, 0.0, 0.0)
 ) -> np.ndarray:
-    """Return a (4, 4) index-to-world transform for voxels of a size, with the centre of voxel 0 at ``translation``.
+    """Return a (4, 4) index-to-world transform that puts the centre of voxel (0, 0, 0) at ``translation``.
 
     Args:
-        voxel_size: edge length, one or one per axis, world units.
+        voxel_size: edge length of a voxel, one or one per axis, in world units.
     """
     matrix = np.eye(4)
     matrix[range(3), range(3)] = voxel_size
@@ -60,8 +60,8 @@ def vdb_scale_transform(
 class VdbGrid:
     """A sparse grid of numbers (float) or vectors (vec3s): leaves of 8 x 8 x 8 voxels, and constant tiles.
 
-    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. All other voxels have the background
-    value and are not active. Values that are not finite are kept; :attr:`non_finite` counts them.
+    A voxel with index (i, j, k) has its *centre* at ``transform @ (i, j, k, 1)``. Voxels outside leaves and tiles have
+    the background value and are not active. NaN and infinite values are allowed; :attr:`non_finite` counts them.
     """
 
     name: str
@@ -86,7 +86,9 @@ class VdbGrid:
         half: bool = False,
         metadata: Mapping[str, Any] | None = None,
     ) -> VdbGrid:
-        """Return a fog volume whose active voxels differ from the background; DataError for a wrong shape or range.
+        """Convert a dense array to a fog volume; voxels that differ from ``background`` become active.
+
+        Raises DataError for a wrong shape or range.
 
         Args:
             array: (X, Y, Z) or (X, Y, Z, 3) values of any real type; stored as float32.
@@ -124,12 +126,12 @@ class VdbGrid:
 
     @property
     def channels(self) -> int:
-        """Numbers per voxel: 1 or 3."""
+        """Number of values per voxel: 1 or 3."""
         return 3 if self.values.ndim == 5 else 1
 
     @property
     def voxel_size(self) -> tuple[float, float, float]:
-        """Edge lengths of a voxel in world units."""
+        """Edge lengths (x, y, z) of a voxel in world units."""
         x, y, z = np.linalg.norm(self.transform[:3, :3], axis=0).tolist()
         return x, y, z
 
@@ -140,7 +142,7 @@ class VdbGrid:
 
     @cached_property
     def bounds(self) -> Bounds | None:
-        """Box around all active voxels, in indices; None without any."""
+        """Box around all active voxels, in voxel indices; None if no voxel is active."""
         lows, highs = [], []
         used = np.asarray(self.masks.any((1, 2, 3)))
         if used.any():
@@ -158,7 +160,7 @@ class VdbGrid:
         return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     def world_bounds(self) -> np.ndarray | None:
-        """Return the (2, 3) float64 box around all active voxels, with their extent, world units; None without."""
+        """Return the (2, 3) float64 box around all active voxels, edges included, in world units; None without any."""
         if self.bounds is None:
             return None
         corners = np.stack(np.meshgrid(*np.array(self.bounds, float).T - 0.5, indexing="ij"), -1).reshape(-1, 3)
@@ -166,12 +168,12 @@ class VdbGrid:
         return np.stack([world.min(0), world.max(0)])
 
     def active_values(self) -> np.ndarray:
-        """Return the (M,) or (M, 3) float32 values of active leaf voxels, and one value per active tile."""
+        """Return (M,) or (M, 3) float32: one value per active leaf voxel, then one per active tile."""
         return np.concatenate([self.values[self.masks], self.tiles.values[self.tiles.active]])
 
     @cached_property
     def range(self) -> tuple[float, float] | None:
-        """Smallest and largest finite active value, of all channels; None without any."""
+        """Smallest and largest finite active value, over all channels; None if there is none."""
         values = self.active_values()
         values = values[np.isfinite(values)]
         return (float(values.min()), float(values.max())) if values.size else None
@@ -188,7 +190,7 @@ class VdbGrid:
 
     @property
     def dense_bytes(self) -> int:
-        """Bytes of the box of active voxels as a float32 array."""
+        """Bytes of :meth:`to_dense` for the box of all active voxels."""
         return (
             0
             if self.bounds is None
@@ -198,11 +200,11 @@ class VdbGrid:
     def to_dense(
         self, bounds: Bounds | None = None, max_bytes: int = DENSE_LIMIT, non_finite: float | None = None
     ) -> np.ndarray:
-        """Return every voxel of a box, active or not, as (X, Y, Z) or (X, Y, Z, 3) float32.
+        """Return all voxels of a box, active or not, as a dense (X, Y, Z) or (X, Y, Z, 3) float32 array.
 
         Args:
-            bounds: the box, in indices; None for :attr:`bounds`, or no voxels if none is active.
-            max_bytes: limit of the memory, with up to 7 more voxels on each side; DataError beyond.
+            bounds: the box, in voxel indices; None for :attr:`bounds` (an empty array if no voxel is active).
+            max_bytes: memory limit for the box and up to 7 more voxels on each side; DataError beyond.
             non_finite: value that replaces NaN and infinity; None keeps them.
         """
         box = self.bounds if bounds is None else bounds

@@ -1,4 +1,4 @@
-"""Read the headers of OpenVDB files; every length is checked before memory is allocated."""
+"""Read the headers of OpenVDB files. Every length is checked before memory is allocated."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _BLOSC_HEADER = struct.Struct("<4xI4xI")  # first 16 bytes of a chunk: unpacked 
 
 
 class VdbCursor:
-    """A position ``at`` in the ``data`` of a file that cannot go beyond ``end``."""
+    """A read position ``at`` in the ``data`` of an OpenVDB file; reads cannot go beyond ``end``."""
 
     __slots__ = ("at", "data", "end", "path")
 
@@ -29,11 +29,11 @@ class VdbCursor:
         self.end = len(data) if end is None else end
 
     def fail(self, text: str) -> DataError:
-        """Return the error to raise for something wrong at or before this position."""
+        """Return the DataError to raise for invalid data at or before this position."""
         return DataError(f"{self.path}: {text}")
 
     def need(self, count: int, what: str) -> None:
-        """Raise DataError unless ``count`` more bytes are there."""
+        """Raise DataError, naming ``what``, unless ``count`` more bytes follow."""
         if not 0 <= count <= self.end - self.at:
             found = f"{what} at byte {self.at} needs {count} bytes, but {self.end - self.at} are left there"
             raise self.fail(f"{found}; truncated or damaged OpenVDB file")
@@ -52,7 +52,7 @@ class VdbCursor:
         return struct.unpack("<" + layout, self.take(struct.calcsize("<" + layout), what))
 
     def text(self, what: str) -> str:
-        """Read a text: its length (uint32) and UTF-8 bytes; invalid bytes become U+FFFD."""
+        """Read a string: its length (uint32), then UTF-8 bytes. Invalid bytes become U+FFFD."""
         (length,) = self.unpack("I", f"length of {what}")
         return self.take(length, what).decode("utf-8", errors="replace")
 
@@ -76,13 +76,13 @@ def open_cursor(path: Path) -> Iterator[VdbCursor]:
 
 
 def vdb_compression_label(flags: int) -> str:
-    """Return OpenVDB's own name of a compression, for example ``blosc + active values``."""
+    """Return OpenVDB's name for the compression ``flags``, for example ``blosc + active values``."""
     codec = "blosc" if flags & BLOSC else "zip" if flags & ZIP else ""
     return " + ".join(word for word in (codec, "active values" if flags & MASK else "") if word) or "none"
 
 
 def blosc_module() -> Any:
-    """Return the package ``blosc``, set to one thread: threads would start and join for every leaf of 2 KB."""
+    """Import the package ``blosc``, set to one thread: starting threads for every leaf of 2 KB is slow."""
     try:
         import blosc
     except ImportError as error:
@@ -93,7 +93,7 @@ def blosc_module() -> Any:
 
 
 def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
-    """Return the function (chunk, size) -> bytes that undoes a grid's compression, or raises ValueError."""
+    """Return the function (chunk, size) -> bytes that decompresses a grid's data, or raises ValueError."""
     if not flags & BLOSC:
         return _unzip_vdb_chunk
     blosc = blosc_module()
@@ -149,7 +149,7 @@ _METADATA = {
 
 @dataclass(frozen=True)
 class GridHeader:
-    """Header of one grid of a file."""
+    """Header of one grid of an OpenVDB file."""
 
     name: str  # unique in its file: further grids of one name get [1], [2], ... as in OpenVDB
     type: str  # OpenVDB's tree type, without the suffix for half floats
@@ -165,13 +165,13 @@ class GridHeader:
 
     @property
     def kind(self) -> str:
-        """Class of the grid: ``fog volume``, ``level set``, ``staggered`` or ``unknown``."""
+        """Grid class: ``fog volume``, ``level set``, ``staggered`` or ``unknown``."""
         value = self.metadata.get("class")
         return value if isinstance(value, str) and value else "unknown"
 
     @property
     def channels(self) -> int:
-        """Numbers per voxel: 1 for float, 3 for vec3s, 0 for types that neuprim does not read."""
+        """Number of values per voxel: 1 for float, 3 for vec3s, 0 for types that neuprim cannot read."""
         return _CHANNELS.get(self.type, 0)
 
     @property
@@ -187,7 +187,7 @@ class GridHeader:
         return x, y, z
 
     def undecodable(self) -> str | None:
-        """Return why the voxels cannot be decoded, or None."""
+        """Return why neuprim cannot decode the voxels of the grid; None if it can."""
         if "ptdataidx" in self.type or "ptidx" in self.type:
             return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
         if not self.channels:
@@ -197,7 +197,7 @@ class GridHeader:
         return None
 
     def refusal(self) -> str | None:
-        """Return why the grid cannot be used as a volume, or None."""
+        """Return why neuprim cannot use the grid as a volume; None if it can."""
         if self.kind == "level set":
             return "is a level set: signed distances to a surface, not densities; convert it to a fog volume first"
         return self.undecodable()
@@ -214,7 +214,7 @@ class FileHeader:
     grids: tuple[GridHeader, ...]
 
     def grid(self, name: str) -> GridHeader:
-        """Return the header of a grid; raises DataError with similar names if there is none."""
+        """Return the header of the grid ``name``; raises DataError, which suggests similar names, if there is none."""
         for grid in self.grids:
             if grid.name == name:
                 return grid
@@ -223,13 +223,13 @@ class FileHeader:
 
 
 def read_header(path: Path) -> FileHeader:
-    """Return the header of a file without decoding voxels; raises DataError."""
+    """Return the header of an OpenVDB file without decoding voxels; raises DataError."""
     with open_cursor(Path(path)) as cursor:
         return parse_header(cursor)
 
 
 def parse_header(cursor: VdbCursor) -> FileHeader:
-    """Return the header, as :func:`read_header`, of an open file whose cursor is at the start."""
+    """Like :func:`read_header`, for an open file whose cursor is at the start."""
     if cursor.end < 8 or cursor.unpack("q", "the magic number") != (MAGIC,):
         expected = f"{MAGIC.to_bytes(8, 'little').hex(' ')} (an OpenVDB file)"
         raise cursor.fail(f"starts with {cursor.data[:8].hex(' ')}; expected {expected}")

@@ -1,7 +1,7 @@
-"""Read grids: decode trees of root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ slots of 8³) and leaves.
+"""Read grids: decode trees of root, upper nodes (32³ slots of 128³ voxels), lower nodes (16³ of 8³) and leaves.
 
 The layout is OpenVDB's (``RootNode``, ``InternalNode``, ``LeafNode``, ``io/Compression.h``), versions 222 to 224: first
-the topology, depth first, in which a leaf is 64 bytes of mask; then all leaf buffers in the same order.
+the topology, depth first, where a leaf is a mask of 64 bytes; then the values of all leaves in the same order.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ LEAF_LIMIT = 4 * 2**30
 
 
 def read_grid(path: Path, name: str, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False) -> VdbGrid:
-    """Return one grid of a file; the others are not decoded. Arguments and errors as of :func:`read_grids`."""
+    """Read one grid of an OpenVDB file; other grids are not decoded. Arguments and errors as of :func:`read_grids`."""
     return next(read_grids(path, (name,), max_bytes=max_bytes, level_sets=level_sets))
 
 
 def read_grids(
     path: Path, names: Sequence[str] | None = None, *, max_bytes: int = LEAF_LIMIT, level_sets: bool = False
 ) -> Iterator[VdbGrid]:
-    """Return several grids of a file, decoded one at a time.
+    """Read several grids of an OpenVDB file, decoded one at a time.
 
     Args:
-        names: names of the grids, in this order; None for all that can be decoded, in file order.
-        max_bytes: limit of the memory for leaves and tiles of each grid.
-        level_sets: read signed distances too, for inspection.
+        names: names of the grids to read, in this order; None for all that neuprim can decode, in file order.
+        max_bytes: memory limit for the leaves and tiles of each grid.
+        level_sets: also accept level sets (signed distances), for inspection.
 
     Raises:
         DataError: the file is damaged or too large, or has no such grid.
@@ -103,7 +103,7 @@ UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
-    """Decoder of the tree of ``source``, called ``what``, into the arrays of a VdbGrid of at most ``max_bytes``."""
+    """Decodes the tree of grid ``what`` at ``source`` into the arrays of a VdbGrid of at most ``max_bytes``."""
 
     def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
@@ -257,7 +257,7 @@ class _TreeReader:
         return np.frombuffer(raw, "<f4").reshape(self._shape).astype(np.float32)
 
     def _leaves(self, first: int, last: int) -> None:
-        """Decode leaves ``first`` to ``last`` - 1: one loop over their headers, then whole arrays."""
+        """Decode leaves ``first`` to ``last`` - 1: loop over their headers, then convert all values at once."""
         masks, special, whole, payloads = self._leaf_bytes(first, last)
         active = _unpack_vdb_mask(masks).reshape(-1, _LEAF)
         values = self.values[first:last]
@@ -280,7 +280,10 @@ class _TreeReader:
     def _leaf_bytes(
         self, first: int, last: int
     ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
-        """Read masks, leaves whose inactive values are not the background, leaves that store all values, and values."""
+        """Read the bytes of leaves.
+
+        Returns masks, leaves whose inactive values are not the background, leaves that store all values, and values.
+        """
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
         unit, masked, packed, nothing = self._stored_size, self._flags & MASK, self._packed, self._half
@@ -330,7 +333,7 @@ def _unpack_vdb_mask(raw: bytes) -> np.ndarray:
 
 @dataclass(frozen=True)
 class VdbFrame:
-    """One file of a sequence."""
+    """One .vdb file of a sequence of time steps."""
 
     number: int  # number in the name of the file
     path: Path
@@ -338,7 +341,7 @@ class VdbFrame:
 
 @dataclass(frozen=True)
 class VdbSequence:
-    """A sequence of files, in the order of the numbers in their names."""
+    """The .vdb files of a folder, one per time step, in the order of the numbers in their names."""
 
     folder: Path
     frames: tuple[VdbFrame, ...]  # one or more

@@ -1,4 +1,4 @@
-"""Write OpenVDB files of version 224, in OpenVDB's own layout."""
+"""Write OpenVDB files of file version 224."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ _STALE = ("file_mem_bytes", "file_delayed_load")
 def write_vdb(
     path: Path, grids: Sequence[VdbGrid], *, compression: str = "blosc", metadata: Mapping[str, Any] | None = None
 ) -> None:
-    """Write grids to a file, which is complete or absent.
+    """Write grids to an OpenVDB file, atomically.
 
     Args:
         grids: one or more grids with different names; those with ``half`` are rounded to 16-bit floats.
         compression: "none", "zip" or "blosc".
-        metadata: metadata of the file: str, bool, int, float, or three ints or floats each.
+        metadata: metadata of the file by name; values are str, bool, int, float, or three ints or floats.
 
     Raises:
-        DataError: the format cannot hold a grid or entry.
+        DataError: the format cannot represent a grid or a metadata value.
         BackendUnavailable: the package ``blosc`` is missing.
     """
     path = Path(path)
@@ -120,7 +120,7 @@ def _grid_metadata(grid: VdbGrid, flags: int, where: str) -> bytes:
 
 
 def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
-    """Pack a transform as the simplest of OpenVDB's maps that equals it."""
+    """Encode a (4, 4) transform as the simplest of OpenVDB's maps that represents it exactly."""
     matrix = np.asarray(matrix, np.float64)
     sound = matrix.shape == (4, 4) and np.isfinite(matrix).all() and (matrix[3] == (0, 0, 0, 1)).all()
     if not sound or np.linalg.det(matrix) == 0:
@@ -139,7 +139,7 @@ def _pack_vdb_transform(matrix: np.ndarray, where: str) -> bytes:
 
 
 class _TreeWriter:
-    """Encoder of a grid into ``topology`` and ``buffers``, the two parts of its tree."""
+    """Encodes the tree of a grid into its two parts, ``topology`` and ``buffers``."""
 
     def __init__(self, grid: VdbGrid, flags: int, where: str) -> None:
         self._grid, self._where = grid, where
@@ -246,7 +246,7 @@ class _TreeWriter:
 def _group_by_block(
     size: int, leaves: np.ndarray, tiles: np.ndarray
 ) -> list[tuple[tuple[int, int, int], tuple[np.ndarray, np.ndarray]]]:
-    """Return (corner, (leaf indices, tile indices)) for each block of ``size`` voxels that holds any."""
+    """Return (corner, (leaf indices, tile indices)) for each block of ``size`` voxels that has leaves or tiles."""
     corners, inverse = np.unique(np.concatenate([leaves, tiles]) // size * size, axis=0, return_inverse=True)
     order, count = np.argsort(inverse, kind="stable"), len(leaves)
     ends = np.cumsum(np.bincount(inverse.ravel(), minlength=len(corners))).tolist()
@@ -265,7 +265,7 @@ def _vdb_slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: 
 
 
 def _value_packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
-    """Return the function that packs values of ``unit`` bytes: with OpenVDB's length in front if ``flags`` compress."""
+    """Return the function that packs values of ``unit`` bytes; if ``flags`` compress, the length comes first."""
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw
     blosc = blosc_module() if flags & BLOSC else None

@@ -1,1 +1,1 @@
-"""Numba backend: float64 preparation per primitive, float32 pixels, all cores."""
+"""The cpu backend, in numba on all cores: per-primitive stage in float64, pixel stage in float32."""

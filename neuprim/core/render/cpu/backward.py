@@ -1,7 +1,7 @@
-"""Backward pass of compositing in the order of centres: back to front, recovering T by T/(1 - alpha).
+"""Backward pass of compositing sorted by centres: goes back to front and recovers T as T/(1 - alpha).
 
-The lanes' optical depths come from the forward pass. Each (tile, primitive) pair writes one gradient row; a primitive's
-rows are added in a fixed order, so that the result has the same bits for any number of threads.
+A lane is one pixel of a (tile, primitive) pair. The forward pass saved the lanes' optical depths. Each pair writes one
+row of gradients. The rows of a primitive are added in a fixed order, so any number of threads gives the same bits.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ Array = np.ndarray[Any, Any]
 
 
 class ImageGradient(NamedTuple):
-    """Inputs of the backward kernels for one frame, and the gradient rows that they fill."""
+    """Inputs of the backward kernels for one frame, and the rows of gradients that the kernels fill."""
 
     # results of the forward pass
     transmittance: Array
@@ -66,7 +66,7 @@ class ImageGradient(NamedTuple):
 
 @inline
 def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
-    """Fill DEPTH of every lane, as the forward pass computes it."""
+    """Fill DEPTH, the optical depth of every lane, as in the forward pass."""
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
         if len(edge) > 0:
@@ -76,7 +76,7 @@ def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """Fill ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH, with the forward pass's clamp and cut."""
+    """Fill ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH; clamps as in the forward pass."""
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
@@ -94,7 +94,7 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
-    """Three channels: recover T; fill GRAD, and dL/d RAY_COLOUR with a ``net``; add to 16-wide sums."""
+    """For three channels: recover T; fill GRAD, and with a ``net`` dL/d RAY_COLOUR; add to sums over 16 pixels."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -140,7 +140,7 @@ def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # t
 
 @inline
 def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyped-def]
-    """Any channels: add the sum of c dL/d colour to ``cg``."""
+    """For any number of channels: add the sum of c dL/d colour to ``cg``."""
     for c in range(color.shape[0]):
         st = state[L.G_COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -155,7 +155,10 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 
 @inline
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
-    """Any channels, with depth: recover T; fill weights ``w`` and GRAD; ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz)."""
+    """Any number of channels, with depth: recover T; fill weights ``w`` and GRAD.
+
+    ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz).
+    """
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -177,7 +180,10 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 
 @inline
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
-    """Any channels: add w, w x error and colour gradients of one row to ``sums``; a ``net``: fill dL/d RAY_COLOUR."""
+    """For any number of channels: add w, w x error and colour gradients of one row to ``sums``.
+
+    With a ``net``, also fill dL/d RAY_COLOUR.
+    """
     st = state[base:]
     for k in range(P.TILE):
         sums[k] += w[k]
@@ -197,7 +203,7 @@ def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no
 
 @inline
 def _compact_lane_gradients(S, n, with_depths):  # type: ignore[no-untyped-def]
-    """Compact the lanes that have a gradient, as many have none, and append zeros; return their number."""
+    """Compact the lanes that have a gradient (many have none), append zeros; return the number of lanes."""
     count = 0
     for k in range(0, n, P.TILE):
         if with_depths:
@@ -222,7 +228,7 @@ def _sum_row(sums, first):  # type: ignore[no-untyped-def]
 
 @inline
 def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
-    """Fill a tile's pixel state; returns the largest number of contributors of a pixel."""
+    """Fill the state of a tile's pixels; return the largest number of primitives composited in a pixel."""
     transmittance, last, g_rgb, g_transmittance, g_z, error, _, with_depth = image
     height, width = norms.shape
     state[:] = f(0)
@@ -249,10 +255,10 @@ def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-unt
 
 @kernel
 def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, net, edge):  # type: ignore[no-untyped-def]
-    """Fill the gradient rows of every pair of tiles ``start:stop``; returns the number of evaluated lanes.
+    """Fill the gradient rows of all pairs of tiles ``start:stop``; return the number of evaluated lanes.
 
     ``live``, ``first_lane``, ``depths``: :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of
-    these tiles; the others as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    these tiles. Other arguments as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     live, first_lane, depths = borrow_array(live), borrow_array(first_lane), borrow_array(depths)

@@ -1,7 +1,7 @@
-"""Geometry and neurons of blocks of 32 primitives at a time, in float64.
+"""Compute geometry and neurons of 32 primitives (a block) at a time, in float64.
 
-A block is one flat array with a column of numbers per quantity, at constant offsets, which LLVM vectorises. Strict
-arithmetic gives each primitive the same bits as it would get alone.
+A block is one flat array with a column per quantity, at constant offsets, so that LLVM vectorises. Strict
+floating-point arithmetic gives each primitive the same bits in any block.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ BLOCK = 32  # primitives per block: the columns below fit into the L1 cache
 
 
 def column(number: int) -> int:
-    """Return the offset of a column in a block's memory."""
+    """Return the offset of column ``number`` in the array of a block."""
     return BLOCK * number
 
 
@@ -60,7 +60,7 @@ def dot3(a, b):  # type: ignore[no-untyped-def]
 
 @strict
 def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
-    """Fill geometry and axes s/m of primitives ``which[:n]``; copies of the last one fill up the block."""
+    """Load geometry and axes s/m of primitives ``which[:n]`` into a block; pad with copies of the last one."""
     means, log_scales, quats = parameters.means, parameters.log_scales, parameters.quats
     for k in range(BLOCK):
         i = which[min(k, n - 1)]
@@ -78,7 +78,7 @@ def load_block(which, n, parameters, S):  # type: ignore[no-untyped-def]
 def project_block(S, view):  # type: ignore[no-untyped-def]
     """Fill orientation B in camera axes, orientation LOCAL in scene axes, 1/|q|, centre, anchor (ANCHOR_Z, UX, UY).
 
-    The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same number.
+    The anchor is rounded to float32 *before* it is used, so that the pixel kernels subtract exactly the same value.
     """
     R, t, fx, fy, cx, cy, near = view.R, view.t, view.fx, view.fy, view.cx, view.cy, view.near
     r0, r1, r2 = (R[0, 0], R[0, 1], R[0, 2]), (R[1, 0], R[1, 1], R[1, 2]), (R[2, 0], R[2, 1], R[2, 2])
@@ -114,7 +114,7 @@ def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
-    """Fill the rows' affine rays; TOTAL and BIGGEST, to check that all is finite and within float32."""
+    """Fill the affine rays of a block, and TOTAL and BIGGEST, which show values that are not finite in float32."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     for k in range(BLOCK):
         m, anchor_z, offset = S[M + k], S[ANCHOR_Z + k], S[BLOCK * P.OFFSET + k]
@@ -142,7 +142,7 @@ def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[no-untyped-def]
-    """Fill ``waves`` (K, 6 BLOCK), the neurons of a block and their speeds."""
+    """Fill ``waves`` (K, 6 BLOCK) with the neurons of a block and their rates."""
     W1, b1, w2 = parameters.W1, parameters.b1, parameters.w2
     for k in range(BLOCK):
         S[FASTEST + k] = 0.0
@@ -170,7 +170,7 @@ def _fill_block_neurons(which, n, parameters, turns, S, waves):  # type: ignore[
 
 @strict
 def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped-def]
-    """Fill the float64 rows of primitives ``which[:n]``."""
+    """Fill a block, ``S`` and ``waves``, from primitives ``which[:n]``."""
     load_block(which, n, parameters, S)
     for k in range(BLOCK):
         S[BLOCK * P.OFFSET + k] = parameters.b2[which[min(k, n - 1)]]
@@ -181,7 +181,7 @@ def fill_block(which, n, parameters, view, S, waves):  # type: ignore[no-untyped
 
 @strict
 def store_row(k, S, waves, rate, order, row):  # type: ignore[no-untyped-def]
-    """Copy the row of a block's primitive ``k``, with neurons sorted by rising rate; fill ``rate`` and ``order``."""
+    """Copy primitive ``k`` of a block to ``row``, with neurons sorted by rising rate; fill ``rate`` and ``order``."""
     for j in range(P.NEURONS):
         row[j] = S[j * BLOCK + k]
     K = rate.shape[0]

@@ -1,9 +1,9 @@
-"""The line integral along one chord: its trigonometric functions and its geometry, forward and backward, in float32.
+"""The integral along one chord (ray inside an ellipsoid) in float32, forward and backward: geometry and functions.
 
-cos, sinc and B_p of a phase in turns, and the exponential, are polynomials (tools/fit_polynomials.py). Phases in
-turns reduce exactly to half a turn: ``r = u - rint(u)``. B_p replaces sinc for a soft edge of exponent p
-(:mod:`neuprim.core.model.edge`). Rates v are turns over half a chord: B_p(2 pi v). There is one polynomial up to half a
-turn and a longer one up to 1.5. Beyond, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2, with
+cos, sinc and B_p of a phase in turns, and the exponential, are polynomials (tools/fit_polynomials.py). Phases in turns
+are reduced exactly to half a turn: ``r = u - rint(u)``. B_p replaces sinc for a soft edge of exponent p
+(:mod:`neuprim.core.model.edge`). Rates v are turns over half a chord: B_p(2 pi v). One polynomial serves up to half a
+turn, a longer one up to 1.5 turns. Beyond, B_1 = 3 (B_0 - cos z)/z^2 and B_2 = 15 (B_1 - B_0)/z^2, with
 dB_1/dz = -3 (B_1 - B_0)/z and dB_2/dz = -5 (B_2 - B_1)/z. float32 errors are below 2e-6 (tests/numerics).
 """
 
@@ -128,7 +128,7 @@ def sinc_turns(z):  # type: ignore[no-untyped-def]
 
 @inline
 def dsinc_turns(z):  # type: ignore[no-untyped-def]
-    """Return d/dz of :func:`sinc_turns`, from its own fit: the difference cos - sinc would cancel for small z."""
+    """Return d/dz of :func:`sinc_turns`, by a fit of its own, as cos - sinc cancels for small z."""
     return ((((_D5 * z + _D4) * z + _D3) * z + _D2) * z + _D1) * z + _D0
 
 
@@ -181,7 +181,7 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
-    """Return v and w reduced to half a turn, whether they were within it, 1/v and 1/w (1 if within) by one division."""
+    """Return v, w reduced to half a turn, whether they were within, and 1/v, 1/w (1 if within) by one division."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w
@@ -219,7 +219,7 @@ def _horner_polynomial(coefficients: tuple[float, ...]) -> Kernel:
 
 
 def _split_chord_polynomial(coefficients: tuple[float, ...]) -> Kernel:
-    """Return the same for ten coefficients as two shorter chains, whose latencies overlap."""
+    """Like :func:`_horner_polynomial`, for ten coefficients: two shorter chains, whose latencies overlap."""
     low, high = _horner_polynomial(coefficients[:5]), _horner_polynomial(coefficients[5:])
 
     @inline
@@ -282,7 +282,7 @@ def _soft_reduced(p: int) -> Kernel:
 
 
 def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
-    """Return functions for B_p(2 pi v), B_p(2 pi w), and the same with derivatives, for any v and w."""
+    """Return two functions of any v and w: B_p(2 pi v) and B_p(2 pi w), without and with derivatives."""
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -317,7 +317,7 @@ _MEANS = tuple(f(n / 2) for n in NORMS)  # means of (1 - u^2)^p over [-1, 1]
 
 @inline_source
 def load_ray(p):  # type: ignore[no-untyped-def]
-    """Return the numbers of a primitive's row that :func:`intersect_chord` needs; load them once for all lanes."""
+    """Return the values of a primitive's row that :func:`intersect_chord` needs, to load once for all lanes."""
     return (
         p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2],
         p[P.XA], p[P.XA + 1], p[P.XA + 2], p[P.XU], p[P.XU + 1], p[P.XU + 2], p[P.XV], p[P.XV + 1], p[P.XV + 2],
@@ -327,7 +327,7 @@ def load_ray(p):  # type: ignore[no-untyped-def]
 
 @inline_source
 def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
-    """Return the chord of one pixel of the tile, named as in the layout; ``half`` is 0 where the ray misses.
+    """Return the chord of one pixel's ray, named as in the layout; ``half`` is 0 if the ray misses the primitive.
 
     fx0, fy0: offset of the tile corner's pixel centre from the anchor; row: from :func:`load_ray`.
     """
@@ -358,13 +358,13 @@ def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 
 @inline_source
 def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
-    """Return dh/dD of h = sqrt(D/a), with the floor on D; a soft edge needs none: D^p outweighs the growing D^-1/2."""
+    """Return dh/dD of h = sqrt(D/a), with a floor on D; a soft edge needs none, as D^p outweighs D^-1/2."""
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
 
 @inline_source
 def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
-    """Return FADE of a whole chord, the mean of (1 - |y|^2)^p, and its derivative by D; 1 and 0 for a hard edge."""
+    """Return FADE of a whole chord, the mean of (1 - |y|^2)^p, and dFADE/dD; 1 and 0 for a hard edge."""
     inner = max(D, f(0))
     if len(edge) == 0:
         return f(1), f(0)
@@ -398,13 +398,13 @@ def chord_backward(  # type: ignore[no-untyped-def]
 
 @inline
 def zero_ray_sums():  # type: ignore[no-untyped-def]
-    """Return the initial sums of :func:`add_ray_gradient`."""
+    """Return the zero sums with which :func:`add_ray_gradient` starts."""
     return f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0), f(0)
 
 
 @inline
 def add_ray_gradient(sums, du, dv, slide, reach, gmx, gmy, gmz, gex, gey, gez):  # type: ignore[no-untyped-def]
-    """Return the sums plus one lane's dL/d(E0, EX, EY, XA), from dL/dm and dL/de; ``reach`` is tc + slide."""
+    """Return ``sums`` plus the dL/d(E0, EX, EY, XA) of one lane, from dL/dm and dL/de; ``reach`` is tc + slide."""
     a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, b0, b1 = sums
     hx, hy, hz = gex + reach * gmx, gey + reach * gmy, gez + reach * gmz
     return (

@@ -1,8 +1,9 @@
-"""Colour networks (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and colours of lanes.
+"""Colour networks (:class:`~neuprim.core.model.forms.RayNet`): per primitive in float64, and at lanes (pixels).
 
-The input of a network is the chord's middle, which the density's pixel stage leaves in the lanes. Its first layer is
-converted to whitened axes and turns once per primitive, like the density's neurons; nothing here depends on the camera.
-RAY_COLOUR holds colours before max(0, .). Three channels have fused loops; other counts, and float64, go through ``V``.
+The input of a network is the chord's middle, which the density's pixel stage stores for each lane. The first layer is
+converted to whitened axes and turns once per primitive, like the density's neurons. The conversion does not depend on
+the camera. RAY_COLOUR holds colours before max(0, .). Three channels have fused loops. Other numbers of channels, and
+float64, use scratch memory ``V``.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ Array = np.ndarray[Any, Any]
 
 
 class ColourNet(NamedTuple):
-    """The colour networks of one frame, as inputs of the pixel kernels."""
+    """The colour networks of all primitives of a frame, as input of the pixel kernels."""
 
     # (N, net_row_width) float32: per unit its first layer (WX, WY, WZ, PHASE: whitened axes, turns), then C output
     # weights
@@ -71,7 +72,7 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
 
 
 def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Return network rows of primitives ``which``, float64 if ``wide``, and which have a unit too fast for float32."""
+    """Return rows of primitives ``which``, float64 if ``wide``, and which of them turn too fast for float32."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
@@ -84,9 +85,9 @@ def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool,
 def colour_net_backward(  # type: ignore[no-untyped-def]
     start, stop, log_scales, quats, Wx, rows, grads, first, touched, g_log_scales, g_quats, g_Wx, g_bias, g_Wout,
 ):  # fmt: skip
-    """Backpropagate gradient rows, whose network columns begin at ``first``, to parameters of ``start:stop``.
+    """Backpropagate gradient rows, whose network columns begin at ``first``, to primitives ``start:stop``.
 
-    Adds to ``g_log_scales`` and ``g_quats``; the gradient by the chord's middle is in the density's columns already.
+    Adds to ``g_log_scales`` and ``g_quats``; the density's columns already include dL/d(chord middle).
     """
     H, C = Wx.shape[1], g_Wout.shape[1]
     local, gL, axes, gl, q, gq = np.empty((3, 3)), np.empty((3, 3)), np.empty(3), np.empty(3), np.empty(4), np.empty(4)
@@ -222,7 +223,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
-    """Fill the gradients of two units, three channels, and add their share of dL/dQ."""
+    """Fill the gradients of two units, three channels, and add their dL/dQ."""
     ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
@@ -258,7 +259,7 @@ def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped
 
 @inline
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
-    """Fill the gradients of one unit, any channels, and add its share of dL/dQ. Overwrites the unit's cos in ``V0``."""
+    """Fill the gradients of one unit, any channels, and add its dL/dQ. Overwrites the unit's cos in ``V0``."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)

@@ -1,9 +1,9 @@
-"""Compositing in the order in which each ray enters its chords (``sort = "entry"``), forward and backward.
+"""Compositing sorted by the point where each ray enters each primitive (``sort = "entry"``), forward and backward.
 
-A first pass over a tile's primitives lists the hits. Each pixel's hits are sorted and composited front to back. The
-backward pass lists and composites again, computes GRAD of every hit back to front, and in a second pass over the
-primitives writes the same gradient rows as the default kernel. Nothing can stop early, so hidden primitives cost time.
-Entries that agree in float32, and chords that the near plane cuts, keep the order of the centres.
+A pass over a tile's primitives lists the hits (pixels whose ray meets a primitive). Each pixel's hits are sorted and
+composited front to back. The backward pass repeats this, computes GRAD of every hit back to front, and in a second pass
+over the primitives writes the same gradient rows as the default kernel. No pixel can stop early, so hidden primitives
+take time. Entries that agree in float32, and chords cut by the near plane, stay in the order of the centres.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ Array = np.ndarray[Any, Any]
 
 
 class _PairLanes(NamedTuple):
-    """Scratch memory for the lanes of one pair; ``waves`` is for a colour network, else None."""
+    """Scratch memory for the lanes of one (tile, primitive) pair; ``waves``: for a colour network, or None."""
 
     S: Array
     D: Array
@@ -46,7 +46,7 @@ class _PairLanes(NamedTuple):
 
 
 class _Hits(NamedTuple):
-    """The hits of one tile in the order of its pairs."""
+    """The hits of one tile, in the order of its (tile, primitive) pairs."""
 
     values: Array
     marks: Array
@@ -76,7 +76,7 @@ def _allocate_lanes(C, net):  # type: ignore[no-untyped-def]
 
 @inline
 def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-def]
-    """Allocate room for the hits of any of the tiles ``start:stop``: the pixels in its pairs' boxes."""
+    """Allocate memory for the hits of any one of tiles ``start:stop``: one per pixel in the box of each pair."""
     room, pairs = 1, 1
     for t in range(start, stop):
         first, end = frame.starts[t], frame.starts[t + 1]
@@ -97,14 +97,14 @@ def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyp
 
 @inline
 def _gather_lanes(lanes, frame, pair):  # type: ignore[no-untyped-def]
-    """Compact the pixels of one pair into lanes; returns their number."""
+    """Compact the pixels of one pair into lanes; return the number of lanes."""
     row_spans(frame.spans[pair.i], pair, lanes.rows_live, lanes.bounds)
     return compact_lanes(lanes.S, lanes.state, lanes.offset, lanes.bounds, pair.y0, pair.y1)
 
 
 @inline
 def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
-    """Load the ray norms of a tile's pixels, and which of its rows lie in the image."""
+    """Load the ray norms of a tile's pixels, and which rows of the tile lie in the image."""
     height, width = norms.shape
     for y in range(P.TILE):
         lanes.rows_live[y] = f(1) if ty + y < height else f(0)
@@ -115,7 +115,7 @@ def _load_tile_norms(lanes, norms, tx, ty):  # type: ignore[no-untyped-def]
 
 @inline
 def _list_tile_hits(lanes, hits, frame, first, end, tx, ty, colors, net, edge):  # type: ignore[no-untyped-def]
-    """List the hits of a tile. Returns (hits, evaluated lanes)."""
+    """List the hits of a tile; return (number of hits, number of evaluated lanes)."""
     S, D, offset, bounds = lanes.S, lanes.D, lanes.offset, lanes.bounds
     values, marks = hits.values, hits.marks
     count, evaluated = 0, 0
@@ -185,7 +185,7 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Do what :func:`~neuprim.core.render.cpu.forward.composite_tiles` does; ``image.last`` gets the hits per pixel."""
+    """Like :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` gets the hits per pixel."""
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE
@@ -264,7 +264,7 @@ def _uncomposite_hits(hits, ids, first, tx, ty, norms, colors, image, tmin, net)
 
 @kernel
 def backward_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Do what :func:`~neuprim.core.render.cpu.backward.backward_tiles` does, but composite again."""
+    """Like :func:`~neuprim.core.render.cpu.backward.backward_tiles`, but composite again."""
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     across = (frame.norms.shape[1] + P.TILE - 1) // P.TILE
     C, neurons, with_depth = colors.shape[1], frame.neurons, image.with_depth

@@ -1,7 +1,7 @@
 """The float64 pixel stage, for the few primitives that need more than float32; results are rounded to float32 lanes.
 
-Whole chords use the functions of the float32 stage, with phases reduced in float64. These do not apply where the near
-plane cuts a chord with a soft edge. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the
+Whole chords use the functions of the float32 stage, with phases reduced in float64. Those functions do not hold if the
+near plane cuts a chord with a soft edge. Along a chord u in [-1, 1], 1 - |y|^2 = D - a (shift + half u)^2 with D at the
 closest approach, a = e.e and shift from there to the middle. Its p-th power is a polynomial q; the mean of
 q cos(phase + z u) follows from the moments
 
@@ -34,7 +34,7 @@ FLOAT64_SCRATCH = L.lane_array(10)
 
 @inline
 def chords_float64(S, X, n, frame, pair, with_mid, backward, edge):  # type: ignore[no-untyped-def]
-    """Do what :func:`~neuprim.core.render.cpu.tiles.lane_chords` does, in float64; return whether a chord is cut."""
+    """Like :func:`~neuprim.core.render.cpu.tiles.lane_chords`, in float64; return whether a chord is cut."""
     p, fx0, fy0 = frame.wide[frame.slots[pair.i]], pair.tx + 0.5, pair.ty + 0.5
     e0, e1, e2, tc, near = p[P.E0], p[P.E0 + 1], p[P.E0 + 2], p[P.TC], p[P.NEAR]
     x0, x1, x2, y0, y1, y2 = p[P.EX], p[P.EX + 1], p[P.EX + 2], p[P.EY], p[P.EY + 1], p[P.EY + 2]
@@ -89,7 +89,7 @@ def chord_phase_float64(X, k, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
-    """Return the phase at the chord's middle, reduced to half a turn, and its change over half a chord, in turns."""
+    """Return, in turns, the phase at the chord's middle, reduced to half a turn, and its change over half a chord."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     u = X[k + _Q0] * wx + X[k + _Q1] * wy + X[k + _Q2] * wz + p[o + P.PHASE]
     v = X[k + _V0] * wx + X[k + _V1] * wy + X[k + _V2] * wz
@@ -98,7 +98,7 @@ def _reduced_chord_phases(X, k, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _whole_chord_neurons(S, X, V, n, p, neurons, edge):  # type: ignore[no-untyped-def]
-    """Add w2 cos(phase at the middle) B_p(half its change) of every neuron to FIELD; fill ``V`` for gradients."""
+    """Add w2 cos(phase at the middle) B_p(phase change over half a chord) of every neuron to FIELD; fill ``V``."""
     for m in range(neurons):
         o = P.NEURONS + P.PER_NEURON * m
         wx, wy, wz, phase, amplitude = p[o + P.WX], p[o + P.WY], p[o + P.WZ], p[o + P.PHASE], f(p[o + P.AMPLITUDE])
@@ -156,8 +156,10 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 
 @inline
 def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
-    """Add the neurons' weighted means to FIELD, and fill FADE, where the near plane cuts soft-edged chords; with ``V``
-    also fill it and BY_D, BY_A, BY_TM, which need p q^(p - 1) and its moments."""
+    """Add the neurons' weighted means to FIELD, and fill FADE, for soft-edged chords that the near plane cuts.
+
+    If ``V`` is given, fill ``V`` and BY_D, BY_A, BY_TM, from the moments of p q^(p - 1).
+    """
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
         D, shift, square, half = X[_INNER + k], X[_SHIFT + k], X[_SQUARE + k], X[_HALF + k]
@@ -200,7 +202,7 @@ def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped
 
 @inline
 def neurons_float64(S, X, V, n, p, neurons, cut, edge):  # type: ignore[no-untyped-def]
-    """Add every neuron's weighted mean to FIELD; fill FADE of ``cut`` chords and, unless None, ``V`` for gradients."""
+    """Add every neuron's weighted mean to FIELD; if ``cut``, fill FADE; unless None, fill ``V`` for gradients."""
     if len(edge) > 0 and cut:
         _cut_chord_neurons(S, X, V, n, p, neurons, len(edge))
     else:

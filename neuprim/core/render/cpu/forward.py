@@ -1,7 +1,8 @@
-"""Forward pass of compositing in the order of centres, and the data that it saves for backward.
+"""Forward pass of compositing sorted by centres, and the data that the pass saves for backward.
 
-Saved are the optical depth of every evaluated lane (4 bytes), and per pair its live tile rows (2 bytes) and its first
-lane in its chunk of tiles (4 bytes). So the backward pass can composite before it evaluates a neuron.
+A lane is one pixel of a (tile, primitive) pair. Saved are the optical depth of every evaluated lane (4 bytes), and per
+pair a mask of tile rows with unfinished pixels (2 bytes) and the first lane in its chunk of tiles (4 bytes). So the
+backward pass can composite before it evaluates a neuron.
 """
 
 from __future__ import annotations
@@ -58,7 +59,7 @@ class SavedForBackward:
 
     @classmethod
     def allocate(cls, pairs: int) -> SavedForBackward:
-        """Allocate memory for this many pairs; 0 saves nothing."""
+        """Allocate memory for ``pairs`` (tile, primitive) pairs; with 0, the forward pass saves nothing."""
         return cls(np.empty(pairs, np.uint16), np.empty(pairs, np.int32))
 
 
@@ -80,7 +81,7 @@ def _depth_array(floats):  # type: ignore[no-untyped-def]
 
 @inline
 def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
-    """Return an upper bound of the lanes of tiles ``start:stop``, in whole vectors."""
+    """Return an upper bound of the number of lanes of tiles ``start:stop``, a multiple of the vector width."""
     lanes = 0
     for t in range(start, stop):
         tx, ty = (t % across) * P.TILE, (t // across) * P.TILE
@@ -110,7 +111,7 @@ def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-un
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
-    """Three channels: add alpha T c to the colour, then update T."""
+    """For three channels: add alpha T c to the colours of a row of pixels, then update T."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -131,7 +132,7 @@ def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # typ
 
 @inline
 def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-untyped-def]
-    """Any channels, with depth: update T only, and fill the weights ``w``."""
+    """For any number of channels, with depth: update T of a row of pixels, and fill the weights ``w``."""
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
     for k in range(P.TILE):
@@ -146,7 +147,7 @@ def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-
 
 @inline
 def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
-    """Any channels: add w c to the colour."""
+    """For any number of channels: add w c to the colours."""
     for c in range(color.shape[0]):
         st = state[L.COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -175,7 +176,7 @@ def _fill_background(tx, ty, down, wide_row, image):  # type: ignore[no-untyped-
 
 @inline
 def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untyped-def]
-    """Write a tile's pixels, over the background."""
+    """Write a tile's pixels, composited over the background, to the image."""
     rgb, transmittance, zsum, last, background, with_depth = image
     for y in range(down):
         Y, j = index(ty + y), y * P.TILE
@@ -195,11 +196,11 @@ def _store_tile(state, tx, ty, down, wide_row, image):  # type: ignore[no-untype
 
 @kernel
 def composite_tiles(start, stop, frame, colors, image, live, first_lane, net, edge):  # type: ignore[no-untyped-def]
-    """Draw tiles ``start:stop``; returns the number of evaluated lanes and, unless ``live`` is empty, their depths.
+    """Render tiles ``start:stop``; return the number of evaluated lanes and, unless ``live`` is empty, their depths.
 
     Args:
         frame: :class:`~neuprim.core.render.cpu.tiles.FrameArrays`.
-        colors: (N, C) colours, or the bases of the networks' colours.
+        colors: (N, C) colours, or the constants that colour networks add to.
         net: :class:`~neuprim.core.render.cpu.colour_net.ColourNet`; None compiles a kernel without networks.
         edge: one of :data:`~neuprim.core.render.cpu.chord.EDGE_TYPES`.
     """

@@ -1,7 +1,7 @@
-"""Compute the gradient row of a pair from dL/d(2 FIELD HALF FADE) of its lanes, for both orders of compositing.
+"""Compute the gradients of a (tile, primitive) pair from dL/d(2 FIELD HALF FADE) of its lanes (pixels), for both sorts.
 
-:func:`neuron_gradients` and :func:`chord_gradient` read chords from the lanes, which float64, colour networks and many
-neurons need. :func:`gradients_at_once` keeps a chord in registers throughout, with at most two neurons.
+:func:`neuron_gradients` and :func:`chord_gradient` read stored chords, as needed for float64, colour networks and many
+neurons. :func:`gradients_at_once` keeps each chord in registers, for at most two neurons.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ def _load_neuron(p, o):  # type: ignore[no-untyped-def]
 
 
 def _neuron_products(slopes):  # type: ignore[no-untyped-def]
-    """Return a function for cos B, d(cos B)/d phase, cos dB/d rate of two neurons; q: chord middle, v: half chord."""
+    """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate of two neurons.
+
+    Its q is the chord middle, its v the half chord.
+    """
 
     @inline
     def products(edge, qx, qy, qz, vx, vy, vz, first, second):  # type: ignore[no-untyped-def]
@@ -65,7 +68,7 @@ _slow, _medium, _fast = _neuron_products(slopes_slow), _neuron_products(slopes_m
 
 @inline
 def _add_neuron_gradient(sums, cosine, u, v, qx, qy, qz, vx, vy, vz):  # type: ignore[no-untyped-def]
-    """Return the sums plus a lane's dL/d(amplitude, phase, W), without factor amplitude, from products x dL/d FIELD."""
+    """Return ``sums`` plus a lane's dL/d(amplitude, phase, W), without factor amplitude, from products x dL/d FIELD."""
     s0, s1, s2, s3, s4 = sums
     return s0 + cosine, s1 + u, s2 + (u * qx + v * vx), s3 + (u * qy + v * vy), s4 + (u * qz + v * vz)
 
@@ -154,7 +157,7 @@ _with_two_fast = _gradients_of_two_neurons(_fast)
 
 @inline
 def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-def]
-    """Fill the gradient row of a pair with at most :data:`AT_ONCE` neurons, from PIXEL and GRAD of its lanes."""
+    """Fill the gradient row of a pair, from PIXEL and GRAD of its lanes; at most :data:`AT_ONCE` neurons."""
     if frame.neurons == 0:
         _gradients_without_neurons(S, n, frame, pair, edge, out)
         return
@@ -172,8 +175,10 @@ def gradients_at_once(S, n, frame, pair, edge, out):  # type: ignore[no-untyped-
 
 @inline
 def lanes_with_slopes(S, D, V, n, frame, pair, edge):  # type: ignore[no-untyped-def]
-    """Fill the chords of ``n`` lanes of a pair; in float64 also the three products per neuron, in ``V``. Return whether
-    the pair is in float64 and the near plane cuts a chord."""
+    """Fill the chords of ``n`` lanes of a pair; in float64 also ``V``, three products per neuron.
+
+    Returns True if the pair is in float64 and the near plane cuts a chord.
+    """
     slot = frame.slots[pair.i]
     if slot >= 0:
         cut = chords_float64(S, D, n, frame, pair, False, True, edge)
@@ -201,7 +206,10 @@ def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyp
 
 
 def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
-    """Return a function for gradients of neurons m and m + 1, dL/dQ and dL/d(half e); None: products from V0, V1."""
+    """Return a function that computes gradients of neurons m and m + 1, dL/dQ and dL/d(half e).
+
+    ``products`` None: the function reads the products from V0 and V1.
+    """
 
     @inline
     def add(S, V0, V1, n, p, m, edge, out):  # type: ignore[no-untyped-def]
@@ -265,10 +273,10 @@ def neuron_gradients(S, V, n, p, kinds, neurons, edge, in_float64, cut, out):  #
 def chord_gradient(S, n, p, out, edge, cut):  # type: ignore[no-untyped-def]
     """Fill dL/d(E0, EX, EY, XA) of the affine ray from the gradients by chord middle, half chord and direction.
 
-    A hard edge has gradients by the chord's ends, t0 and t1. A soft edge has none, but its weight depends on D = 1 -
-    |p|^2, and on a = e.e and the closest approach if the near plane cuts the chord. If it cuts no chord of the pair,
-    BY_D is d FADE/dD, and the ends' share through HALF is used. Otherwise (float64) the ends are left out, and BY_D,
-    BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
+    A hard edge has gradients through the chord's ends, t0 and t1. A soft edge has none, but its weight depends on
+    D = 1 - |p|^2, and if the near plane cuts the chord, on a = e.e and the closest approach. If no chord of the
+    pair is cut, BY_D is d FADE/dD, and the gradient through HALF is used. Otherwise (float64) the ends have no
+    gradient, and BY_D, BY_A and BY_TM are derivatives of the whole mean FADE FIELD.
     """
     tc, soft = p[P.TC], len(edge)
     rays = zero_ray_sums()

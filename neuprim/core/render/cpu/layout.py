@@ -1,4 +1,4 @@
-"""Row widths and scratch memory of the numba kernels: arrays over lanes at constant offsets of one flat array.
+"""Row widths and scratch memory of the numba kernels: scratch arrays lie at constant offsets in one flat array.
 
 A *lane* is one pixel of a (tile, primitive) pair.
 """
@@ -20,22 +20,22 @@ def _padded_row_width(floats: int) -> int:
 
 
 def row_width(neurons: int) -> int:
-    """Return the floats per primitive row for K padded neurons, a multiple of 16."""
+    """Return the number of floats in a primitive's row, for K padded neurons; a multiple of 16."""
     return _padded_row_width(NEURONS + PER_NEURON * neurons)
 
 
 def net_row_width(hidden: int, channels: int) -> int:
-    """Return the floats per row of a colour network of H padded units, at least one."""
+    """Return the number of floats in the row of a colour network, for H padded units; at least one."""
     return max((NET_OUT + channels) * hidden, 1)
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the floats per gradient row for K padded neurons, C colours and H padded units, a multiple of 16."""
+    """Return the floats in a row of gradients, for K padded neurons, C colours, H padded units; a multiple of 16."""
     return _padded_row_width(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 
 def lane_array(number: int) -> int:
-    """Return the offset of a scratch array over lanes."""
+    """Return the offset of scratch array ``number``, which has one element per lane."""
     return LANES * number
 
 

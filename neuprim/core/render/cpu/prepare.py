@@ -1,7 +1,7 @@
-"""The per-primitive stage, in float64: anchors, whitening, exact bounds.
+"""The per-primitive stage of rendering, in float64: anchors, whitened rays, exact screen bounds.
 
-Each primitive is anchored at its own projected centre, so that whitened rays are affine in the pixel offset and float32
-does not have to represent the distance to the camera (method: "Line integral"). Anchor and unit of t have no gradient.
+The anchor of a primitive is its projected centre. Whitened rays are affine in the pixel offset from the anchor, so
+float32 need not represent the distance to the camera (method: "Line integral"). Anchor and unit of t have no gradient.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Array = np.ndarray[Any, Any]
 
 
 class PrimitiveArrays(NamedTuple):
-    """Geometry and density of N primitives with K neurons, or gradients by them."""
+    """Geometry and density parameters of N primitives with K neurons, or gradients with respect to them."""
 
     means: Array
     log_scales: Array
@@ -73,7 +73,7 @@ class View(NamedTuple):
 
 
 class Projected(NamedTuple):
-    """Results of :func:`prepare_primitives` for each primitive."""
+    """Results of :func:`prepare_primitives`, one element or row per primitive."""
 
     rows: Array  # (N, row_width) float32 rows of the pixel kernels
     # (N, SPAN_WIDTH) silhouettes and (N, 4) pixel boxes
@@ -87,7 +87,7 @@ class Projected(NamedTuple):
 
     @classmethod
     def allocate(cls, count: int, neurons: int) -> Projected:
-        """Allocate memory for primitives with ``neurons`` each, padded to pairs for the kernels."""
+        """Allocate memory for ``count`` primitives with ``neurons`` each, padded to an even number."""
         padded = neurons + neurons % 2
         return cls(
             rows=np.empty((count, L.row_width(padded)), np.float32),
@@ -103,7 +103,7 @@ class Projected(NamedTuple):
 
 @strict
 def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
-    """Return whether no chord can reach the optical depth ``least``: no half chord exceeds the longest semi-axis."""
+    """Return whether no chord can reach optical depth ``least``, as half chords are at most the longest semi-axis."""
     return most <= 0.0 or most * NORMS[edge] <= least
 
 
@@ -111,7 +111,7 @@ def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
     """Return r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
 
-    ``most``: F; ``longest``: s, in units of the longest semi-axis. Rounded to float32, so that backends agree.
+    ``most``: F; ``longest``: s, in units of the longest semi-axis; Rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -123,7 +123,7 @@ def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
 
 @strict
 def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untyped-def]
-    """Return whether the numbers of a primitive that is not drawn are finite; ``most`` includes its amplitudes."""
+    """Return whether a primitive that is not drawn has finite parameters; ``most`` includes its amplitudes."""
     means, log_scales, quats, W1, b1, _, _ = parameters
     total, square = most, np.float64(0.0)
     for a in range(3):
@@ -139,8 +139,8 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
     """Return the pixel range of the silhouette, scaled by ``square`` ** 0.5, along a screen axis.
 
-    Tangents as in ``screen_boxes`` of the reference, in units of m; ``b``, ``towards``: rows of B of the screen axis
-    and of depth; ``s22``: S_zz of the whole ellipsoid.
+    Uses the tangents of ``screen_boxes`` in the reference, in units of m; ``b``, ``towards``: rows of B of the screen
+    axis and of depth; ``s22``: S_zz of the whole ellipsoid.
     """
     (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
     sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)
@@ -152,7 +152,7 @@ def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middl
 
 @strict
 def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length):  # type: ignore[no-untyped-def]
-    """Return an upper bound, <= 1, of the half chords of all rays that hit the ellipsoid, in longest semi-axes.
+    """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis.
 
     A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
     slopes. 1 where the anchor is not the centre.
@@ -183,7 +183,7 @@ def _rounded(x):  # type: ignore[no-untyped-def]
 
 @strict
 def _bound_block(S, view, edge, least):  # type: ignore[no-untyped-def]
-    """Fill silhouettes, boxes, status and FLOAT64 of a block's primitives."""
+    """Fill silhouettes, boxes, status and FLOAT64 of the primitives of a block."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     width, height, soft = float(view.width), float(view.height), edge > 0
     for k in range(BLOCK):
@@ -304,9 +304,9 @@ def _store_block(block, n, S, waves, rate, out):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def prepare_primitives(start, stop, parameters, view, edge, least, out):  # type: ignore[no-untyped-def]
-    """Fill ``out`` for primitives ``start:stop``; silhouettes are those of rays that reach the optical depth ``least``.
+    """Fill ``out`` for primitives ``start:stop``; silhouettes bound the rays that reach optical depth ``least``.
 
-    A primitive that reaches it nowhere gets only a status, an empty box and a depth of 0.
+    A primitive that no such ray hits gets only a status, an empty box and a depth of 0.
     """
     parameters, view, out = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(out)
     w2, b2, boxes = parameters.w2, parameters.b2, out.boxes

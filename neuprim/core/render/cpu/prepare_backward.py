@@ -1,4 +1,4 @@
-"""Backward pass of the per-primitive stage: from gradient rows to parameters, in float64, in blocks."""
+"""Backward pass of the per-primitive stage: from gradient rows to parameter gradients, in float64, by blocks."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ _COLUMNS = COLUMNS + 56
 
 @strict
 def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-def]
-    """Return dL/d of a column of B and of the logarithm of its axis s, and its share of -m dL/d centre.
+    """Return dL/d(column of B), dL/d(log of its axis s), and this axis's part of -m dL/d centre.
 
     ``g``: dL/d(E0, EX, EY, XA) along the axis.
     """
@@ -132,7 +132,7 @@ def _geometry_backward(S, R):  # type: ignore[no-untyped-def]
 
 @strict
 def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S):  # type: ignore[no-untyped-def]
-    """Apply the chain rule to primitives ``which[:n]``."""
+    """Compute parameter gradients of primitives ``which[:n]`` from their gradient rows."""
     W1, rows, order, turns = parameters.W1, projected.rows, projected.order, view.turns
     load_block(which, n, parameters, S)
     project_block(S, view)
@@ -179,10 +179,10 @@ def _backward_block(which, n, parameters, view, projected, grads, out, g_view, S
 
 @exact_kernel
 def prepare_backward(start, stop, parameters, view, projected, grads, touched, out, g_view):  # type: ignore[no-untyped-def]
-    """Apply the chain rule from gradient rows to parameters of ``start:stop``; zeros for those not ``touched``.
+    """Compute parameter gradients of primitives ``start:stop`` from gradient rows; zeros if not ``touched``.
 
     Fills ``out`` (:class:`PrimitiveArrays`, float32) and ``g_view`` (N, 3, 4), each primitive's part of dL/d(R | t).
-    Pass ``g_view`` as zeros, or empty if it is not needed.
+    Pass zeros as ``g_view``, or an empty array if dL/d(R | t) is not needed.
     """
     parameters, view, projected = borrow_arrays(parameters), borrow_arrays(view), borrow_arrays(projected)
     grads, out, g_view = borrow_array(grads), borrow_arrays(out), borrow_array(g_view)

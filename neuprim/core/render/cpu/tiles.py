@@ -1,7 +1,7 @@
-"""Tiles of 16 x 16 pixels: the primitives that reach each one, front to back, and the pixels of each pair.
+"""Tiles of 16 x 16 pixels: the primitives that reach each tile, front to back, and the pixels of each pair.
 
-Per (tile, primitive) pair, for both passes and both orders: solve the silhouette for each pixel row, gather the pixels
-inside into a compact list of lanes, run chord and neurons over that list, scatter back row by row.
+Forward and backward pass do the same per (tile, primitive) pair: find the pixels of each row inside the silhouette,
+gather them into a compact list of lanes, compute chords and neurons of all lanes, scatter the results back row by row.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ Array = np.ndarray[Any, Any]
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs sorted by tile, then by depth."""
+    """Pairs (tile, primitive) of a frame, sorted by tile, then by depth."""
 
     starts: NDArray[np.int64]  # (tiles + 1,) first pair of each tile
     ids: NDArray[np.int32]  # (pairs,) primitive of each pair
@@ -55,7 +55,7 @@ class TileLists:
 
 
 def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the front-to-back order; equal depths keep their index order.
+    """Return the indices that sort primitives front to back by ``depth``; equal depths stay in index order.
 
     Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. Depths
     that agree to about 1e-9 of their value (1 million primitives) count as equal.
@@ -71,9 +71,9 @@ def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
 
 @exact_kernel
 def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-untyped-def]
-    """Return the tiles that the silhouettes of primitives ``start:stop`` reach, row by row, up to 1e-3 pixels more.
+    """Return the tiles that the silhouettes of primitives ``start:stop`` reach, with a margin of 1e-3 pixels.
 
-    ``first[i + 1]`` gets the number of tiles of primitive i. Primitives come in memory order, not in depth order.
+    ``first[i + 1]`` gets the number of tiles of primitive i. Primitives are in memory order, not in depth order.
     """
     rows, spans, boxes, status = projected.rows, projected.spans, projected.boxes, projected.status
     tiles, n = np.empty(4096, np.int32), 0
@@ -114,7 +114,7 @@ def _reached_tiles(start, stop, projected, across, first):  # type: ignore[no-un
 
 @exact_kernel
 def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignore[no-untyped-def]
-    """Sort pairs by tile, by counting; primitives come in depth order, so each tile's list is front to back."""
+    """Sort pairs by tile with a counting sort, in depth order of primitives: each tile's list is front to back."""
     for k in range(tiles.shape[0]):
         starts[tiles[k] + 1] += 1
     for t in range(starts.shape[0] - 1):
@@ -132,7 +132,10 @@ def _sort_pairs_by_tile(order, first, tiles, starts, ids, slots):  # type: ignor
 def bin_primitives(
     projected: Projected, width: int, height: int, threads: int, images: tuple[Array, int] | None = None
 ) -> TileLists:
-    """Return the tile lists of a frame; with ``images``, (N,) image of each primitive and a count, of all images."""
+    """Return the tile lists of a frame.
+
+    ``images``: (N,) index of the image of each primitive, and the number of images; None for one image.
+    """
     count = projected.depth.shape[0]
     across, down = -(-width // P.TILE), -(-height // P.TILE)
     first = np.zeros(count + 1, np.int64)
@@ -148,7 +151,7 @@ def bin_primitives(
 
 
 class FrameArrays(NamedTuple):
-    """One frame, as input of the pixel kernels."""
+    """The data of one frame that the pixel kernels read."""
 
     rows: Array  # (N, row_width) float32, one row per primitive (layout)
     wide: Array  # (M, row_width) float64 rows of the primitives that are drawn in float64
@@ -170,7 +173,7 @@ class FrameArrays(NamedTuple):
 
 
 class PairWindow(NamedTuple):
-    """Pixels x0:x1, rows y0:y1 of the tile at (tx, ty) in the box of primitive i; fx0, fy0: corner from the anchor."""
+    """Pixels x0:x1, rows y0:y1 of tile (tx, ty) inside primitive i's box; fx0, fy0: tile corner minus anchor."""
 
     i: int
     tx: int
@@ -246,7 +249,7 @@ def prefetch_lane_depths(depths, first, stop):  # type: ignore[no-untyped-def]
 
 @inline
 def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
-    """Fill pixels [bounds[y], bounds[y + 16]) of each live tile row inside the silhouette, 16 rows in one vector."""
+    """Fill, for each unfinished tile row y, the pixels [bounds[y], bounds[y + 16]) inside the silhouette."""
     skew, xc, yc, hx = span[P.SKEW], span[P.XC] - pair.fx0, span[P.YC] - pair.fy0, span[P.HX]
     ihy = f(1) / span[P.HY]
     low, high, top, bottom = f(pair.x0), f(pair.x1), f(pair.y0), f(pair.y1)
@@ -267,7 +270,7 @@ def row_spans(span, pair, rows_live, bounds):  # type: ignore[no-untyped-def]
 
 @inline
 def compact_lanes(S, state, offset, bounds, y0, y1):  # type: ignore[no-untyped-def]
-    """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Returns the lane count.
+    """Gather pixels and their ray norms into lanes; row y starts at ``offset[y]``. Return the number of lanes.
 
     Padding is the first lane's pixel with a norm of 0. Every row copies a whole vector without a branch; the next row,
     or the padding, overwrites the excess.
@@ -320,7 +323,7 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
 
 
 def _neuron_values(profiles):  # type: ignore[no-untyped-def]
-    """Return a function: FIELD += w2 cos(phase at middle) B_p(rate x half chord) of two neurons, one range of rates."""
+    """Return a function for two neurons: FIELD += w2 cos(phase at middle) B_p(rate x half chord), one rate range."""
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]

@@ -1,2 +1,4 @@
-"""CUDA backend in Warp: float64 preparation per primitive, float32 pixels. For tests, the same source runs on Warp's
-CPU blocks."""
+"""The cuda backend, in Warp: per-primitive stage in float64, pixel stage in float32.
+
+For tests, the same source runs on the CPU, as Warp's CPU blocks.
+"""

@@ -1,4 +1,4 @@
-"""The CUDA backend as one differentiable operation, on the tensors' device and torch's current stream."""
+"""The cuda backend as one differentiable operation, on the device of its tensors and torch's current stream."""
 
 from __future__ import annotations
 
@@ -112,14 +112,14 @@ class _Rasterize(torch.autograd.Function):
 def render(
     lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
 ) -> RenderOutput:
-    """Draw a frame; see :data:`neuprim.core.render.output.Draw`."""
+    """Render a frame; see :data:`neuprim.core.render.output.Draw`."""
     return rasterize(_Rasterize, "cuda", lowered, camera, background, settings)
 
 
 def render_slabs(
     lowered: LoweredPrimitives, slabs: Tensor, count: int, camera: Camera, settings: RenderSettings
 ) -> tuple[Tensor, Tensor]:
-    """Return opacity and depth of each slab, all drawn as one frame; see :func:`neuprim.core.render.render_slabs`."""
+    """Render all slabs as one frame; return opacity and depth. See :func:`neuprim.core.render.render_slabs`."""
     means, settings = lowered.geometry.means, replace(settings, depth=True)
     tensors = rasterizer_tensors(lowered)
     blank = torch.zeros(len(means), 1, device=means.device)

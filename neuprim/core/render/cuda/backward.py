@@ -1,10 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Backward pass of compositing, from the data that the forward pass saved in the pixels' slots.
+"""Backward pass of compositing. A slot holds the data that the forward pass saved for one pixel of a pair.
 
-First, one block per tile, one thread per pixel: it visits its hits back to front and stores dL/dI and the weight in
-each slot. Then, one warp per (tile, primitive) pair: it recomputes chord and neurons, sums in registers, and writes one
-row per pair. A primitive's rows are added in the order of its pairs, so that reruns give the same bits. With 8 neurons
-the sums alone take 59 registers of 128, so values that a few operations can recompute are not kept over the neurons.
+First kernel, one block per tile, one thread per pixel: visit the hits back to front, and store dL/dI and the weight in
+each slot. Second kernel, one warp per (tile, primitive) pair: recompute chord and neurons, sum in registers, and write
+one gradient row. A primitive's rows are added in the order of its pairs, so reruns give the same bits. With 8 neurons
+the sums take 59 of 128 registers, so the kernel recomputes cheap values instead of keeping them in registers.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the pixels' kernel of a form; ``depth``: with a gradient of the sum of w z."""
+    """Return the first kernel, for pixels, of a form; ``depth``: the sum of w z has a gradient."""
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -82,8 +82,11 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
         transmittance: Floats, reached: Ints, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats,
         hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
-        """``g_transmittance`` includes the background's share. dL/dI = (1 - alpha) T dL/dw - b; b, the light behind the
-        hit, is the sum of w dL/dw of later hits and T dL/dT."""
+        """Store dL/dI = (1 - alpha) T dL/dw - b, and the weight, in each slot.
+
+        b, the light behind the hit, is the sum of w dL/dw of later hits and T dL/dT. ``g_transmittance`` includes the
+        background's part.
+        """
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel_of_lane(lane)
@@ -132,7 +135,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the pairs' kernel of a form; ``depth``: with a gradient of the sum of w z."""
+    """Return the second kernel, for pairs, of a form; ``depth``: the sum of w z has a gradient."""
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -289,7 +292,7 @@ def sum_pairs(
 
 @functools.cache
 def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel for sorted hits, which does what ``pixels_kernel`` does: (alpha, T) to (dL/dI, weight)."""
+    """Return a kernel like :func:`pixels_kernel` for sorted hits, which turns (alpha, T) into (dL/dI, weight)."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
 
@@ -335,7 +338,7 @@ def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
 
 @dataclass
 class ImageGradient:
-    """Gradients of an image, float32 and contiguous, and the error of each pixel for the contributions."""
+    """The gradient dL/d(image), float32 and contiguous, and the error of each pixel, used for contributions."""
 
     rgb: Tensor  # (H W, C)
     transmittance: Tensor  # (H W,), includes the background's share
@@ -351,7 +354,10 @@ def rasterizer_gradient_rows(
     settings: RenderSettings,
     gradient: ImageGradient,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return (N, gradient_width) rows, and (N, net_gradient_row_width) of networks or None; overwrites the slots."""
+    """Return gradient rows, (N, gradient_width), and those of networks, (N, net_gradient_row_width), or None.
+
+    Overwrites the slots.
+    """
     lists, device, depth = frame.lists, frame.device, gradient.z is not None
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     a = KernelArrays(frame, net, settings, drawn.spans, drawn.offsets)
@@ -391,7 +397,7 @@ def rasterizer_gradient_rows(
 
 
 def _sum_pair_rows(frame: Frame, pair_rows: Tensor) -> Tensor:
-    """Return (N, width) sums of the rows of each primitive's pairs."""
+    """Return (N, width), for each primitive the sum of its pairs' rows."""
     grads = torch.empty(frame.rows.shape[0], pair_rows.shape[1], dtype=torch.float32, device=frame.device)
     lists = (warp_array(frame.lists.first), warp_array(frame.lists.slots_of))
     launch_kernel(sum_pairs, grads.shape, (*lists, warp_array(pair_rows), warp_array(grads)), frame.device)

@@ -1,7 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Silhouettes, tile lists and pixels of each pair; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
+"""Silhouettes, tile lists and pixels per pair; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
 
-Everything is counted before it is written, and sorted by integers, so reruns give the same bits. Synchronises once.
+Outputs are counted before they are written, and sorted by integer keys, so reruns give the same bits. Synchronises
+once.
 """
 
 import functools
@@ -51,7 +52,7 @@ _MOST = 2**31  # indices of pairs are int32
 
 @dataclass(frozen=True)
 class TileCounts:
-    """Counts of a frame on the host, and running sums on the device."""
+    """Total counts of a frame on the host, and running sums of counts on the device."""
 
     pairs: int  # (tile, primitive) pairs
     in_float64: int  # primitives that are drawn in float64
@@ -61,7 +62,7 @@ class TileCounts:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs sorted by image (if there are several), then by tile, by depth and by index."""
+    """Pairs (tile, primitive), sorted by image (if there are several), then by tile, depth and index."""
 
     starts: Tensor  # (tiles + 1,) int32, first pair of each tile, of all images
     ids: Tensor  # (pairs,) int32, primitive of each pair
@@ -75,7 +76,7 @@ class TileLists:
 
 
 def count_tiles(counts: Tensor, bad: Tensor) -> TileCounts:
-    """Return totals and running sums of ``prepare``'s counts; synchronises. BackendUnavailable: too many pairs."""
+    """Return totals and running sums of the stage's ``counts``. Synchronises. BackendUnavailable: too many pairs."""
     ends = torch.stack(
         [torch.cumsum(row, 0, dtype=torch.int64) for row in counts]
     )  # torch's scan of a single row is ten times faster
@@ -121,7 +122,7 @@ class SilhouetteSpans:
 
 @wp.func
 def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """Return spans of |r e|^2 - |x x e|^2 > 0, r^2 = ``square``: centre XC + SKEW (dv - YC), half width by HX, HY."""
+    """Return row spans where |r e|^2 - |x x e|^2 > 0, r^2 = ``square``: centre XC + SKEW (dv - YC), width by HX, HY."""
     o = SilhouetteSpans()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
@@ -160,7 +161,7 @@ def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, squ
 
 @wp.func
 def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64):
-    """Return an upper bound, <= 1, of the half chords of all rays that hit the ellipsoid, in longest semi-axes."""
+    """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis."""
     bound, one = d(1.0), d(1.0)
     if r.tc != d(0.0):
         z = p.centre[2]
@@ -179,7 +180,7 @@ def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64
 
 @wp.func
 def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
-    """Select a number by edge exponent. An array, indexed by a variable, would need stack memory."""
+    """Return the argument for edge exponent 0, 1 or 2. An array with a variable index would need stack memory."""
     number = hard
     if edge == 1:
         number = one
@@ -190,13 +191,13 @@ def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.f
 
 @wp.func
 def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
-    """Return whether no chord, however long, can reach the optical depth ``least``."""
+    """Return whether no chord of a primitive, however long, can reach the optical depth ``least``."""
     return most <= d(0.0) or most * _chord_bound_by_edge(edge, _N0, _N1, _N2) <= least
 
 
 @wp.func
 def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """Return r^2 of the visible extent: 1 for all of it, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
+    """Return r^2 of an ellipsoid's visible extent: 1 for all, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
     square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
     if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
         square = d(1.0)
@@ -207,7 +208,7 @@ def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.flo
 
 @wp.struct
 class Ellipse:
-    """A silhouette on the screen, from the float32 numbers that the pixel kernels read; ``box`` in pixels."""
+    """A silhouette on the screen, from the float32 values that the pixel kernels read; ``box`` in pixels."""
 
     box: wp.vec4i
     bounded: wp.int32
@@ -237,7 +238,7 @@ def silhouette_ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.flo
 
 @wp.func
 def tile_range(e: Ellipse, ty: int):
-    """Return the first tile, and one past the last, that the silhouette reaches in row ``ty`` of tiles."""
+    """Return the range [first, end) of tiles that the silhouette reaches in row ``ty`` of tiles."""
     lo, hi = e.box[0] // _TILE, (e.box[2] - 1) // _TILE + 1
     if e.bounded > 0:
         d0 = wp.max(d(wp.max(ty * _TILE, e.box[1])) + e.base, -e.hy)
@@ -263,7 +264,10 @@ def _binning_kernels() -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Longs, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """Write keys tile << 32 | rank for the tiles of the primitive of depth rank tid; ``tiles`` per image, or 0."""
+        """Write keys tile << 32 | rank, one per tile that the primitive with depth rank tid reaches.
+
+        ``tiles``: tiles per image; 0 for one image.
+        """
         rank = wp.tid()
         i = int(order[rank])
         last = int(ends[0, i])
@@ -289,7 +293,7 @@ def _binning_kernels() -> tuple[Any, Any]:
         keys: Longs, came_from: Longs, order: Longs, pairs: int, tiles: int, each: int,
         starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
-        """Fill the lists from sorted keys; dim (pairs,). ``tiles``: of all images; ``each``: of one."""
+        """Fill the tile lists from sorted keys; dim (pairs,). ``tiles``: count in all images; ``each``: in one."""
         k = wp.tid()
         key = keys[k]
         tile, rank = int(key >> wp.int64(32)), int(key & wp.int64(0xFFFFFFFF))
@@ -320,7 +324,7 @@ def bin_primitives(
 ) -> tuple[TileLists, Tensor, Tensor]:
     """Return a frame's tile lists, ``slots`` and ``which``, from what ``prepare`` and :func:`count_tiles` filled.
 
-    ``images``: the image of each primitive, (N,) int32, and their number.
+    ``images``: (N,) int32 index of the image of each primitive, and the number of images.
     """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-camera.width // L.TILE), -(-camera.height // L.TILE)
@@ -357,10 +361,10 @@ def row_spans(
     rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, ids: Ints, tiles: Ints, size: wp.vec2i, spans: Shorts2d,
     counts: Ints,
 ):  # fmt: skip
-    """Thread n fills the pixels of its tile that pair n covers: start << 8 | last << 4 | first for each of 16 rows.
+    """Thread n writes which pixels of its tile pair n covers: start << 8 | last << 4 | first for each of 16 rows.
 
-    Each pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. This takes a fifth
-    of the memory of whole tiles.
+    Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. The slots
+    take a fifth of the memory of whole tiles.
     """
     n = wp.tid()
     i = ids[n]

@@ -1,10 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Native functions of the kernels: operations of a whole block, and array elements in one instruction each.
+"""Native functions of the kernels: operations across a block of threads, and fast loads of array elements.
 
-Every thread of a block must call a block's operation; on Warp's CPU blocks, a static buffer replaces the hardware.
-Warp's own indexing takes nine instructions for a row's span, as it allows negative indices and 64-bit strides. Two
-suffice in loops over hits: their indices are not negative and their arrays contiguous
-(:func:`neuprim.core.compute.warp.array`).
+Every thread of a block must call a block operation. On the CPU, a static buffer replaces the hardware. Indexing in Warp
+takes nine instructions to load a span, as Warp allows negative indices and 64-bit strides. In loops over hits, indices
+are not negative and arrays are contiguous, so two instructions suffice (:func:`neuprim.core.compute.warp.array`).
 """
 
 # annotations must be values, not text: Warp reads them, and cannot look up the local names of a function
@@ -32,14 +31,14 @@ _ANY = """
 
 @wp.func_native(_ANY)
 def any_tile_thread(yes: int) -> int:
-    """Return whether ``yes`` is not 0 in any thread of the block."""
+    """Return 1 if ``yes`` is not 0 in any thread of the block, else 0."""
 
 
 def _halving_sums(width: int) -> str:
-    """Return code that sums values over a warp: 31 shuffles per 32 values instead of 160.
+    """Return native code that sums ``width`` values over a warp: 31 shuffles per 32 values instead of 160.
 
-    Each step keeps half of the values and adds a partner lane's; lane l ends with l m to l m + m - 1, m = width/32.
-    Loops have constant bounds, so that they are unrolled.
+    Each step keeps half of the values and adds those of a partner lane. With m = width/32, lane l ends with the sums
+    l m to l m + m - 1. Loops have constant bounds, so that they are unrolled.
     """
     steps = ""
     for bit in (16, 8, 4, 2, 1):
@@ -75,13 +74,13 @@ def _halving_sums(width: int) -> str:
 
 @functools.cache
 def gradient_row_type(width: int) -> Any:
-    """Return the type of a gradient row in registers."""
+    """Return the type of a gradient row of ``width`` values in registers."""
     return wp.types.vector(length=width, dtype=wp.float32)
 
 
 @functools.cache
 def gradient_row_sums(width: int) -> Callable[..., Any]:
-    """Return a function (x, lane, out, pair) that writes sums over a warp to a pair's row; ``width``: 32 times n."""
+    """Return a function (x, lane, out, pair) that sums x over a warp into row ``pair``; ``width``: multiple of 32."""
     row = gradient_row_type(width)
 
     @wp.func_native(_halving_sums(width))
@@ -100,17 +99,17 @@ def int_at(numbers: Ints, at: int) -> int: ...
 
 @wp.func_native("return numbers.data[size_t(row) * size_t(width) + column];")
 def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float:
-    """Return one number of an array whose rows have ``width`` numbers."""
+    """Return element (row, column) of an array whose rows have ``width`` elements."""
 
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
 def span_of(spans: Shorts2d, pair: int, y: int) -> int:
-    """Return the span of a pair's row of pixels, see :func:`~neuprim.core.render.cuda.binning.row_spans`."""
+    """Return the span of pair ``pair`` in tile row ``y``, see :func:`~neuprim.core.render.cuda.binning.row_spans`."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")
 def load_rasterizer_row_column(rows: Vec4s2d, row: int, width: int, column: int) -> wp.vec4:
-    """Return one float4 column of a primitive's row; rows have ``width`` columns."""
+    """Return float4 column ``column`` of a primitive's row; rows have ``width`` columns."""
 
 
 @wp.func_native("return hits.data[slot];")

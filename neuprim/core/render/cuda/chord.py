@@ -1,9 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The line integral along one pixel's chord, forward and backward: the CPU's formulas with Warp's vectors.
+"""The integral along one pixel's chord, forward and backward: the formulas of the cpu backend with Warp vectors.
 
-An optical depth is I = N_p |d| D^p half field, with field the mean of the density's numerator, weighted by the edge.
-cos and B_p of a phase in turns are polynomials up to half a turn, recursions beyond (:mod:`neuprim.core.model.edge`).
-B_p' = -z B_(p+1)/(2p + 3): the backward pass needs one more member. Coefficients: tools/fit_polynomials.py.
+The optical depth is I = N_p |d| D^p half field. field is the mean of the density's numerator, weighted by the edge.
+cos and B_p of a phase in turns are polynomials up to half a turn, and recursions beyond
+(:mod:`neuprim.core.model.edge`). B_p' = -z B_(p+1)/(2p + 3): the backward pass also needs B_(p+1). Coefficients:
+tools/fit_polynomials.py.
 """
 
 from __future__ import annotations
@@ -110,7 +111,7 @@ def opacity_of_depth(I: float):  # type: ignore[no-untyped-def]
 
 @wp.struct
 class Ray:
-    """The columns of a primitive's row that :func:`intersect_chord` needs; kernels read the others themselves."""
+    """The columns of a primitive's row that :func:`intersect_chord` needs; kernels load other columns separately."""
 
     e0: wp.vec4
     ex: wp.vec4
@@ -122,7 +123,7 @@ class Ray:
 
 @wp.struct
 class Chord:
-    """A pixel's ray in whitened space; t counts in units of m from an origin slid by ``slide``."""
+    """A pixel's ray in whitened space. t is in units of m, from an origin moved along the ray by ``slide``."""
 
     du: float  # pixel offset from the anchor
     dv: float
@@ -151,7 +152,7 @@ def neuron_phase(q: wp.vec3, w: wp.vec4):
 
 @wp.func
 def load_ray(rows: Any, j: int):
-    """Return the ray of row ``j``, from a tile of rows or the whole array."""
+    """Return the :class:`Ray` of row ``j``, from a tile of rows or from the whole array."""
     r = Ray()
     r.e0 = rows[j, L.E0]
     r.ex = rows[j, L.EX]
@@ -164,7 +165,7 @@ def load_ray(rows: Any, j: int):
 
 @wp.func
 def intersect_chord(r: Ray, px: float, py: float):
-    """Return the chord of the pixel centre (px, py)."""
+    """Return the chord of the ray through pixel centre (px, py)."""
     c = Chord()
     c.du = px - r.e0[3]
     c.dv = py - r.ex[3]
@@ -190,7 +191,7 @@ def intersect_chord(r: Ray, px: float, py: float):
 
 @wp.struct
 class Pull:
-    """dL/d(origin m, direction e) of a ray."""
+    """The gradient dL/d(origin m, direction e) of a ray."""
 
     m: wp.vec3
     e: wp.vec3
@@ -200,7 +201,7 @@ class Pull:
 def chord_ends_backward(
     c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3
 ):
-    """Return dL/d(m, e) from dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD includes D's part by h."""
+    """Return dL/d(m, e) from dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD includes dh/dD."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     tm = g_tm + gt0 + gt1
@@ -216,7 +217,7 @@ def chord_ends_backward(
 
 @wp.func
 def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: float, gq: wp.vec3, gv: wp.vec3):
-    """Do the same in float32, with dh/dD = ``by_depth`` and no gradients other than through D and the chord's ends."""
+    """Like :func:`chord_ends_backward`, with dh/dD = ``by_depth``, and no gradient by tm and a."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     return chord_ends_backward(c, g_half, g_mid, 0.0, gD + (gt1 - gt0) * by_depth, 0.0, gq, gv)
@@ -224,13 +225,13 @@ def chord_backward(c: Chord, g_half: float, g_mid: float, gD: float, by_depth: f
 
 @wp.func
 def pixel_of_lane(lane: int):
-    """Return (x, y) in the tile of a block's thread: a warp covers 8 x 4 pixels, which small primitives fill better."""
+    """Return (x, y) in the tile for thread ``lane``: a warp covers 8 x 4 pixels, which small primitives fill better."""
     return wp.vec2i((lane & 7) | ((lane >> 2) & 8), ((lane >> 3) & 3) | ((lane >> 4) & 12))
 
 
 @wp.func
 def slot_of_pixel(span: int, offset: int, x: int):
-    """Return the slot of pixel x of a tile row, -1 outside its span (start << 8 | last << 4 | first)."""
+    """Return the slot of pixel x in a tile row; -1 outside the row's span (start << 8 | last << 4 | first)."""
     slot = int(-1)
     if x >= (span & 15) and x <= ((span >> 4) & 15):
         slot = offset + (span >> 8) + x - (span & 15)
@@ -239,7 +240,7 @@ def slot_of_pixel(span: int, offset: int, x: int):
 
 @wp.func
 def pixel_of_slot(spans: Any, n: int, s: int):
-    """Return (x, y) in the tile of pixel ``s`` of pair ``n``: the last row of ``spans`` that starts at or before it."""
+    """Return (x, y) in the tile of slot ``s`` of pair ``n``: y is the last row whose span starts at or before s."""
     y = int(0)
     for b in range(4):
         if int(spans[n, y + (8 >> b)]) >> 8 <= s:

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Colour networks, per primitive and at pixels; the CUDA version of :mod:`neuprim.core.render.cpu.colour_net`.
 
-The per-primitive stage is in float64. A slot's hue is the colour before max(0, .), which the forward pass saves. A
-network's share of a ray's gradient comes only through the chord's middle; it is linear, and added to the density's row.
+The per-primitive stage is in float64. A slot (one pixel of a pair) has a hue, the colour before max(0, .), which the
+forward pass saves. The network's gradient reaches a ray only through the chord's middle. It is added to the density's
+row.
 """
 
 import functools
@@ -65,7 +66,7 @@ _FAST = wp.constant(d(W.FLOAT64_TURNS**2))
 
 @dataclass
 class ColourNet:
-    """The networks of a frame; the parameters are contiguous, all float32 or all float64."""
+    """The colour networks of a frame; parameters are contiguous, all float32 or all float64."""
 
     Wx: Tensor  # (N, H, 3)
     bias: Tensor  # (N, H)
@@ -81,7 +82,7 @@ class ColourNet:
 
 @wp.func
 def _whitened_unit(log_scale: wp.vec3d, quat: wp.vec4d, w: wp.vec3d, phase: wp.float64):
-    """Return (WX, WY, WZ, PHASE) of a unit, on whitened axes and in turns."""
+    """Return (WX, WY, WZ, PHASE) of a network unit, converted to whitened axes and turns."""
     p = project_primitive(wp.vec3d(), log_scale, quat, View())
     on_axes = _TURNS * wp.cw_mul(p.axes, wp.transpose(p.local) * w)
     turns = _TURNS * phase
@@ -116,7 +117,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         which: Ints, log_scales: wp.array(dtype=vec3), quats: wp.array(dtype=vec4), Wx: wp.array2d(dtype=vec3),
         bias: wp.array2d(dtype=real), wide: Vec4ds2d,
     ):  # fmt: skip
-        """Thread (m, j) fills unit j of primitive ``which[m]``."""
+        """Thread (m, j) fills the float64 row of unit j of primitive ``which[m]``."""
         m, j = wp.tid()
         i = which[m]
         wide[m, j] = _whitened_unit(wp.vec3d(log_scales[i]), wp.vec4d(quats[i]), wp.vec3d(Wx[i, j]), d(bias[i, j]))
@@ -127,7 +128,10 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         channels: int, weights: Floats2d, grads: Floats2d, first: int, g_log_scales: Vec3s, g_quats: Vec4s,
         g_Wx: Vec3s2d, g_bias: Floats2d, g_Wout: Floats3d,
     ):  # fmt: skip
-        """One thread per primitive; visible if column G_WEIGHT of ``weights`` > 0. Adds to g_log_scales and g_quats."""
+        """Thread i computes the parameter gradients of primitive i, visible if column G_WEIGHT of ``weights`` > 0.
+
+        Adds to g_log_scales and g_quats; overwrites the other gradients.
+        """
         i = wp.tid()
         seen = weights[i, wp.static(L.G_WEIGHT)] > f(0.0)
         logs, quat = wp.vec3d(log_scales[i]), wp.vec4d(quats[i])
@@ -172,7 +176,7 @@ def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
 def prepare_rasterizer_colour_net(
     log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor
 ) -> ColourNet:
-    """Return the networks with rows of all primitives; ``wide`` is empty, see :func:`fill_wide_net`."""
+    """Return the networks with the rows of all primitives; :func:`fill_wide_net` fills ``wide``, which is empty."""
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
     dtype = torch.float64 if double else torch.float32
@@ -192,7 +196,7 @@ def prepare_rasterizer_colour_net(
 
 
 def fill_wide_net(net: ColourNet, which: Tensor, log_scales: Tensor, quats: Tensor) -> None:
-    """Fill ``net.wide`` for primitives ``which`` (M,) int32; ``log_scales`` and ``quats`` are the frame's."""
+    """Fill ``net.wide``, float64 rows, for primitives ``which`` (M,) int32."""
     M, H, device = len(which), net.hidden, net.Wx.device
     double = net.Wx.dtype == torch.float64
     real, vec3, vec4 = _kernel_types(double)
@@ -210,9 +214,9 @@ def fill_wide_net(net: ColourNet, which: Tensor, log_scales: Tensor, quats: Tens
 def colour_net_backward(
     net: ColourNet, parameters: Sequence[Tensor], weights: Tensor, grads: Tensor, out: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the float32 gradients of Wx, bias and Wout; adds to those of log_scales and quats in ``out``.
+    """Return the float32 gradients of Wx, bias and Wout; add to those of log_scales and quats in ``out``.
 
-    ``weights``, ``grads``: (N, .) gradient rows of the density's and of the networks' pass.
+    ``weights``, ``grads``: (N, ...) gradient rows of the density and of the networks.
     """
     _, log_scales, quats, *_ = parameters
     _, g_log_scales, g_quats, *_ = out
@@ -242,7 +246,7 @@ def net_gradient_row_width(form: KernelForm) -> int:
 
 @functools.cache
 def rasterizer_net_gradient_kernel(form: KernelForm) -> Any:
-    """Return a kernel, one warp per pair: gradients of its network, and the ray's share through the chord's middle."""
+    """Return a kernel, one warp per pair, for gradients of the network and, through the chord's middle, of the ray."""
     C, H, P = form.channels, form.hidden, form.edge
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     columns, net_columns = L.rasterizer_row_columns(form.neurons, C), max(H * each, 1)
@@ -325,7 +329,7 @@ def float64_hues_kernel(channels: int) -> Any:
         pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, rows: Vec4s2d, first: int, hidden: int,
         slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, size: wp.vec2i, hues: Floats2d,
     ):  # fmt: skip
-        """``mixes``: the networks' float32 rows, for output weights; ``rows``: bases from column ``first``."""
+        """``mixes``: float32 rows of networks, for output weights; ``rows``: constant colours from column ``first``."""
         member, lane = wp.tid()
         n = pairs[member]
         i, r = ids[n], slots[ids[n]]
@@ -348,7 +352,7 @@ def float64_hues_kernel(channels: int) -> Any:
 
 @functools.cache
 def float64_net_kernel(form: KernelForm) -> Any:
-    """Return the :func:`rasterizer_net_gradient_kernel` of the float64 pairs, in float64."""
+    """Return the float64 version of :func:`rasterizer_net_gradient_kernel`, for float64 pairs."""
     C = form.channels
     each, width = L.rasterizer_net_columns(C), net_gradient_row_width(form)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

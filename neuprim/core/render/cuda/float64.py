@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """The pixel stage in float64, for the few primitives that need more than float32: chords, opacities, gradients.
 
-The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are
-stored in the slots before compositing. Gradients of edges: :func:`neuprim.core.render.cpu.gradients.chord_gradient`.
+The formulas are those of :mod:`neuprim.core.render.cpu.float64`; a hard edge is q = 1. Opacities and entries are stored
+in the slots (pixels of pairs) before compositing. For gradients of edges see
+:func:`neuprim.core.render.cpu.gradients.chord_gradient`.
 """
 
 from __future__ import annotations
@@ -75,7 +76,7 @@ def intersect_chord64(wide: Doubles2d, r: int, X: int, Y: int):
 
 @wp.struct
 class Weight:
-    """Coefficients of q(u), its mean, and d q/d(1 - |y|^2) as a polynomial b0 + b1 u + b2 u^2."""
+    """The edge weight q(u): its coefficients, its mean, and dq/d(1 - |y|^2) as a polynomial b0 + b1 u + b2 u^2."""
 
     q: vec5d
     mean: wp.float64
@@ -86,7 +87,7 @@ class Weight:
 
 @wp.func
 def chord_edge_polynomial64(c: Chord64, edge: int):
-    """Return the weight q(u) = (D - a (shift + half u)^2)^p."""
+    """Return the edge weight q(u) = (D - a (shift + half u)^2)^p along a chord."""
     w = Weight()
     two, a, shift = d(2.0), d(1.0) / c.ia, c.mid - c.tm
     c0, c1, c2 = c.D - a * shift * shift, -two * a * shift * c.half, -a * c.half * c.half
@@ -137,7 +138,7 @@ def _chord_bessel(z: wp.float64):
 
 @wp.func
 def chord_moments(z: wp.float64):
-    """Return C_0, S_1, C_2, S_3, C_4, S_5."""
+    """Return the moments C_0, S_1, C_2, S_3, C_4, S_5 of :mod:`neuprim.core.render.cpu.float64`."""
     j = _chord_bessel(z)
     two, three, eight = d(2.0), d(3.0), d(8.0)
     M = vec6d()
@@ -152,20 +153,20 @@ def chord_moments(z: wp.float64):
 
 @wp.func
 def chord_phase64(c: Chord64, w: wp.vec3d, phase: wp.float64):
-    """Return the phase at the chord's middle, in radians, reduced to half a turn."""
+    """Return a neuron's phase at the chord's middle, in radians, reduced to half a turn."""
     u = wp.dot(c.q, w) + phase
     return d(_TWO_PI) * (u - wp.rint(u))
 
 
 @wp.func
 def rate64(c: Chord64, w: wp.vec3d):
-    """Return z, the phase change over half a chord in radians."""
+    """Return z, a neuron's phase change over half a chord, in radians."""
     return d(_TWO_PI) * c.half * wp.dot(c.e, w)
 
 
 @wp.struct
 class Moments:
-    """Means of q(u) cos(z u) and q(u) sin(z u), and their derivatives by z."""
+    """Means of q(u) cos(z u) and q(u) sin(z u) over a chord, and their derivatives by z."""
 
     even: wp.float64
     odd: wp.float64
@@ -175,7 +176,7 @@ class Moments:
 
 @wp.func
 def weighted_moments64(w: Weight, M: vec6d):
-    """Return the moments of a weight; ``M``: from :func:`chord_moments`."""
+    """Return the :class:`Moments` of an edge weight; ``M``: from :func:`chord_moments`."""
     out = Moments()
     out.even = w.q[0] * M[0] + w.q[2] * M[2] + w.q[4] * M[4]
     out.odd = w.q[1] * M[1] + w.q[3] * M[3]
@@ -186,7 +187,7 @@ def weighted_moments64(w: Weight, M: vec6d):
 
 @wp.struct
 class Pull64:
-    """dL/d(origin m, direction e, G) of a ray; G = du EX + dv EY grows with the pixel offset."""
+    """The gradient dL/d(origin m, direction e, G) of a ray; G = du EX + dv EY grows with the pixel offset."""
 
     m: wp.vec3d
     e: wp.vec3d
@@ -199,7 +200,7 @@ def chord_backward64(
     gD: wp.float64, gA: wp.float64,
     gq: wp.vec3d, gv: wp.vec3d,
 ):  # fmt: skip
-    """Do what :func:`~neuprim.core.render.cuda.chord.chord_ends_backward` does, with dh/dD from the floor on D."""
+    """Like :func:`~neuprim.core.render.cuda.chord.chord_ends_backward` in float64, with a floor on D in dh/dD."""
     half, two = d(0.5), d(2.0)
     gt1, gt0 = half * (g_mid + g_half), half * (g_mid - g_half) * c.uncut
     tm, g_h = g_tm + gt0 + gt1, gt1 - gt0
@@ -215,7 +216,7 @@ def chord_backward64(
 
 @wp.func
 def ray_norm(lens: wp.vec4, X: int, Y: int):
-    """Return the length of the ray direction whose camera-z is 1."""
+    """Return the length of the ray direction of pixel (X, Y), scaled to camera-z 1."""
     x = (d(X) + d(0.5) - d(lens[2])) / d(lens[0])
     y = (d(Y) + d(0.5) - d(lens[3])) / d(lens[1])
     return wp.sqrt(x * x + y * y + d(1.0))
@@ -223,14 +224,14 @@ def ray_norm(lens: wp.vec4, X: int, Y: int):
 
 @functools.cache
 def float64_opacity_kernel(depth: bool) -> Any:
-    """Return the kernel of opacities, for any form; ``depth``: also camera-z of the chords' middles."""
+    """Return the kernel that computes opacities, for any form; ``depth``: also camera-z of the chords' middles."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_opacity(
         pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
         lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
     ):  # fmt: skip
-        """One warp for each of ``pairs``; ``slots[i]``: the row of primitive i in ``wide``."""
+        """Store the opacities of ``pairs``, one warp each; ``slots[i]``: the row of primitive i in ``wide``."""
         member, lane = wp.tid()
         n = pairs[member]
         r = slots[ids[n]]
@@ -268,7 +269,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the pairs' gradient kernel of a form; ``depth``: with a gradient of the sum of w z."""
+    """Return the gradient kernel for float64 pairs of a form; ``depth``: the sum of w z has a gradient."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

@@ -1,9 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Forward pass of compositing: one block per tile, one thread per pixel. For ``sort = "entry"``, it has two passes.
+"""Forward pass of compositing: one block per tile, one thread per pixel; two passes for ``sort = "entry"``.
 
-Rows are loaded into shared memory in batches; a tile ends when T < T_min in all of its pixels. (alpha, transmittance
-before) of every hit is stored in its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). The slots of float64
-pairs contain their opacities beforehand (:mod:`~neuprim.core.render.cuda.float64`).
+Primitives' rows are loaded into shared memory in batches. A tile is finished when T < T_min in all of its pixels. A hit
+stores (alpha, transmittance before it) in its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). The slots of
+float64 pairs already contain opacities (:mod:`~neuprim.core.render.cuda.float64`).
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ from neuprim.core.settings import RenderSettings
 
 @wp.func
 def entry_sort_key(pixel: int, entry: float):
-    """Return a key that sorts by pixel, then by entry: the bits of floats, mapped to integers of the same order."""
+    """Return an integer key that sorts by pixel, then by entry, whose float bits are mapped to ordered integers."""
     bits = wp.int64(wp.cast(entry, wp.int32))
     if bits < wp.int64(0):
         bits = wp.int64(-1) - bits  # negative floats: larger ones have more bits
@@ -67,9 +67,11 @@ BATCH = 16  # rows in shared memory at a time
 
 @functools.cache
 def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
-    """Return a kernel. ``keep``: fill the slots, read float64 primitives from them; ``depth``: also the sum of w z.
+    """Return the compositing kernel of a form.
 
-    ``listing``: only list every hit, its key and pair, for :func:`composite_kernel`; ``several``: more than one image.
+    ``keep``: fill the slots, and read float64 primitives from slots; ``depth``: also compute the sum of w z.
+
+    ``listing``: only list key and pair of every hit, for :func:`composite_kernel`; ``several``: more than one image.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
@@ -88,7 +90,10 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
         limits: wp.vec4, background: Floats, size: wp.vec2i, rgb: Floats2d, transmittance: Floats, zsum: Floats,
         hits: Vec2s, depths: Floats, hues: Floats2d, reached: Ints, keys: Longs, owners: Ints,
     ):  # fmt: skip
-        """limits = (alpha_min, alpha_max, transmittance_min, -); pairs before ``reached[tile]`` were composited."""
+        """Composite one tile per block; sets ``reached[tile]``, the end of the composited pairs.
+
+        ``limits``: (alpha_min, alpha_max, transmittance_min, -).
+        """
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
         at = pixel_of_lane(lane)
@@ -243,7 +248,7 @@ def _first_hit_of_pixel(keys: Longs, count: int, pixel: int):
 
 @functools.cache
 def composite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel, one thread per pixel, front to back; slots get (alpha, T before), alpha 0 if hidden."""
+    """Return a kernel that composites sorted hits, one thread per pixel, and writes (alpha, T before) to slots."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
     colour_type = wp.types.vector(length=C, dtype=wp.float32)
@@ -254,7 +259,7 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
         background: Floats, hues: Floats2d, depths: Floats, hits: Vec2s, rgb: Floats2d, transmittance: Floats,
         zsum: Floats, begins: Ints,
     ):  # fmt: skip
-        """``begins[pixel]`` receives where its hits begin in ``order``."""
+        """Composite the hits of pixel tid; set ``begins[tid]`` to the first index of the hits in ``order``."""
         n = wp.tid()
         first = _first_hit_of_pixel(keys, count, n)
         begins[n] = first
@@ -302,7 +307,7 @@ _NUMBERS = {
 
 @dataclass
 class CompositedFrame:
-    """Results of a forward pass, and data saved for backward."""
+    """Images of a forward pass, and the data that the pass saves for backward."""
 
     rgb: Tensor  # (H W, C)
     transmittance: Tensor  # (H W,)
@@ -344,19 +349,19 @@ class KernelArrays:
 
     @property
     def covered(self) -> tuple[Any, ...]:
-        """Primitive, tile, and pixels of every pair."""
+        """Arrays with the primitive, the tile and the pixels of every pair."""
         return self.ids, self.tile_of, self.spans, self.offsets
 
 
 def _marked_pairs(marked: Tensor, count: int) -> Tensor:
-    """Return the (count,) int32 indices of a mask's True values, whose number is known; no synchronisation."""
+    """Return the indices, (count,) int32, of the ``count`` True values of a mask; does not synchronise."""
     place = torch.where(marked, torch.cumsum(marked, 0) - 1, count)
     numbers = torch.arange(marked.shape[0], dtype=torch.int32, device=marked.device)
     return torch.empty(count + 1, dtype=torch.int32, device=marked.device).index_copy_(0, place, numbers)[:count]
 
 
 def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
-    """Return slot count, (pairs + 1,) first slots, float64 pairs; synchronises. BackendUnavailable: too many slots."""
+    """Return slot count, (pairs + 1,) first slots, float64 pairs. Synchronises. BackendUnavailable: too many slots."""
     in_float64 = torch.empty(0, dtype=torch.int32, device=frame.device)
     offsets = torch.zeros(len(counts) + 1, dtype=torch.int32, device=frame.device)
     ends = torch.cumsum(counts, 0, dtype=torch.int64)
@@ -384,7 +389,7 @@ def composite_frame(
     differentiable: bool,
     images: int = 1,
 ) -> CompositedFrame:
-    """Draw one image, or several without gradients and sorted by centres. Synchronises if slots are kept."""
+    """Composite one image, or several (without gradients, sorted by centres). Synchronises if slots are needed."""
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
 

@@ -1,6 +1,6 @@
-"""Columns of the CUDA kernels' arrays; :mod:`neuprim.core.render.layout` explains the numbers.
+"""Column numbers of the CUDA kernels' arrays; :mod:`neuprim.core.render.layout` explains what columns hold.
 
-A primitive's row is a whole number of float4: one load of 16 bytes reads a vector and a scalar.
+A primitive's row consists of float4 columns: one load of 16 bytes reads a vector and a scalar.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ CUT_AT = -1e30  # entry of every chord that the near plane cuts: in front of all
 
 @dataclass(frozen=True)
 class KernelForm:
-    """The form of a compiled kernel: neurons K, exponent p, channels C, hidden units H (-1: constant colours)."""
+    """Constants of a compiled kernel: neurons K, edge exponent p, channels C, hidden units H (-1: constant colours)."""
 
     neurons: int
     edge: int
@@ -62,16 +62,16 @@ def rasterizer_row_columns(neurons: int, channels: int) -> int:
 
 
 def wide_width(neurons: int) -> int:
-    """Return the length of a primitive's float64 row: the CPU's columns without padding."""
+    """Return the length of a primitive's float64 row: the columns of the cpu backend without padding."""
     return layout.NEURONS + PER_NEURON * neurons
 
 
 def rasterizer_net_columns(channels: int) -> int:
-    """Return the float4 columns per unit of a colour network: (WX, WY, WZ, PHASE), then four output weights in each."""
+    """Return the number of float4 columns per network unit: (WX, WY, WZ, PHASE), then four output weights each."""
     return 1 + -(-channels // 4)
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the columns of a gradient row with H units of a colour network, a multiple of a warp's lanes."""
+    """Return the number of columns of a gradient row with H network units, a multiple of the warp size."""
     used = G_NEURONS + PER_NEURON * neurons + channels + (4 + channels) * hidden
     return -(-used // WARP) * WARP

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""A frame on the device, and the per-primitive stage that fills it: one thread per primitive, in float64.
+"""The device arrays of a frame, and the per-primitive stage that fills them: one thread per primitive, in float64.
 
-The CUDA version of :mod:`neuprim.core.render.cpu.prepare`. Rows are float4 and include the colours; neurons stay in the
-model's order. The stage also counts each primitive's tiles.
+This is the CUDA version of :mod:`neuprim.core.render.cpu.prepare`. Rows consist of float4 and include colours. Neurons
+stay in the order of the model. The stage also counts the tiles that each primitive reaches.
 """
 
 import functools
@@ -82,7 +82,7 @@ def store_float4(rows: Vec4s2d, i: int, j: int, x: float, y: float, z: float, w:
 
 @wp.func
 def _store_vector(rows: Vec4s2d, i: int, j: int, v: wp.vec3d, scalar: wp.float64):
-    """Store 16 bytes in one instruction; Warp's own store of a vector takes four."""
+    """Store a vector and a scalar, 16 bytes, in one instruction; a store of a Warp vector takes four."""
     store_float4(rows, i, j, f(v[0]), f(v[1]), f(v[2]), f(scalar))
 
 
@@ -102,8 +102,8 @@ def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
 def project_primitives_kernel(double: bool) -> Any:
     """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
 
-    ``counts`` (2, N): tiles reached, and 1 if the primitive is visible and needs float64. ``bad`` (1,): the first
-    primitive that is not finite, colours included. ``least``: the optical depth below which nothing is drawn.
+    ``counts`` (2, N): number of tiles reached; 1 if the primitive is visible and needs float64. ``bad`` (1,): the first
+    primitive that is not finite, colours included. ``least``: the optical depth below which samples are skipped.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 
@@ -301,7 +301,7 @@ def wide_kernel(double: bool) -> Any:
 
 
 class NotFinitePrimitive(ValueError):
-    """Primitive ``row`` is not finite, or outside float32; the caller reports which of its numbers."""
+    """Primitive ``row`` has values that are NaN, infinite or outside float32; the caller reports which ones."""
 
     def __init__(self, row: int) -> None:
         super().__init__(f"primitive {row} is not finite")
@@ -310,7 +310,7 @@ class NotFinitePrimitive(ValueError):
 
 @dataclass(frozen=True)
 class Projection:
-    """A view as argument of the kernels."""
+    """A camera view as argument of the kernels."""
 
     matrix: Tensor  # (16,) float64 on the device, world to camera
     camera: Camera  # focal lengths and centre in pixels, size
@@ -352,7 +352,7 @@ class Frame:
 
     @property
     def inputs(self) -> tuple[Any, ...]:
-        """The parameters as Warp arrays."""
+        """The parameters of the frame's primitives as Warp arrays."""
         return rasterizer_parameter_arrays(self.parameters)
 
 
@@ -376,8 +376,8 @@ def prepare_frame(
     Args:
         palette: (N, C) colours.
         tensors: those of :data:`~neuprim.core.render.rasterize.PARAMETERS`, all on one device.
-        forced: (N,) bool, primitives to draw in float64 in any case.
-        images: (N,) int32, the image of each primitive, and their number; None for one.
+        forced: (N,) bool, primitives that are always rendered in float64.
+        images: (N,) int32 index of the image of each primitive, and the number of images; None for one image.
 
     Raises NotFinitePrimitive, or BackendUnavailable if primitives reach 2^31 tiles or more.
     """

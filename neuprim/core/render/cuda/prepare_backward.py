@@ -1,5 +1,5 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""The chain rule from gradient rows to parameters, one thread per primitive, like the CPU's ``prepare_backward``."""
+"""Backward pass of the per-primitive stage, one thread per primitive, as in the cpu backend's ``prepare_backward``."""
 
 import functools
 from typing import Any
@@ -127,9 +127,9 @@ def _prepare_backward_kernel(double: bool) -> Any:
 
 
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """Return float32 gradients of the parameters, and with ``want_view`` the (3, 4) float64 one of (R | t).
+    """Return float32 gradients of the parameters, and with ``want_view`` the (3, 4) float64 gradient of (R | t).
 
-    ``grads``: (N, gradient_width) float32 rows; those whose weight is 0 give zeros.
+    ``grads``: (N, gradient_width) float32 rows; a row with weight 0 gives zero gradients.
     """
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in frame.parameters)
     g_view = torch.empty(grads.shape[0], 12, dtype=torch.float64, device=grads.device) if want_view else None

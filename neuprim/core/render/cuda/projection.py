@@ -42,7 +42,10 @@ class ProjectedPrimitive:
 
 @wp.struct
 class Ray:
-    """A = m S^-1 B^T and coefficients of rays in whitened space, x(t) = (xa + du xu + dv xv + s G) + t (e0 + G)."""
+    """A = m S^-1 B^T and the rays of a primitive in whitened space.
+
+    Rays are x(t) = (xa + du xu + dv xv + s G) + t (e0 + G).
+    """
 
     A: wp.mat33d
     ref: wp.vec3d
@@ -77,7 +80,7 @@ def load_projection_view(matrix: Doubles, intrinsics: wp.vec4d, near: wp.float64
 
 @wp.func
 def project_primitive(mean: wp.vec3d, log_scale: wp.vec3d, quat: wp.vec4d, v: View):
-    """Return the projection. The anchor is rounded *before* its use, so that pixel kernels subtract the same number."""
+    """Project a primitive. The anchor is rounded *before* its use, so that pixel kernels subtract the same value."""
     one, two = d(1.0), d(2.0)
     p = ProjectedPrimitive()
     n = one / wp.sqrt(quat[0] * quat[0] + quat[1] * quat[1] + quat[2] * quat[2] + quat[3] * quat[3])

@@ -1,1 +1,1 @@
-"""Hydra groups of the dynamic task."""
+"""Hydra config groups of the task ``dynamic``."""

@@ -1,1 +1,1 @@
-"""Datasets from OpenVDB sequences: a medium of their grids, ray-marched to ground truth."""
+"""Datasets from OpenVDB sequences: ground-truth images are ray-marched from the grids."""

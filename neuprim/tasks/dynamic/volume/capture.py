@@ -1,4 +1,4 @@
-"""Capture a volume sequence: cameras around the unit box, the images of every frame, and their files.
+"""Render a volume sequence: cameras around the unit box, images of every frame, and their files.
 
 volumes/KEY/scene.json                 what was rendered, and how scene units map to the files' world
 volumes/KEY/frame_00012/cam_07.exr     linear RGB radiance and alpha, premultiplied, half floats
@@ -67,14 +67,14 @@ _POINTS_BYTES = 2 * POINTS * 3 * 4 + 2**16
 
 @dataclass(frozen=True)
 class Capture:
-    """A volume sequence and everything its images depend on.
+    """A volume sequence, with all inputs that its images depend on.
 
     Attributes:
-        frames: the files, in order.
-        cameras: all of them, the last ``held_out`` of which are not trained on; ``samples``: rays per pixel side.
-        lights: number per frame, which training cameras take in turns; if several, held-out cameras have other lights.
+        frames: the .vdb files, in order.
+        cameras: training cameras, then ``held_out`` test cameras; ``samples``: rays per pixel side.
+        lights: number of lights per frame. Training cameras take turns; test cameras have other lights if several.
         bounds: (2, 3) box around all matter, scene units.
-        ends: frame numbers whose times are 0 and 1; None: the first and the last frame's.
+        ends: numbers of the frames with time 0 and 1; None: the first and the last frame.
         measured: frame number -> extent of its extinction grid; empty if unknown.
     """
 
@@ -92,25 +92,25 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The extinction grid's meaning if flames add to sigma and its part is stored; else empty."""
+        """The meaning of the extinction grid if flames add to sigma, as models then store its share; else empty."""
         return (self.reader.extinction,) if self.optics.mixes(self.reader.names) else ()
 
     @property
     def clock(self) -> tuple[int, int]:
-        """Frame numbers whose times are 0 and 1."""
+        """Numbers of the frames with time 0 and 1."""
         return self.ends or (self.frames[0].number, self.frames[-1].number)
 
     def time(self, frame: VdbFrame) -> float:
-        """Return a frame's time 0..1; it is linear in the number, so gaps in numbers are gaps in time."""
+        """Return a frame's time 0..1. Time is linear in the frame number, so missing numbers are gaps in time."""
         first, last = self.clock
         return (frame.number - first) / max(last - first, 1)
 
     def select_frames(self, first: int, last: int) -> Capture:
-        """Return the capture of frames ``first`` to ``last``, with times and image folder of all frames."""
+        """Return a capture of the frames ``first`` to ``last``; the times do not change."""
         return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
     def key(self) -> str:
-        """Return a short hash of all inputs; files count by name, size and modification time."""
+        """Return a short hash of all inputs; files are identified by path, size and modification time."""
         stats = [(f.number, str(f.path), f.path.stat().st_size, f.path.stat().st_mtime_ns) for f in self.frames]
         cameras = [(c.viewmat.tolist(), c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in self.cameras]
         optics, names, normalisation = asdict(self.optics), dict(self.reader.names), asdict(self.normalisation)
@@ -118,7 +118,7 @@ class Capture:
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def frame_lights(self, frame: VdbFrame) -> list[Light | None]:
-        """Return each camera's light: the optics' own for the first, constant in time if held out."""
+        """Return each camera's light in a frame: the optics' light for the first, constant lights for test cameras."""
         if self.lights == 1:
             return [self.optics.light] * len(self.cameras)
         lights = [self.optics.light, *draw_lights(self.optics, self.lights - 1, frame.number)]
@@ -126,7 +126,7 @@ class Capture:
         return [lights[c % self.lights] for c in range(training)] + draw_lights(self.optics, self.held_out)
 
     def medium(self, frame: VdbFrame) -> Medium:
-        """Build the medium of a frame's file without its light; empty if no grid of the file absorbs."""
+        """Build the medium of a frame, without the optics' light; empty if no grid of the file absorbs."""
         grids = self.reader.read(frame.path)
         if self.reader.extinction not in grids and not (self.components and self.optics.flame_grid in grids):
             return Medium.without_voxels()
@@ -137,7 +137,7 @@ class Capture:
             raise DataError(f"{frame.path}: {error}") from error
 
     def placement(self) -> DensityGridPlacement:
-        """Return how the scene maps to the world of its files, with the dataset's times."""
+        """Return how the scene maps to the world of its .vdb files, with frame numbers, times and grid names."""
         optics, names = self.optics, self.reader.names
         flames_absorb = optics.flame_extinction > 0 and optics.flame_grid in names
         return DensityGridPlacement(
@@ -152,24 +152,24 @@ class Capture:
         )
 
     def frame_folder(self, frame: VdbFrame) -> str:
-        """Return the name of the folder of a frame's files."""
+        """Return the name of the folder with a frame's images and points."""
         return f"frame_{frame.number:05d}"
 
     def fetch_image(self, store: Store, frame: VdbFrame, camera: int) -> Path:
-        """Return the local file of one image; raises DataError if the store cannot be read."""
+        """Return the local path of a frame's image from one camera; raises DataError if the store cannot be read."""
         pixels = self.cameras[camera].width * self.cameras[camera].height
         return store.fetch_file(f"{self.frame_folder(frame)}/cam_{camera:02d}.exr", pixels * 4 * 4 + 2**16)
 
     def fetch_points(self, store: Store, frame: VdbFrame) -> Path:
-        """Return the local points file of a frame.
+        """Return the local path of a frame's ``points.npz``.
 
-        It holds means (M, 3) scene units, colors (M, 3) linear radiance, weight () total extinction, largest ()
-        extinction, brightest () radiance of the frame's images.
+        The file has the arrays means (M, 3), scene units; colors (M, 3), linear radiance; weight (), total extinction;
+        largest (), largest extinction; brightest (), largest radiance in the frame's images.
         """
         return store.fetch_file(f"{self.frame_folder(frame)}/{LAST_FILE}", _POINTS_BYTES)
 
     def describe(self) -> dict[str, Any]:
-        """Return the content of ``scene.json``."""
+        """Return the content of ``scene.json`` as JSON values."""
         return {
             "renderer_version": RENDERER_VERSION,
             "frames": [{"number": f.number, "file": str(f.path)} for f in self.frames],
@@ -183,7 +183,7 @@ class Capture:
         }
 
     def render(self, frame: VdbFrame, folder: Path) -> None:
-        """Render a frame and write all of its files into a folder.
+        """Render a frame from all cameras; write its images and points into a folder.
 
         Raises:
             DataError: the frame's file cannot be read, or its light does not fit half floats.
@@ -210,7 +210,7 @@ class Capture:
 
 
 def _sample_medium_points(medium: Medium, seed: int) -> dict[str, Any]:
-    """Draw points in proportion to the extinction, with jitter inside their voxels."""
+    """Draw starting points in a medium, in proportion to the extinction, jittered inside their voxels."""
     generator = np.random.default_rng(seed)
     sigma = medium.values[..., 0]
     total = float(sigma.sum(dtype=np.float64))
@@ -237,8 +237,8 @@ def _encode_capture_value(value: Any) -> Any:
 class CapturedVdbFrames(DatasetImages):
     """Ground truth of a volume sequence: every frame from every camera, rendered when missing.
 
-    A frame's folder appears when all of its files are written. So an interrupted run continues with the missing frames,
-    and if two runs render the same frame, the files of the first are kept.
+    A frame's folder appears only when all of its files are written. An interrupted run therefore continues with the
+    missing frames. If two runs render the same frame, the files of the first one remain.
 
     Args:
         store: the store of ground truth; the images are in its ``volumes/KEY``.
@@ -281,7 +281,7 @@ class CapturedVdbFrames(DatasetImages):
             self.write(frame, tell)
 
     def write(self, frame: int, tell: Callable[[str], None] = warn_once) -> None:
-        """Render a frame and store it, unless it exists by then."""
+        """Render the frame with index ``frame`` and store it, unless the store already has it."""
 
         def render(folder: Path) -> None:
             self.capture.render(self.capture.frames[frame], folder)
@@ -295,10 +295,10 @@ class CapturedVdbFrames(DatasetImages):
                 self.store.write_file(_SCENE_FILE, lambda path: write_json(path, self.capture.describe()))
 
     def render_missing(self, progress: Callable[[str, float], None]) -> Store:
-        """Render missing frames in this process; return the store of the images.
+        """Render all missing frames in this process; return the store of the images.
 
         Raises:
-            DataError: a file cannot be read, or the place cannot be written.
+            DataError: a .vdb file cannot be read, or the store cannot be written.
         """
         missing = self.missing()
         if missing:
@@ -313,7 +313,7 @@ class CapturedVdbFrames(DatasetImages):
 
 @contextmanager
 def _describe_capture_write_errors(store: Store) -> Iterator[None]:
-    """Convert disk errors to a DataError of one line that names the store."""
+    """Convert errors of writing files to a DataError that names the store."""
     try:
         yield
     except (OSError, DataError) as error:
@@ -338,15 +338,13 @@ _ELEVATIONS = (3.0, 80.0)  # degrees above the horizon of the lowest and the hig
 def hemisphere_capture_cameras(
     size: int, cameras: int = 40, *, up: str = "z", field_of_view: float = 27.0
 ) -> tuple[list[Camera], list[Camera]]:
-    """Return training cameras and two test cameras around the unit box.
-
-    They are on a Fibonacci lattice over the upper hemisphere.
+    """Return training cameras, then two test cameras, on a Fibonacci lattice over the hemisphere above the unit box.
 
     Args:
         size: edge of the square images in pixels.
-        cameras: number of cameras of both kinds, at least 4.
-        up: 'y' or 'z'.
-        field_of_view: whole angle, degrees.
+        cameras: total number of cameras, at least 4.
+        up: upward axis, 'y' or 'z'.
+        field_of_view: full angle, degrees.
     """
     low, high = (math.sin(math.radians(e)) for e in _ELEVATIONS)
     focal = 0.5 * size / math.tan(math.radians(field_of_view) / 2)
@@ -365,10 +363,10 @@ def hemisphere_capture_cameras(
 
 
 def choose_rays_per_pixel(camera: Camera, voxel: float) -> int:
-    """Return 1 ray per pixel side where a pixel at the middle of the box is narrower than a ``voxel``, in scene units,
-    else 2.
+    """Return the rays per pixel side: 1 if pixels at the centre of the box are narrower than a ``voxel``, else 2.
 
-    One ray then differs from many by 68 to 72 dB PSNR (`smoke_fire` at 160×160), and takes a quarter of the time.
+    ``voxel`` is in scene units. For such narrow pixels, the PSNR of one ray against many is 68 to 72 dB (`smoke_fire`
+    at 160×160), in a quarter of the time of two per side.
     """
     return 1 if _DISTANCE / camera.fx < voxel else 2
 
@@ -380,9 +378,9 @@ _COMPARED_PER_THIRD = 3  # frames
 def sample_extinction(
     medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], part: bool = False
 ) -> np.ndarray:
-    """Return (X, Y, Z) float32 extinction at a lattice's points, trilinear.
+    """Sample a medium's extinction at the points of a grid, trilinearly: (X, Y, Z) float32.
 
-    With ``part``, it is only the extinction grid's part.
+    If ``part``, the result is only the contribution of the extinction grid, without flames.
     """
     if medium.values.size == 0:
         return np.zeros(shape, np.float32)
@@ -394,13 +392,14 @@ def sample_extinction(
 
 
 class CaptureDensity(DensityGridSource):
-    """Ground-truth density of ``path`` or of the scene's own files.
+    """Ground-truth density of the .vdb files of ``path``, or of the scene if ``path`` is None.
 
-    Grids, optics, placement and times are those of the scene. Frames of a folder outside the scene's times are left
-    out; a single file outside them has no time. Models are compared on a frame's own voxels within the sequence's box.
+    Grids, optics, placement and times are those of the scene. If ``path`` is a folder, frames outside the scene's
+    times are left out. If it is a single file outside these times, it has no time. Models are compared on the voxels
+    of the frame, within the sequence's box.
 
     Raises:
-        DataError: no file, or no frame within the scene's times.
+        DataError: there is no file, or no frame within the scene's times.
     """
 
     def __init__(self, capture: Capture, path: Path | None = None) -> None:
@@ -422,7 +421,7 @@ class CaptureDensity(DensityGridSource):
         self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]
 
     def medium(self, frame: int) -> Medium:
-        """Return the medium of a frame's file; the last one is cached, as grids are requested in parts."""
+        """Return the medium of a frame. The last medium is cached, since grids are requested in parts."""
         if self._cached is None or self._cached[0] != frame:
             self._cached = (frame, self.capture.medium(self._files[frame]))
         return self._cached[1]
@@ -452,12 +451,12 @@ class CaptureDensity(DensityGridSource):
 
 
 def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
-    """Measure errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
+    """Measure a model's errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
 
-    ``sigma_frames`` has the numbers of every compared frame
-    (:func:`~neuprim.core.volumes.density_truth.measure_density_errors`); thirds are means over three of them, evenly
-    spaced. Frames without extinction are left out. If flames add to the extinction of a grid, the same numbers exist
-    for that grid's part: ``density_frames``, ...
+    "sigma_frames" has the errors of each compared frame, see
+    :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. The errors of a third are means over three
+    evenly spaced frames. Frames without extinction are left out. If flames add to the extinction of a grid, the errors
+    of that grid's part are also measured: "density_frames", ...
     """
     result: dict[str, Any] = {}
     count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD

@@ -1,4 +1,4 @@
-"""Rendered volume sequences as a dataset: one view per camera and frame, two cameras held out."""
+"""Dataset of a rendered volume sequence: one view per camera and frame; two cameras are held out."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11
 """Shares of the memory for training images, test images (read in order) and voxels."""
 
 LIGHT_DISTANCE = 1e4
-"""Distance of directional lights from the middle of the scene, scene units."""
+"""Distance of directional lights from the scene's centre, scene units."""
 
 _MIN_ALPHA = 1.0 / 255.0  # least alpha of a pixel that shows matter
 
@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 class _RecentFrames(Generic[T]):
-    """LRU cache of items by index, read on first use; old ones are dropped beyond ``memory`` bytes."""
+    """LRU cache of items, read by index on first use. The oldest items are dropped beyond ``memory`` bytes."""
 
     def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
         self._read, self._size, self._memory = read, size, memory
@@ -58,12 +58,14 @@ class _RecentFrames(Generic[T]):
 
 
 class VdbFrameViews(ViewSet):
-    """Frames of some cameras, camera by camera; half floats, decoded on first use.
+    """Views of a rendered volume sequence: all frames of the first camera, then of the next one, and so on.
+
+    Images are decoded to half floats on first use.
 
     Args:
         folder: store of the images.
-        exposure: radiance that becomes 1.
-        every: use every n-th frame only; times stay those of the whole sequence.
+        exposure: radiance that is scaled to 1.
+        every: use every n-th frame only; times remain relative to the whole sequence.
         memory: bytes of decoded images in memory.
     """
 
@@ -86,7 +88,7 @@ class VdbFrameViews(ViewSet):
         return len(self.cameras) * len(self.times)
 
     def _split_index(self, index: int) -> tuple[int, int]:
-        """Return the camera number of a view, and the position of its frame."""
+        """Convert a view's index to the camera number and the index of the frame."""
         camera, frame = divmod(index, len(self.times))
         return self.cameras[camera], frame
 
@@ -116,9 +118,9 @@ class VdbFrameViews(ViewSet):
 
 
 def light_conditions(capture: Capture, light: Light | None) -> dict[str, Tensor]:
-    """Return a view's light conditions: position and irradiance.
+    """Return the conditions "light" (position) and "light_intensity" (irradiance) of a view with a light at infinity.
 
-    The position is so far away that rays are parallel. Empty if all views have the same light.
+    The position is so far away that rays are practically parallel. The result is empty if all views have one light.
     """
     if capture.lights == 1 or light is None:
         return {}
@@ -129,14 +131,14 @@ def light_conditions(capture: Capture, light: Light | None) -> dict[str, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class VolumeRecording:
-    """A rendered volume sequence, for starting points and evaluation; a dataset's ``extra``.
+    """Facts about a rendered volume sequence for starting points and evaluation; stored as a dataset's ``extra``.
 
     Attributes:
         folder: store of the rendered images.
         exposure: the brightest radiance that any camera sees.
         weights: total extinction of each frame.
         every: every n-th frame is used for training.
-        test: the held-out views, camera by camera, all frames of each.
+        test: the held-out views: all frames of one camera, then of the next.
     """
 
     name: str
@@ -149,7 +151,7 @@ class VolumeRecording:
     _masks: dict[int, Tensor] = field(default_factory=dict, repr=False)
 
     def points(self, views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
-        """Draw starting points with the "time" of their frame, in proportion to the extinction of training frames."""
+        """Draw starting points with the "time" of their frame; frames are drawn in proportion to their extinction."""
         weights = np.array(self.weights)
         weights[[t for t in range(len(weights)) if t % self.every]] = 0.0
         if not weights.sum() > 0:
@@ -180,7 +182,7 @@ class VolumeRecording:
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
 
     def matter_mask(self, index: int) -> Tensor:
-        """Return an (H, W) bool mask of matter in any frame of a test view's camera; cached per camera."""
+        """Return an (H, W) bool mask of pixels that matter covers in any frame of a test view's camera; cached."""
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
@@ -192,7 +194,7 @@ class VolumeRecording:
 
 @dataclass(frozen=True)
 class TrainingFrames:
-    """Part of a sequence that a run uses.
+    """The part of a volume sequence that a run uses.
 
     Attributes:
         every: train on every n-th frame.
@@ -214,7 +216,7 @@ def volume_dataset(
     up: Tensor,
     used: TrainingFrames = TrainingFrames(),
 ) -> Dataset:
-    """Return the dataset of a rendered sequence.
+    """Return the dataset of a rendered volume sequence.
 
     Colours are linear radiance over the brightest value that any camera sees.
 
@@ -271,7 +273,7 @@ _POINTS_FILE = {
 
 
 def read_vdb_frame_points(path: Path, *names: str) -> dict[str, Any]:
-    """Read arrays of a frame's points file; DataError if it is damaged."""
+    """Read the arrays ``names`` of a frame's ``points.npz``; DataError if the file is damaged."""
     try:
         return read_npz_arrays(path, {name: _POINTS_FILE[name] for name in names})
     except DataError as error:
@@ -279,7 +281,7 @@ def read_vdb_frame_points(path: Path, *names: str) -> dict[str, Any]:
 
 
 def total_extinction_of_vdb_frame(capture: Capture, store: Store, frame: VdbFrame) -> float:
-    """Read the total extinction of a frame from its points file."""
+    """Read the total extinction of a frame from its ``points.npz``."""
     return float(read_vdb_frame_points(capture.fetch_points(store, frame), "weight")["weight"])
 
 
@@ -302,7 +304,7 @@ _MAX_VOXEL_BYTES = 4 * 2**30  # of a frame; more than the largest grid that is r
 
 @dataclass(frozen=True)
 class MediumVoxels:
-    """A frame's voxels that hold matter or light.
+    """The voxels of a frame that are not empty.
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
@@ -329,24 +331,24 @@ class MediumVoxels:
 
     @functools.cached_property
     def rms(self) -> tuple[float, float, float]:
-        """Root mean squares of sigma, sigma times radiance, and the extinction grid's part; 0 without voxels."""
+        """Root mean squares over voxels: of sigma, sigma times radiance, the extinction grid's part; 0 if empty."""
         if not len(self.index):
             return 0.0, 0.0, 0.0
         squares = np.square(self.values, dtype=np.float64).mean(0)
         return tuple(float(np.sqrt(x)) for x in (squares[0], squares[1:4].mean(), squares[4:].sum()))  # type: ignore[return-value]
 
     def write(self, path: Path) -> None:
-        """Write the arrays to an .npz file; raises OSError."""
+        """Write the voxels to an .npz file; raises OSError."""
         arrays: dict[str, Any] = {name: np.asarray(getattr(self, name)) for name in _VOXEL_ARRAYS}
         with open(path, "wb") as file:
             np.savez(file, **arrays)
 
     @staticmethod
     def read(path: Path) -> MediumVoxels:
-        """Read what :meth:`write` wrote.
+        """Read voxels that :meth:`write` wrote.
 
         Raises:
-            DataError: damaged, or not the voxels of a grid.
+            DataError: the file is damaged, or its arrays are not voxels of a grid.
         """
         found = read_npz_arrays(path, _VOXEL_ARRAYS)
         index, values, matrix = found["index"], found["values"], found["scene_from_index"]
@@ -362,7 +364,7 @@ class MediumVoxels:
         return MediumVoxels(index, values, (x, y, z), matrix)
 
     def values_at_cells(self, cells: np.ndarray) -> np.ndarray:
-        """Return (M, C) values at (M, 3) integer indices; 0 outside."""
+        """Return (M, C) values of the voxels with integer indices ``cells`` (M, 3); 0 for empty voxels."""
         values = np.zeros((len(cells), self.values.shape[1]), np.float32)
         inside = ((cells >= 0) & (cells < np.array(self.shape))).all(1)
         if len(self.index) and inside.any():
@@ -373,14 +375,15 @@ class MediumVoxels:
 
 
 class FrameVoxels(PointSupervision):
-    """Sampler of voxel centres, one frame at a time, to supervise the extinction directly.
+    """Sampler of voxels, for training that compares the model with the extinction of the files.
 
-    A frame is drawn in proportion to its extinction, and one draw in ten takes any frame. 70 % of the points are voxels
-    with matter, 20 % lie up to six voxels away from one, and 10 % anywhere in a box larger than the sequence's.
+    Each sample is from one frame. The probability of a frame is proportional to its extinction; one draw in ten is
+    uniform over frames. 70 % of the points are voxels with matter, 20 % lie up to six voxels away from such a voxel,
+    and 10 % anywhere in a box larger than the sequence's box.
 
     Args:
-        folder: store of the images. Voxels of a frame are stored there as well, as their light takes long to compute.
-        views: whose frames, times and exposure are used.
+        folder: store of the images. Lit voxels are stored there, too, since their light takes long to compute.
+        views: training views; their frames, times and exposure are used.
         weights: total extinction of each of these frames.
         memory: bytes of voxels in memory.
     """
@@ -433,7 +436,7 @@ class FrameVoxels(PointSupervision):
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
-        """Return a frame's medium, lit if there is one light; of several, models add each themselves."""
+        """Return a frame's medium, including a single light. With several lights, the model adds scattered light."""
         medium = self.capture.medium(frame)
         return light_medium(medium, self.capture.frame_lights(frame)[0]) if self.capture.lights == 1 else medium
 

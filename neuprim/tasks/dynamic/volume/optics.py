@@ -1,4 +1,4 @@
-"""Optics of a volume: settings, presets (``scene.look``), and how the grids of a frame become extinction and light."""
+"""Optics of a volume: settings, presets (``scene.look``), and conversion of a frame's grids to extinction and light."""
 
 from __future__ import annotations
 
@@ -121,11 +121,11 @@ class Optics:
         validate_fields(self, "scene.optics")
 
     def mixes(self, names: Container[str]) -> bool:
-        """Return whether flames add to the extinction grid's extinction, given the grids ``names``."""
+        """Return whether both the extinction grid and the flames absorb, in files with the grids ``names``."""
         return self.extinction > 0 and self.flame_extinction > 0 and self.flame_grid in names
 
     def turn_to_axis(self, up: Axis) -> Optics:
-        """Return the optics for sequences with the up axis ``up``; the light is rotated, too."""
+        """Return these optics for sequences with the up axis ``up``: the light's direction is rotated accordingly."""
         if up == self.up or self.light is None:
             return replace(self, up=up)
         x, y, z = self.light.direction
@@ -194,17 +194,17 @@ OPTICS_PRESETS = {
 
 
 def optics_preset(name: str, up: Axis = "z") -> Optics:
-    """Return the preset ``scene.look=name`` for the up axis ``up``; ConfigError if there is none."""
+    """Return the optics of the preset ``scene.look=name`` for the up axis ``up``; ConfigError if it does not exist."""
     if name not in OPTICS_PRESETS:
         raise ConfigError(f"scene.look={name}: no such look{nearest(name, OPTICS_PRESETS)}")
     return OPTICS_PRESETS[name].turn_to_axis(up)
 
 
 def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
-    """Apply ``scene.optics.KEY=VALUE`` to optics; a light keeps the settings that are not given.
+    """Apply changes ``scene.optics.KEY=VALUE`` to optics; settings of the light that are not given do not change.
 
     Raises:
-        ConfigError: no such setting, a value of another form, or an impossible one.
+        ConfigError: a setting does not exist, or a value has a wrong type or is out of range.
     """
     validate_setting_names(changes, field_types(Optics), "scene.optics")
     light = changes.get("light")
@@ -219,7 +219,7 @@ _LOWEST = math.radians(10.0)  # lowest elevation of random lights
 
 
 def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
-    """Draw lights as strong as the optics' own, uniform over the sky; ``key`` seeds the draw."""
+    """Draw ``count`` random lights, as strong as the optics' light, uniform over the sky; ``key`` is the seed."""
     own = optics.light
     if own is None:
         return [None] * count
@@ -236,7 +236,7 @@ def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
 
 
 def light_medium(medium: Medium, light: Light | None) -> Medium:
-    """Return the medium with its single scattering of a light added: isotropic, with shadows."""
+    """Add isotropic single scattering of a light, with shadows, to a medium's source; return the new medium."""
     if light is None or medium.empty or medium.scattered is None:
         return medium
     values = medium.values.copy()
@@ -253,16 +253,16 @@ _BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between
 def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray) -> Medium:
     """Build the medium of one frame on the voxels of its extinction grid, without the optics' light.
 
-    Other grids are sampled at those voxels' centres, trilinearly unless their transform is the same. If flames absorb,
-    the medium contains all of them. An empty frame gives an empty medium.
+    Other grids are sampled at the centres of these voxels, trilinearly unless they have the same transform. If flames
+    absorb, the voxels are extended to contain all flames. An empty frame gives an empty medium.
 
     Args:
-        grids: by meaning; those that the optics do not use are ignored.
+        grids: meaning -> grid; grids that the optics do not use are ignored.
         scene_from_world: (4, 4) float64.
 
     Raises:
-        DataError: none of the extinction grids is there, one has the wrong number of channels, the box is too large, or
-            an extinction overflows.
+        DataError: no extinction grid exists, a grid has a wrong number of channels, the box is too large, or an
+            extinction overflows.
     """
     flames = grids.get(optics.flame_grid) if optics.emission > 0.0 or optics.flame_extinction > 0.0 else None
     base = next((grids[name] for name in optics.extinction_grids if name in grids), None)
@@ -294,7 +294,7 @@ def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world:
 
 
 def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
-    """Return bounds in indices of ``transform``: of voxels with centres in a grid's active box."""
+    """Return the bounds of the voxels of ``transform`` whose centres lie in a grid's active box."""
     if grid.bounds is None or _same_voxels(grid.transform, transform):
         return grid.bounds
     ends = np.array(grid.bounds, np.float64) - 0.5  # faces of the outermost voxels, not centres
@@ -316,7 +316,7 @@ def _make_medium_bounds(low: np.ndarray, high: np.ndarray) -> Bounds:
 
 
 def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether two index-to-world maps have the same voxels, to a millionth of a voxel."""
+    """Return whether two index-to-world matrices define the same voxels, to a millionth of a voxel."""
     scale = float(np.abs(b[:3, :3]).max())
     shift = np.linalg.inv(b) @ a[:, 3]  # not a difference, as the world's origin may be far away
     same_axes = np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * scale)
@@ -351,7 +351,7 @@ def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, chann
 def _scattering_albedo(
     grids: Mapping[str, VdbGrid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
 ) -> np.ndarray:
-    """Return the albedo, times colour grid or gradient, such that it broadcasts to (X, Y, Z, 3)."""
+    """Return the albedo times colour grid or gradient, broadcastable to (X, Y, Z, 3)."""
     albedo = np.array(optics.albedo, np.float32)
     if optics.color_grid is not None and optics.color_grid in grids:
         return albedo * np.clip(_sample_medium_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
@@ -367,7 +367,7 @@ def _scattering_albedo(
 
 
 def _flame_radiance(flame: np.ndarray, optics: Optics) -> np.ndarray:
-    """Return (X, Y, Z, 3) float32 emission · B(K(flame))."""
+    """Return the radiance of flames, emission · B(K(flame)) of :class:`Optics`, (X, Y, Z, 3) float32."""
     low, high = optics.flame_range
     table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
     where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
@@ -391,7 +391,7 @@ def _black_body_observer_lobe(mean: float, below: float, above: float) -> np.nda
 
 @cache
 def _standard_observer() -> np.ndarray:
-    """Return (3, L) CIE 1931 2° colour matching functions: fit of Wyman, Sloan, Shirley (JCGT 2013)."""
+    """Return (3, L) CIE 1931 2° colour matching functions, by the fit of Wyman, Sloan, Shirley (JCGT 2013)."""
     x = 0.362 * _black_body_observer_lobe(442.0, 0.0624, 0.0374) + 1.056 * _black_body_observer_lobe(
         599.8, 0.0264, 0.0323
     )
@@ -406,7 +406,7 @@ def _standard_observer() -> np.ndarray:
 
 
 def black_body_xyz(kelvin: np.ndarray) -> np.ndarray:
-    """Return (…, 3) CIE XYZ of black bodies in one unit of radiance.
+    """Return (…, 3) CIE XYZ of black bodies at temperatures ``kelvin``, in an arbitrary common unit.
 
     XYZ = ∫ B(λ, T) (x̄, ȳ, z̄) dλ, B ∝ λ⁻⁵ / (exp(hc/λkT) - 1).
     """
@@ -416,6 +416,6 @@ def black_body_xyz(kelvin: np.ndarray) -> np.ndarray:
 
 
 def black_body_rgb(kelvin: np.ndarray, hottest: float) -> np.ndarray:
-    """Return (…, 3) linear sRGB of black bodies, clipped at 0; the largest channel at ``hottest`` is 1."""
+    """Return (…, 3) linear sRGB of black bodies, clipped at 0; the largest channel at ``hottest`` kelvin is 1."""
     top = np.maximum(black_body_xyz(np.array(hottest)) @ _SRGB_FROM_XYZ.T, 0.0).max()
     return np.maximum(black_body_xyz(kelvin) @ _SRGB_FROM_XYZ.T, 0.0) / top

@@ -1,9 +1,10 @@
 """Ray marching of a voxel medium, cell by cell: images, and the transmittance to a light.
 
-A cell is the cube between eight voxel centres. Along a straight line through it a trilinear field is a cubic
-polynomial, which two Gauss points integrate exactly, so a ray's optical depth has no discretisation error. For the
-radiance, each point's source is weighted by the transmittance up to it, scaled so that a constant source is integrated
-exactly: an error of fourth order in the step. Steps of an optical depth above 0.5 are shortened.
+A cell is the cube between eight voxel centres. Along a straight line through a cell, a trilinear field is a cubic
+polynomial. Two Gauss points integrate it exactly, so a ray's optical depth has no discretisation error. For the
+radiance, the source at each point is weighted by the transmittance up to the point. The weights are scaled so that a
+constant source is integrated exactly. The error is of fourth order in the step. Steps with an optical depth above 0.5
+are shortened.
 """
 
 from __future__ import annotations
@@ -44,7 +45,7 @@ _NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest so
 
 @dataclass(frozen=True, eq=False)
 class Medium:
-    """Extinction and source of a medium on voxel centres, trilinear between; may have no voxels.
+    """Extinction and source of a medium at voxel centres, trilinear in between. A medium may have no voxels.
 
     The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at its end.
 
@@ -52,8 +53,8 @@ class Medium:
         values: (X, Y, Z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
             The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
         scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
-        scattering: (X, Y, Z) float32, the extinction grid's part of σ if flames add to it; None if it is all of σ.
-        scattered: (X, Y, Z, 3) float32, that part times the scattering albedo; None if it scatters no light.
+        scattering: (X, Y, Z) float32, the extinction grid's part of σ; None if flames do not add to σ.
+        scattered: (X, Y, Z, 3) float32, the extinction grid's part of σ times the albedo; None without a light.
     """
 
     values: np.ndarray
@@ -91,7 +92,7 @@ class Medium:
 
     @property
     def empty(self) -> bool:
-        """Whether there is no cell: fewer than two voxels along some axis."""
+        """Whether the medium has no cell: fewer than two voxels along some axis."""
         return min(self.values.shape[:3]) < 2
 
     @cached_property
@@ -118,9 +119,9 @@ class Medium:
 
 
 def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions: int = 1) -> Tensor:
-    """Render a medium: (H, W, 4) float32 linear premultiplied RGBA without a background.
+    """Render a medium to (H, W, 4) float32 linear premultiplied RGBA, without a background.
 
-    Alpha is exact up to rounding, radiance of fourth order. A ray ends where T < 1e-4.
+    Alpha is exact up to rounding; radiance has an error of fourth order. A ray ends where T < 1e-4.
 
     Args:
         camera: pinhole, scene units.
@@ -140,8 +141,8 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
     """Return (X, Y, Z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
-    It is exact up to rounding. ``direction`` points to the light, scene axes, any length > 0. Voxels without extinction
-    get 1 without a ray.
+    The transmittance is exact up to rounding. ``direction`` points to the light, on the scene's axes, any length > 0.
+    Voxels without extinction get 1 instead of a traced ray.
     """
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
@@ -158,7 +159,7 @@ def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarra
 
 @inline
 def _clip_march_to_slab(o, d, size, near, far):  # type: ignore[no-untyped-def]
-    """Return the part of [near, far] in which ``o + t d`` is within 0..size."""
+    """Clip the interval [near, far] of t to the part where ``o + t d`` is within 0..size, for one axis."""
     if abs(d) < 1e-12:
         return (near, far) if 0.0 <= o <= size else (_FAR, -_FAR)
     a, b = -o / d, (size - o) / d
@@ -173,7 +174,7 @@ def _first_march_cell(o, d, t, cells):  # type: ignore[no-untyped-def]
 
 @inline
 def _inverse_march_direction(d):  # type: ignore[no-untyped-def]
-    """Return 1 / d; 0 if the ray does not leave its cells along this axis."""
+    """Return 1 / d for one axis; 0 if the ray does not leave its cell along this axis."""
     return 1.0 / d if abs(d) > 1e-12 else 0.0
 
 
@@ -189,7 +190,7 @@ def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
 
 @inline
 def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-def]
-    """Return the cell beyond ``t`` on one axis; exact on the crossed one, so rounding stalls no ray."""
+    """Return the next cell index after ``t`` for one axis; exact on the crossed axis, so rounding stalls no ray."""
     if crossed:
         return cell + reach + 1 if d > 0.0 else cell - reach - 1
     if reach == 0:
@@ -199,7 +200,7 @@ def _next_march_cell(o, d, cell, reach, t, crossed):  # type: ignore[no-untyped-
 
 @inline
 def _march_absorption(depth):  # type: ignore[no-untyped-def]
-    """Return (1 - exp(-depth)) / depth and exp(-depth), float32, mostly by series: no cancellation."""
+    """Return (1 - exp(-depth)) / depth and exp(-depth), float32. A series for small depths avoids cancellation."""
     if depth < _HALF:
         mean = _ONE - depth * _C7
         mean = _ONE - depth * _C6 * mean
@@ -225,10 +226,10 @@ def _short_march_transmittance(depth):  # type: ignore[no-untyped-def]
 
 @inline
 def _march_step_gains(a, b):  # type: ignore[no-untyped-def]
-    """Return weights of the sources of two Gauss points in a step, and its transmittance, float32.
+    """Return the weights of the sources at the two Gauss points of a step, and the step's transmittance, float32.
 
     Args:
-        a, b: optical depth that each point stands for.
+        a, b: optical depths of the two points' halves of the step.
     """
     depth = a + b
     if depth > _HALF:  # shortest steps in an almost opaque medium: the points one after the other, always in range
@@ -249,7 +250,7 @@ _FREE = ("nsz", "contract", "reassoc")  # fast-math flags of LLVM in _two_points
 def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any, second: Any) -> Any:
     """Generate code for trilinear values of four channels at two points of a cell, as vectors.
 
-    LLVM does not vectorise the scalar code, which takes 1.4 times as long.
+    The scalar code takes 1.4 times as long, since LLVM does not vectorise it.
 
     Args:
         flat: float32 array of the interleaved voxels.

@@ -1,4 +1,4 @@
-"""Find the grids of a sequence, measure them, and place the sequence in the scene's unit box."""
+"""Find the grids of an OpenVDB sequence, measure them, and map the sequence into the scene's unit box."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ _PEAK_QUANTILE = 0.999  # of a grid's voxels, so that single outliers do not cha
 
 @dataclass(frozen=True)
 class GridReader:
-    """Reads the grids of files by meaning ("density", "temperature", "flames", "color").
+    """Reader of the grids of .vdb files by meaning ("density", "temperature", "flames", "color").
 
     Attributes:
         names: meaning -> name in the files.
@@ -40,10 +40,10 @@ class GridReader:
     extinction: str = "density"
 
     def with_extinction(self, wanted: Sequence[str], folder: Path) -> GridReader:
-        """Choose the first of the optics' ``extinction_grids`` that the sequence has.
+        """Return a reader whose extinction grid is the first of ``wanted`` that the sequence has.
 
         Raises:
-            DataError: it has none of them.
+            DataError: the sequence has none of these grids.
         """
         for meaning in wanted:
             if meaning in self.names:
@@ -55,17 +55,17 @@ class GridReader:
         )
 
     def read(self, path: Path) -> dict[str, VdbGrid]:
-        """Read the grids of one file by meaning; grids that the file lacks are left out (exporters drop empty ones)."""
+        """Read one file: return meaning -> grid. Missing grids are left out, since exporters drop empty grids."""
         in_file = {grid.name for grid in read_header(path).grids}
         wanted = {meaning: name for meaning, name in self.names.items() if name in in_file}
         return dict(zip(wanted, read_grids(path, list(wanted.values())), strict=True))
 
 
 def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> GridReader:
-    """Find the grids that some frame has: those the user chose by name, then those with a usual name.
+    """Find the grids that any frame has, first by the names that the user chose, then by common names.
 
     Raises:
-        DataError: a named grid is in no file or cannot be read (level sets, points), or no grid absorbs.
+        DataError: a chosen grid is in no file or cannot be read (level sets, points), or no grid absorbs.
     """
     refusals: dict[str, str | None] = {}  # name -> why the grid cannot be used
     for frame in frames:
@@ -99,12 +99,12 @@ def find_volume_grids(frames: Sequence[VdbFrame], chosen: Mapping[str, str]) -> 
 
 @dataclass(frozen=True)
 class SequenceSurvey:
-    """What the grids of all frames hold.
+    """Statistics of the grids of all frames of a sequence.
 
     Attributes:
-        box: (2, 3) around all matter, world units.
+        box: (2, 3) bounds of all matter, world units.
         extents: frame number -> extent of its extinction grid.
-        hottest: the largest flame.
+        hottest: largest value of the flame grids.
         peaks: meaning -> a value that one voxel in a thousand exceeds.
         voxel: shortest edge of a voxel of these grids, world units.
     """
@@ -119,7 +119,7 @@ class SequenceSurvey:
 def survey_volume_frames(
     frames: list[VdbFrame], reader: GridReader, optics: Optics, progress: Callable[[str, float], None]
 ) -> SequenceSurvey:
-    """Read all frames and measure their grids. Matter is what absorbs: the extinction grid, and flames if they do.
+    """Read all frames and measure their grids. Matter is the extinction grid, and the flames if they absorb.
 
     Raises:
         DataError: no frame has an active voxel.
@@ -152,22 +152,23 @@ def survey_volume_frames(
 
 
 def _count_vdb_values(values: np.ndarray) -> np.ndarray:
-    """(2^15,) numbers of positive values by the upper half of a float32's bits, which rises with its value."""
+    """Count positive values per bin, (2^15,); the bin is the upper half of a float32's bits, sorted by value."""
     positive = values[np.isfinite(values) & (values > 0)]
     return np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=1 << 15)
 
 
 def _peak_vdb_value(counts: np.ndarray) -> float:
-    """A quantile close to the largest value, to about 1 %; 0 without any value."""
+    """Return a quantile close to the largest value, to about 1 %, from counts per bin; 0 if all counts are 0."""
     cumulative = np.cumsum(counts)
     place = int(np.searchsorted(cumulative, _PEAK_QUANTILE * cumulative[-1]))
     return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if cumulative[-1] else 0.0
 
 
 def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurvey) -> dict[str, Any]:
-    """Settings of the optics for these files: presets are for grids that peak at about 1, so divide by the peak.
+    """Return settings of the optics that depend on the values in the files.
 
-    The divisor is rounded to a power of two, so that a few more or fewer frames change nothing.
+    Presets assume grids with a peak of about 1, so the extinctions are divided by the peak. The divisor is rounded to a
+    power of two, so that it rarely changes when frames are added or left out.
     """
     grids = {"extinction": extinction, "flame_extinction": "flames"}
     settings: dict[str, Any] = {
@@ -180,14 +181,14 @@ def data_dependent_optics(optics: Optics, extinction: str, survey: SequenceSurve
 
 @dataclass(frozen=True)
 class CaptureNormalisation:
-    """scene = (world - center) · scale, the same for all frames; axes are not turned."""
+    """Map from world to scene: scene = (world - center) · scale, equal for all frames, without rotation."""
 
     center: tuple[float, float, float]
     scale: float
 
     @staticmethod
     def from_bounds(bounds: np.ndarray) -> CaptureNormalisation:
-        """Map the (2, 3) box ``bounds``, world units, to one around the origin with longest side 1.
+        """Return the map of the box ``bounds`` (2, 3), world units, to a box around the origin with longest side 1.
 
         Raises:
             DataError: the box is not finite, or has no volume.
@@ -206,7 +207,7 @@ class CaptureNormalisation:
         return (np.asarray(points, np.float64) - self.center) * self.scale
 
     def matrix(self) -> np.ndarray:
-        """(4, 4) float64, world to scene, acting on column vectors."""
+        """Return the (4, 4) float64 matrix from world to scene, for column vectors."""
         matrix = np.diag([self.scale, self.scale, self.scale, 1.0])
         matrix[:3, 3] = -np.asarray(self.center) * self.scale
         return matrix

@@ -1,8 +1,9 @@
-"""Load volume scenes (``scene=smoke_fire`` and others): OpenVDB files, given or simulated, as a dataset, or in chunks.
+"""Load volume scenes (``scene=smoke_fire`` and others) from given or simulated OpenVDB files; split them into chunks.
 
-Chunks of time divide the training frames evenly, in order, and are trained separately. Each also sees a few frames
-beyond its ends, over which neighbouring chunks are blended (:mod:`neuprim.tasks.dynamic.time_density`). Times, box,
-cameras and exposure are those of the whole sequence, so that nothing has to be converted.
+A long sequence can be trained in chunks of time, each in its own run. Chunks divide the training frames evenly, in
+order. Each chunk also contains a few frames beyond its ends, over which neighbouring chunks are blended
+(:mod:`neuprim.tasks.dynamic.time_density`). All chunks use the times, box, cameras and exposure of the whole sequence,
+so that the trained models can be joined without conversion.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ from neuprim.tasks.dynamic.volume.survey import (
 
 
 def _vdb_frame_range(frames: str) -> range | None:
-    """The numbers of "FIRST:LAST" or "FIRST:LAST:STEP", LAST included; None for other text."""
+    """Parse "FIRST:LAST" or "FIRST:LAST:STEP" to frame numbers, LAST included; None for other text."""
     match = re.fullmatch(r"(\d{1,9}):(\d{1,9})(?::(\d{1,9}))?", frames)
     if match is None or (step := int(match[3] or 1)) < 1 or int(match[1]) > int(match[2]):
         return None
@@ -135,10 +136,12 @@ class VdbSceneSettings:
         return self.memory * 2.0**20
 
     def resolve_optics(self, has_density: bool = True) -> Optics:
-        """The preset with the user's changes; "auto" is for files with a density, or those whose hot gas absorbs.
+        """Return the optics: the preset with the user's changes.
+
+        ``look="auto"`` is "smoke_fire" for files with a density, else "embergen_fire", where hot gas absorbs.
 
         Raises:
-            ConfigError: no such preset or setting, or an impossible value.
+            ConfigError: a preset or setting does not exist, or a value is out of range.
         """
         automatic = "smoke_fire" if has_density else "embergen_fire"
         preset = optics_preset(automatic if self.look == "auto" else self.look, self.up)
@@ -146,10 +149,10 @@ class VdbSceneSettings:
 
 
 def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the sequence") -> list[int]:
-    """Those of the ascending ``numbers`` of a sequence that ``scene.frames`` names.
+    """Select the frames of ``scene.frames`` from the ascending frame ``numbers`` of a sequence.
 
     Raises:
-        ConfigError: another form than "all", "FIRST:LAST" or "FIRST:LAST:STEP".
+        ConfigError: ``frames`` is not "all", "FIRST:LAST" or "FIRST:LAST:STEP".
         DataError: none of the frames exists.
     """
     wanted = _vdb_frame_range(validate_value(frames, Frames, "scene.frames"))
@@ -166,7 +169,7 @@ def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the 
 
 @dataclass(frozen=True)
 class _PreparedVdbScene:
-    """Everything that is known before anything is rendered."""
+    """A volume scene before rendering: its settings, source, capture and held-out cameras."""
 
     settings: VdbSceneSettings
     name: str
@@ -175,7 +178,7 @@ class _PreparedVdbScene:
     held_out: range
 
     def span_ends(self) -> tuple[int, int] | None:
-        """First and last number of the chosen frames within ``scene.span``; None for all of them."""
+        """Return first and last number of the chosen frames within ``scene.span``; None for all frames."""
         wanted = None if self.settings.span is None else _vdb_frame_range(self.settings.span)
         if wanted is None:
             return None
@@ -194,11 +197,11 @@ class _PreparedVdbScene:
 
 
 def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load a volume scene: find or simulate files, survey them, render all cameras, store the images in the cache.
+    """Load a volume scene: find or simulate .vdb files, measure them, render all cameras, store images in the cache.
 
     Raises:
-        ConfigError: unknown setting or impossible value.
-        DataError: files that are missing, damaged, or without a usable grid; a cache that cannot be written.
+        ConfigError: a setting is unknown, or a value is out of range.
+        DataError: files are missing, damaged, or without a usable grid, or the cache cannot be written.
     """
     scene = _prepare_vdb_scene(settings, context)
     _report_chosen_extinctions(scene)
@@ -212,16 +215,16 @@ def load_volume_scene(settings: Mapping[str, Any], context: SceneContext) -> Dat
 def open_captured_vdb_frames(
     settings: Mapping[str, Any], context: SceneContext, known: Mapping[str, Any] | None = None
 ) -> CapturedVdbFrames:
-    """The scene's images as work to be done; raises as :func:`load_volume_scene`.
+    """Prepare the images of a volume scene without rendering them; raises as :func:`load_volume_scene`.
 
     Args:
-        known: of the same scene's ground truth in another process, which has surveyed the files.
+        known: facts about this scene from another process, so that the files need not be measured again.
     """
     return _prepare_vdb_scene(settings, context, known).rendered_frames(context)
 
 
 def open_volume_source(settings: Mapping[str, Any], context: SceneContext) -> CaptureDensity:
-    """The scene's files without any image; raises as :func:`load_volume_scene`."""
+    """Open the .vdb files of a volume scene without rendering images; raises as :func:`load_volume_scene`."""
     scene = _prepare_vdb_scene(settings, context)
     span = scene.span_ends()
     return CaptureDensity(scene.capture if span is None else scene.capture.select_frames(*span))
@@ -279,7 +282,7 @@ def _prepare_vdb_scene(
 
 
 def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
-    """Print one line with the extinctions that were chosen instead of the preset's."""
+    """Print one line with the extinctions that were adapted to the files and differ from the preset."""
     capture = scene.capture
     preset = scene.settings.resolve_optics("density" in capture.reader.names)
     lines = []
@@ -295,21 +298,21 @@ def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
 # ---------------------------------------------------------------- chunks of time
 
 MAX_FRAMES, MIN_FRAMES = 100, 25
-"""Frames of an automatic chunk: primitives are active for much of a sequence, and short chunks cut that short."""
+"""Maximum and minimum frames per chunk for "auto". Short chunks cut off primitives that are active for a long time."""
 
 _TIME_POWERS = {"window_center": 1, "velocity": -1, "acceleration": -2, "W_t": -1}
-"""Parameters in units of the sequence's time -> power of time in them."""
+"""Parameters that depend on the unit of time -> their power of time."""
 
 _FRAMES_PER_OVERLAP, _MAX_OVERLAP = 8, 3
-"""A chunk sees one frame beyond each end per eight of its own, from one to three. An abrupt change of models is visible
-where little moves; frames in two chunks cost both of them."""
+"""A chunk contains extra frames beyond each end: one per eight of its frames, from one to three. Without overlap, the
+change of models is visible where little moves. But both chunks must be trained on the frames of an overlap."""
 
 
 def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    """The chunks of ``scene.chunks``; None for one run. Renders all frames, as the chunks share one exposure.
+    """Split a run into ``scene.chunks`` chunks; None for one run. Renders all frames: chunks share one exposure.
 
     Raises:
-        ConfigError: more chunks than the frames allow; and as :func:`load_volume_scene`.
+        ConfigError: there are too few frames for so many chunks. Other errors as in :func:`load_volume_scene`.
     """
     scene = _prepare_vdb_scene({name: value for name, value in config["scene"].items() if name != "name"}, context)
     options, capture = scene.settings, scene.capture
@@ -343,15 +346,18 @@ def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> 
 
 
 def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int, memory: float) -> int:
-    """Number of chunks: the requested one, or for "auto" enough that none has more than :data:`MAX_FRAMES` frames and
-    the images of each fit in memory, but not so many that one has fewer than :data:`MIN_FRAMES`.
+    """Return the number of time chunks: the requested number or, for "auto", a suitable one.
+
+    "auto" uses as many chunks as needed so that no chunk has more than :data:`MAX_FRAMES` frames and the images of each
+    chunk fit in memory. But no chunk has fewer than :data:`MIN_FRAMES` frames.
 
     Args:
-        frames: for training.
-        image_bytes, memory: bytes of all decoded training images, and of those that a run keeps in memory.
+        frames: number of training frames.
+        image_bytes: size of all decoded training images.
+        memory: bytes of decoded images that a run can hold in memory.
 
     Raises:
-        ConfigError: fewer than two frames per chunk.
+        ConfigError: a chunk would have fewer than two frames.
     """
     if requested == "auto":
         wanted = max(math.ceil(frames / MAX_FRAMES), math.ceil(image_bytes / memory))
@@ -366,7 +372,7 @@ def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int
 
 
 def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Settings of a chunk's training: learning rates as for a sequence of the chunk's length, windows at most that."""
+    """Return changed settings for a chunk: learning rates in units of its length, windows at most as long."""
     length = capture.time(frames[-1]) - capture.time(frames[0])
     density = TimeDensity(config["model"]["neurons"], **config["model"]["density"])
     rates = {spec.name: config["train"]["rates"].get(spec.name, spec.lr) for spec in density.parameters()}
@@ -380,15 +386,15 @@ def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[
 
 
 def join_time_chunks(models: Sequence[Primitives], numbers: Sequence[int], overlaps: ChunkOverlaps) -> Primitives:
-    """Join the models of chunks: at every time their extinctions and sources, weighted by their chunks' weights.
+    """Join the models of time chunks to one model, which sums their extinctions and sources, weighted by chunk.
 
     Args:
-        models: all of one form, in the whole sequence's time.
-        numbers: of their chunks, 0 to len(overlaps); missing chunks are empty.
-        overlaps: of neighbouring chunks.
+        models: models with the same field settings, in the time of the whole sequence.
+        numbers: chunk number of each model, 0 to len(overlaps); chunks without a model are empty.
+        overlaps: overlaps in time of neighbouring chunks.
 
     Raises:
-        ConfigError: forms differ, or are joined models already.
+        ConfigError: models have different field settings, or a model is already joined.
     """
     first = models[0]
     for model in models:

@@ -1,1 +1,1 @@
-"""Hydra groups of the relighting task."""
+"""Hydra config groups of the task ``relight``."""

@@ -1,1 +1,1 @@
-"""Hydra groups of the static task; a package, because Hydra looks for one."""
+"""Hydra config groups of the task ``static``. (Hydra searches for config groups in packages.)"""

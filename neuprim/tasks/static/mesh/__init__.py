@@ -1,4 +1,4 @@
-"""The scene ``mesh``: a user's mesh file, ray-cast with cameras and light of the scene ``solids``."""
+"""The scene ``mesh``: a user's mesh file, rendered by ray casting with the cameras and light of ``scene=solids``."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LIGHT = Daylight(DAYLIGHT.direction, *((0.8 * r, 0.8 * g, 0.8 * b) for r, g, b i
 
 @dataclass(frozen=True)
 class MeshSettings(SolidsSettings):
-    """Settings of ``scene=mesh`` beyond those of ``solids``."""
+    """Settings of ``scene=mesh`` in addition to those of ``scene=solids``."""
 
     # the model, .glb, .gltf, .obj, .ply or .stl
     path: Annotated[Path, nonempty_text("the model's file")] = field(kw_only=True)
@@ -53,7 +53,7 @@ class MeshSettings(SolidsSettings):
 
 
 def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=mesh``, drawn on first use; raises DataError for a damaged model or files outside its folder."""
+    """Load ``scene=mesh``, rendered on first use; raises DataError if the mesh is damaged or names files elsewhere."""
     asked = validate_settings(MeshSettings, settings, "scene")
     folder = generate_mesh_images(asked, context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import load_blender
@@ -68,7 +68,7 @@ def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
 def generate_mesh_images(
     settings: MeshSettings, cache_dir: Path, progress: Progress = lambda text, fraction: None
 ) -> Path:
-    """Write the data set unless it is complete; return its folder ``cache_dir/mesh-KEY``."""
+    """Write the images of ``scene=mesh`` unless they exist; return the folder ``cache_dir/mesh-KEY``."""
     path = find_model_file(settings.path)
     progress(f"mesh: reading {path.name}", 0.0)
     model = MODEL_READERS[path.suffix.lower()](MeshFolder(path, settings.skip_missing))
@@ -91,7 +91,7 @@ def generate_mesh_images(
 def unlit_mesh_radiance(
     scene: Scene, origins: NDArray[np.float64], directions: NDArray[np.float64]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Return (N, 3) unlit linear RGB of N rays, zero where nothing is hit, and an (N,) bool hit mask."""
+    """Trace N rays without lighting: return (N, 3) linear RGB, zero without a hit, and an (N,) bool hit mask."""
     hits = scene.intersect(origins, directions)
     image = np.zeros(directions.shape, dtype=np.float32)
     image[hits.hit] = hits.albedo if hits.emission is None else hits.albedo + hits.emission

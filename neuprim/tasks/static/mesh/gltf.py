@@ -1,4 +1,4 @@
-"""glTF 2 (.gltf, .glb): materials and triangles. Animations, lights and cameras are ignored."""
+"""Reader of materials and triangles from glTF 2 (.gltf, .glb). Animations, lights and cameras are ignored."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ _ROWS = 50_000  # vertices that are skinned at once, which bounds the memory
 
 
 class _GltfPrimitive(NamedTuple):
-    """Indexed triangles in the space of their mesh: faces (F, 3), and values per vertex."""
+    """Indexed triangles of a glTF primitive in mesh coordinates: faces (F, 3), and values per vertex."""
 
     material: str
     faces: NDArray[np.int64]
@@ -53,7 +53,7 @@ class _GltfPrimitive(NamedTuple):
 
 
 def read_gltf(folder: MeshFolder) -> Model:
-    """Read a .gltf or .glb file; DataError if it is damaged, compressed, or has invalid references."""
+    """Read a .gltf or .glb file; DataError if it is damaged or compressed, or a reference is invalid."""
 
     def read() -> Model:
         reader = _GltfReader(GltfDocument(folder))
@@ -66,7 +66,7 @@ def read_gltf(folder: MeshFolder) -> Model:
 
 
 class _GltfReader:
-    """Reader of the materials and triangles of one document."""
+    """Reader of the materials and triangles of one glTF document."""
 
     def __init__(self, document: GltfDocument) -> None:
         self.document, self.path = document, document.path
@@ -74,7 +74,7 @@ class _GltfReader:
         self.vertices = self.triangles = self.parts = self.skipped = 0
 
     def read_faces(self, materials: Mapping[str, Material]) -> tuple[list[Faces], int]:
-        """Return all triangles of the default scene, in its coordinates, and their vertex count."""
+        """Return all triangles of the document's default scene, in scene coordinates, and the number of vertices."""
         nodes = self.document.entries("nodes")
         check_mesh_limits(self.path, {"nodes": (len(nodes), MAX_PARTS)})
         matrices = self._node_matrices(nodes)
@@ -106,7 +106,7 @@ class _GltfReader:
         return found, self.vertices
 
     def _count_primitive(self, primitive: _GltfPrimitive) -> None:
-        """Count one use of a primitive against the limits."""
+        """Add one use of a primitive to the counts; raise DataError above a limit."""
         self.vertices += len(primitive.positions)
         self.triangles += len(primitive.faces)
         self.parts += 1
@@ -116,7 +116,7 @@ class _GltfReader:
     def _read_gltf_mesh(
         self, number: int, node: Mapping[str, Any], materials: Mapping[str, Material], pose: NDArray | None = None
     ) -> list[_GltfPrimitive]:
-        """Read the triangles of a node's mesh; ``pose`` are (J, 4, 4) joint matrices of a skin."""
+        """Read the triangles of the mesh of ``node``; ``pose`` has the (J, 4, 4) joint matrices of a skinned mesh."""
         mesh = self.document.content["meshes"][number]
         weights = [finite_gltf_number(w) for w in node.get("weights", mesh.get("weights", []))]
         found = []
@@ -167,7 +167,7 @@ class _GltfReader:
         return _GltfPrimitive(name, faces, positions, normals, colour, uv, glow_uv)
 
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
-        """Return (V, 2) coordinates, v upward, of the set that a material's texture uses; None without."""
+        """Return (V, 2) coordinates, v upward, of the set that a material's texture uses; None if it is missing."""
         material = self.document.content["materials"][int(name)]
         texture = {**_gltf_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
@@ -183,7 +183,7 @@ class _GltfReader:
     def _pose_vertices(
         self, primitive: Mapping[str, Any], name: str, values: NDArray, weights: Sequence[float], pose: NDArray | None
     ) -> NDArray[np.float64]:
-        """Return (V, 3) positions or normals after morph targets and skinning."""
+        """Apply morph targets and skinning to (V, 3) positions or normals."""
         count = len(values)
         for weight, target in zip(weights, primitive.get("targets", []), strict=False):
             if weight and name in target:
@@ -209,7 +209,7 @@ class _GltfReader:
         return moved
 
     def _place_primitive(self, primitive: _GltfPrimitive, matrix: NDArray[np.float64]) -> Faces:
-        """Transform a primitive by the (4, 4) ``matrix`` to scene coordinates."""
+        """Return a primitive transformed by ``matrix`` (4, 4) to scene coordinates."""
         faces = primitive.faces
         with np.errstate(all="ignore"):
             positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -241,7 +241,7 @@ class _GltfReader:
         return found
 
     def _instance_matrices(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the (4, 4) transforms of a node's mesh: one, or one per instance."""
+        """Return the (4, 4) transforms of a node's mesh: one per instance (EXT_mesh_gpu_instancing), else one."""
         instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
         if instancing is None:
             return [matrix]
@@ -288,7 +288,7 @@ class _GltfReader:
         return replace(found, blend=mode == "BLEND", glow=glow, unlit=unlit)
 
     def _textured_material(self, factor: Sequence[float], texture_info: Mapping[str, Any] | None) -> Material:
-        """Return a material of a colour factor and the texture that it multiplies, if any."""
+        """Return a material with a colour factor and, if given, the texture that the factor multiplies."""
         colour = (factor[0], factor[1], factor[2])
         if texture_info is None:
             return Material(colour)
@@ -306,7 +306,7 @@ class _GltfReader:
         return Material(colour, self._read_gltf_image(to_gltf_index(source)), wrap, transform)
 
     def _read_gltf_image(self, index: int) -> str | None:
-        """Read an image, return its key in :attr:`images`; None if missing, with ``skip_missing``."""
+        """Read an image; return its key in :attr:`images`, or None if it is missing and ``skip_missing`` is set."""
         name = f"image {index}"
         if name not in self.images:
             image = self.document.content["images"][index]
@@ -321,9 +321,9 @@ class _GltfReader:
 
 
 def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
-    """Return base colour and texture in ``pbrMetallicRoughness`` keys.
+    """Return a material's base colour and texture with the keys of ``pbrMetallicRoughness``.
 
-    If a material has both notations, specular-glossiness wins.
+    If a material also has the specular-glossiness extension, the extension's values are used.
     """
     glossy = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness")
     if glossy is None:
@@ -333,7 +333,7 @@ def _gltf_base_colour(material: Mapping[str, Any]) -> Mapping[str, Any]:
 
 
 def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
-    """Return the (4, 4) parent-from-node matrix of a matrix or of translation, rotation and scale."""
+    """Return the (4, 4) parent-from-node matrix of a node, from its matrix or its translation, rotation and scale."""
     matrix = np.eye(4)
     lengths = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
     numbers = {key: [finite_gltf_number(x) for x in place[key]] for key in lengths if key in place}
@@ -352,7 +352,7 @@ def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
 
 
 def _index_triangles(index: NDArray[np.int64], mode: int) -> NDArray[np.int64]:
-    """Return (F, 3) vertex indices of a triangle list, strip or fan."""
+    """Convert the indices of a triangle list, strip or fan (``mode``) to (F, 3) vertex indices."""
     if mode == _TRIANGLES:
         return index[: len(index) // 3 * 3].reshape(-1, 3)
     count = max(len(index) - 2, 0)

@@ -1,4 +1,4 @@
-"""JSON and binary data of a glTF file; indices and sizes are checked against the available bytes."""
+"""JSON and binary data of a glTF file. All indices and sizes are checked against the available bytes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _T = TypeVar("_T")
 
 
 def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
-    """Call a function; convert the exceptions that damaged documents cause to DataError."""
+    """Call a function that reads a glTF document; convert exceptions that damaged documents cause to DataError."""
     try:
         return function()
     except _DAMAGE as error:
@@ -69,7 +69,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 class GltfDocument:
-    """A glTF document with checked version and extensions, and its arrays."""
+    """A glTF document; its version and required extensions are checked. Gives access to its arrays."""
 
     def __init__(self, folder: MeshFolder) -> None:
         data = folder.read_model()
@@ -85,7 +85,7 @@ class GltfDocument:
         self._buffers = [self._read_buffer(i, entry, binary) for i, entry in enumerate(self.entries("buffers"))]
 
     def entries(self, key: str) -> list[Any]:
-        """Return the document's top-level list ``key``; empty if it is missing."""
+        """Return the document's top-level list ``key``, or an empty list if it is missing."""
         return self.content.get(key, [])
 
     def _check_extensions(self) -> None:
@@ -101,7 +101,7 @@ class GltfDocument:
             warn_once(f"{self.path}: uses the glTF extension{'s' * (len(ignored) > 1)} {shown[:300]}; drawn without")
 
     def unsupported(self, extension: str) -> DataError:
-        """Return the error for an extension that is not read."""
+        """Return the DataError for an extension that neuprim does not support."""
         found = f"needs the glTF extension {extension[:60]}, which is not read"
         return DataError(f"{self.path}: {found}; expected a plain export, not compressed")
 
@@ -164,14 +164,14 @@ def parse_gltf_uri(uri: Any) -> str:
 
 
 def to_gltf_index(value: Any) -> int:
-    """Return an index or count; refuse -1, with which Python would take the last entry of a list."""
+    """Check that a JSON value is an index or a count, and return it. Negative numbers are refused."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 0:
         raise ValueError(f"an index is {str(value)[:20]}")
     return value
 
 
 def finite_gltf_number(value: Any) -> float:
-    """Return a number; refuse NaN and infinity."""
+    """Check that a JSON value is a finite number, and return it."""
     number = float(value)
     if not math.isfinite(number):
         raise ValueError(f"a number is {number}")

@@ -1,7 +1,7 @@
-"""Reading a mesh file and the files it refers to: under size limits, from its folder only.
+"""Read a mesh file and the files that it names, within size limits and only from the mesh file's folder.
 
-Polygons are triangulated by fans, or else by ear clipping, which keeps the surface; polygons that cross themselves are
-refused.
+Polygons are triangulated by fans, or by ear clipping where a fan would change the surface. Self-intersecting polygons
+are refused.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _SCHEME = re.compile(r"[A-Za-z][A-Za-z0-9+.\-]*:")
 
 @dataclass(frozen=True)
 class Material:
-    """Surface material: colour, texture, opacity and emission."""
+    """Surface material of a mesh: colour, texture, opacity and emission."""
 
     colour: tuple[float, float, float] | None = (
         None  # linear RGB factor on texture and vertex colours; None if the file has none
@@ -55,7 +55,7 @@ class Material:
 
 @dataclass(frozen=True)
 class Faces:
-    """Triangles of one material."""
+    """Triangles of a mesh that have the same material."""
 
     corners: NDArray[np.float64]  # (F, 3, 3) positions in the units and axes of the file
     material: str = ""
@@ -67,7 +67,7 @@ class Faces:
 
 @dataclass(frozen=True)
 class Model:
-    """A mesh file whose references are read and whose geometry is not parsed yet."""
+    """A mesh file with its materials and textures in memory. ``read_faces`` parses the geometry later."""
 
     path: Path
     read_faces: Callable[[], tuple[list[Faces], int]]  # all triangles, and the number of vertices; raises DataError
@@ -79,7 +79,7 @@ class Model:
 
 
 def find_model_file(path: Path) -> Path:
-    """Return the existing mesh file of ``scene.path`` with ``~`` expanded; raises DataError for any other."""
+    """Return the mesh file ``path`` with ``~`` expanded; raises DataError if it is missing or of another type."""
     try:
         file = path.expanduser()
         usable, there = file.is_file(), file.exists()
@@ -96,7 +96,7 @@ def find_model_file(path: Path) -> Path:
 
 
 class MeshFolder:
-    """Reader of a mesh file and files below its folder, up to a total size; hashes all it reads."""
+    """Reader of a mesh file and of files below its folder, up to a total size; computes a hash of all bytes read."""
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
         self.file, self.skip_missing = file, skip_missing
@@ -115,14 +115,14 @@ class MeshFolder:
         return data
 
     def read_required(self, reference: str, what: str) -> bytes:
-        """Read a required file; DataError if outside the model's folder, missing or too large."""
+        """Read a file that the mesh file needs; DataError if it is outside the folder, missing or too large."""
         found, fault = self._resolve_reference(reference, what)
         if found is None:
             raise DataError(fault)
         return found
 
     def read_optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """Read the first existing of ``references``; else raise, or warn and return None (``skip_missing``)."""
+        """Read the first existing file of ``references``. If none exists: DataError, or None with ``skip_missing``."""
         faults = []
         for reference in references:
             found, fault = self._resolve_reference(reference, what)
@@ -136,7 +136,7 @@ class MeshFolder:
         return None
 
     def _resolve_reference(self, reference: str, what: str) -> tuple[bytes | None, str]:
-        """Return the referenced bytes, or None and the reason why the reference is refused."""
+        """Read the file or data URI ``reference``; return its bytes, or None and why it is refused."""
         shown = reference if len(reference) <= 80 else reference[:77] + "..."
         if reference.startswith("data:"):
             return self._decode_data_uri(reference, what), ""
@@ -183,14 +183,14 @@ class MeshFolder:
 
 
 def check_mesh_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None:
-    """Raise DataError for the first count above its limit, given as name -> (count, limit)."""
+    """Raise DataError for the first count above its limit; ``counts`` maps a name to (count, limit)."""
     for name, (count, limit) in counts.items():
         if count > limit:
             raise DataError(f"{path}: {count} {name}; expected at most {limit} (each use of a part counts)")
 
 
 def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
-    """Raise DataError if ``faces``, of any shape, index missing or non-finite ``positions`` (V, 3)."""
+    """Raise DataError if an index in ``faces`` is out of range, or its row of ``positions`` (V, 3) is not finite."""
     if not faces.size:
         return
     low, high = int(faces.min()), int(faces.max())
@@ -216,7 +216,7 @@ def triangulate_polygons(
     """Triangulate polygons; return (T, 3) rows of ``corners`` and (T,) ascending polygon indices.
 
     ``corners`` (C, 3) are the finite corners of all polygons, concatenated; ``sizes`` (P,) is the number of corners of
-    each polygon. Raises DataError for polygons that cross themselves.
+    each polygon. Raises DataError for self-intersecting polygons.
     """
     first = np.cumsum(sizes) - sizes
     found, owners, crossed = [np.zeros((0, 3), np.int64)], [np.zeros(0, np.int64)], []
@@ -271,7 +271,7 @@ def triangulate_polygons(
 
 
 def _polygon_triangle_fan(size: int, start: int) -> NDArray[np.intp]:
-    """Return the (size - 2, 3) corner indices of the triangle fan around the corner ``start``."""
+    """Return (size - 2, 3) corner indices: the triangle fan of a polygon around its corner ``start``."""
     around = (start + np.arange(1, size)) % size
     return np.stack([np.full(size - 2, start), around[:-1], around[1:]], axis=1)
 
@@ -284,7 +284,7 @@ def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
 
 
 def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
-    """Clip ears off a polygon (Meisters 1975); return (T, 3) corners, None on failure, and tests left."""
+    """Triangulate a polygon by ear clipping (Meisters 1975); return (T, 3) corners or None, and remaining ``tests``."""
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0
     while len(left) >= 3:

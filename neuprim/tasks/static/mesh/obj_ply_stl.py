@@ -1,6 +1,6 @@
 """Readers of OBJ with material libraries (.mtl), PLY with colours or a texture, and STL.
 
-Colours, which STL files may have, too, and textures are sRGB. Counts in headers are checked before memory is allocated.
+Textures and colours (also those of STL files) are sRGB. Counts in headers are checked before memory is allocated.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ _NONE = -1  # index of missing texture coordinates or normals
 
 
 def read_obj(folder: MeshFolder) -> Model:
-    """Read an .obj file and its material libraries; DataErrors are those of :class:`MeshFolder`."""
+    """Read an .obj file and its material libraries; raises DataError as :class:`MeshFolder` does."""
     text = folder.read_model().decode("utf-8", "replace")
     found = {"vertices": (text.count("\nv "), MAX_VERTICES), "faces": (text.count("\nf "), MAX_FACES)}
     check_mesh_limits(folder.file, {**found, "changes of material": (text.count("usemtl "), MAX_PARTS)})
@@ -61,7 +61,7 @@ def read_obj(folder: MeshFolder) -> Model:
 
 
 def _read_obj_faces(path: Path, text: str) -> tuple[list[Faces], int]:
-    """Return the triangles of each material, and the number of vertices."""
+    """Parse the text of an .obj file: return the triangles of each material, and the number of vertices."""
     text = re.sub(r"\\\r?\n", " ", text)
     numbers, lengths = {key: array("d") for key in _WIDTHS}, {key: array("q") for key in _WIDTHS}
     indices, sizes, owners = array("q"), array("q"), array("q")
@@ -121,7 +121,7 @@ def _look_up_obj_corners(table: NDArray[np.float64], index: NDArray[np.int64], m
 
 
 def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return rows of one key as a table (N, 2 or more); missing numbers are NaN, those of ``vt`` 0."""
+    """Return the lines of one key as a table (N, 2 or more); missing values are NaN, or 0 for ``vt``."""
     width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
     table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
     first = np.cumsum(lengths) - lengths
@@ -132,7 +132,7 @@ def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[n
 
 
 def _obj_vertex_colours(path: Path, v: NDArray[np.float64]) -> NDArray[np.float32] | None:
-    """Return (V, 3) colours 0..1, the numbers after x y z; None unless all vertices have one."""
+    """Return (V, 3) vertex colours 0..1, the values after x y z; None unless all vertices have a colour."""
     if v.shape[1] < 6:
         return None
     found = v[:, 3:6]
@@ -180,7 +180,7 @@ def _read_mtl_library(text: str, folder: MeshFolder, images: dict[str, bytes]) -
 
 
 def _finish_mtl_material(material: Material) -> Material:
-    """Set colours to white where a texture replaces them, and drop emission of strength zero."""
+    """Finish a material: white where a texture replaces the colour, and no emission if its strength is zero."""
     white = (1.0, 1.0, 1.0)
     glow = material.glow
     if glow is not None and glow.texture is not None:
@@ -191,7 +191,7 @@ def _finish_mtl_material(material: Material) -> Material:
 
 
 def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: dict[str, bytes]) -> Material | None:
-    """Read a texture with wrap mode and transform; None if it is missing and ``skip_missing``."""
+    """Read a .mtl file's texture with wrap mode and transform; None if it is missing and ``skip_missing`` is set."""
     image, options = _mtl_texture_file_name(words, rest)
     spellings = [image, PurePosixPath(image.replace("\\", "/")).name]
     if image not in images:
@@ -207,7 +207,7 @@ def _read_mtl_texture(words: list[str], rest: str, folder: MeshFolder, images: d
 
 
 def _mtl_texture_file_name(words: list[str], rest: str) -> tuple[str, dict[str, tuple[float, float]]]:
-    """Return a texture's file name, maybe with blanks, and the options before it that transform it."""
+    """Split a .mtl texture line into the file name, which may contain blanks, and the options before it."""
     place, last = 0, len(words) - 1
     options: dict[str, tuple[float, float]] = {}
     while place < last and words[place] in {*_NUMBERS, *_WORDS}:
@@ -258,7 +258,7 @@ _STL = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute",
 
 
 def read_ply_mesh(folder: MeshFolder) -> Model:
-    """Read a .ply file with its faces, and the texture that a comment ``TextureFile`` names."""
+    """Read a .ply file with faces, and the texture that its comment ``TextureFile`` names."""
     data = folder.read_model()
     end = data.find(b"end_header", 0, _HEADER)
     if not data.startswith(b"ply"):
@@ -281,7 +281,7 @@ def read_ply_mesh(folder: MeshFolder) -> Model:
 
 
 def _read_mesh_faces_of_ply(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Read all triangles and count the vertices."""
+    """Parse a .ply file: return all triangles and the number of vertices."""
     elements = read_ply_elements(io.BytesIO(data), len(data), path, ("vertex", "face", "tristrips"))
     vertices = elements["vertex"]
     if not {"x", "y", "z"} <= set(vertices.names):
@@ -318,7 +318,7 @@ def _read_mesh_faces_of_ply(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | None:
-    """Return (N, 3) colours 0..1 of vertices or faces; None without."""
+    """Return (N, 3) colours 0..1 of the vertices or faces of a .ply file; None if it has no colours."""
     if not set(_RGB) <= set(element.names):
         return None
     kind = element.rows.dtype["red"]
@@ -331,7 +331,8 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
 def read_stl(folder: MeshFolder) -> Model:
     """Read an .stl file.
 
-    It is binary if its length fits the face count at byte 80, whatever it begins with; else text.
+    The file is read as binary if its length matches the face count at byte 80, else as text. Its first bytes do not
+    matter.
     """
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
@@ -348,7 +349,7 @@ def read_stl(folder: MeshFolder) -> Model:
 
 
 def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Read all triangles of a text file and count their corners."""
+    """Parse a text .stl file: return all triangles and the number of corners."""
     words = re.findall(rb"(?i)^\s*vertex\s+(\S+)[ \t]+(\S+)[ \t]+(\S+)", data, re.MULTILINE)
     try:
         corners = np.array(words, dtype=np.float64).reshape(-1, 3, 3)
@@ -359,7 +360,7 @@ def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _read_stl_binary(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Read triangles of a binary file, with the colours of VisCAM (bit 15 set) or Materialise Magics (COLOR=)."""
+    """Parse a binary .stl file, with colours as by VisCAM (bit 15 set) or Materialise Magics (COLOR=)."""
     rows = np.frombuffer(data, _STL, offset=84)
     bits = rows["attribute"].astype(np.int64)
     fives = np.stack([(bits >> shift & 31) / 31 for shift in (10, 5, 0)], axis=-1)

@@ -1,4 +1,4 @@
-"""Ray-cast mesh: triangles with colours, opacity and filtered textures, placed in the unit box."""
+"""Mesh for ray casting: triangles with colours, opacity and filtered textures, fitted into the unit box."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ _FARTHEST_UV = 1e6  # float32 has steps of 1/16 there; coordinates beyond, and N
 
 @dataclass(frozen=True)
 class SurfacePart:
-    """Triangles of one material, with resolved colours."""
+    """Triangles of one material, with final colours."""
 
     corners: NDArray[np.float64]  # (F, 3, 3) positions in the units and axes of the file, finite
     normals: NDArray[np.float64] | None  # (F, 3, 3) of the file, if any
@@ -51,7 +51,7 @@ class SurfacePart:
 
 
 def read_surfaces(model: Model) -> list[SurfacePart]:
-    """Parse a model's geometry and resolve its colours; raises DataError for damage, no triangles or too many."""
+    """Parse the geometry and colours of a mesh; raises DataError if it is damaged or has no or too many triangles."""
     faces, vertices = model.read_faces()
     count = sum(len(part.corners) for part in faces)
     if not count:
@@ -92,7 +92,7 @@ def _make_surface_part(model: Model, faces: Faces) -> SurfacePart:
 def _texture_coordinates(
     model: Model, uv: NDArray[np.floating] | None, material: Material, faces: int
 ) -> NDArray[np.float32] | None:
-    """Return (F, 3, 2) texture coordinates of the corners; None without texture or coordinates."""
+    """Return (F, 3, 2) texture coordinates of the faces' corners; None without a texture or coordinates."""
     if material.texture is None:
         return None
     if uv is None:
@@ -105,7 +105,7 @@ def _texture_coordinates(
 
 
 def _transform_texture_coordinates(uv: NDArray[np.float32], material: Material) -> NDArray[np.float32]:
-    """Apply the material's texture transform, which is written for a v that points down."""
+    """Apply the material's texture transform, which is defined for a downward v, to coordinates with upward v."""
     if material.transform is None:
         return uv
     matrix = np.array(material.transform, np.float32)
@@ -168,7 +168,7 @@ def _wrap_mesh_texels(index: NDArray[np.float64], size: int, wrap: str) -> NDArr
 
 
 def _linear_texels(pixels: NDArray) -> NDArray[np.float32]:
-    """Return (..., 4) float32 linear values of uint8 sRGB texels; floats are linear already."""
+    """Convert uint8 sRGB texels to (..., 4) float32 linear values; float texels are already linear."""
     if pixels.dtype != np.uint8:
         return pixels.astype(np.float32)
     values = np.empty(pixels.shape, np.float32)
@@ -178,7 +178,7 @@ def _linear_texels(pixels: NDArray) -> NDArray[np.float32]:
 
 
 def _halve_texture(image: NDArray) -> NDArray[np.float16]:
-    """Average 2 x 2 pixels in linear light; the last row or column of an odd size counts twice."""
+    """Halve a texture: average 2 x 2 pixels in linear light; the last row or column of an odd size counts twice."""
     height, width = image.shape[:2]
     half = np.empty(((height + 1) // 2, (width + 1) // 2, 4), np.float16)
     for top in range(0, len(half), _ROWS):
@@ -192,7 +192,7 @@ def _halve_texture(image: NDArray) -> NDArray[np.float16]:
 def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -> NDArray[np.uint8]:
     """Decode an image to (H, W, 4) uint8, sRGB with straight alpha, of at most ``left`` pixels.
 
-    Raises DataError naming model and image if it is damaged, of another format, or too large.
+    Raises DataError if the image is damaged, of another format, or too large; the message names model and image.
     """
     where = f"{path}: texture {name[:80]!r}"
     try:
@@ -228,9 +228,9 @@ _Z_FROM_Y = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])
 
 
 def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np.float64] | None:
-    """Return the (4, 4) transform that turns z up, centres and fits into [-1, 1]^3 and view.
+    """Return (4, 4) scene_from_file of a mesh: z up, centred, and scaled to fit into [-1, 1]^3 and all images.
 
-    None if the size is 0 or out of range.
+    The result is None if the mesh's size is 0 or out of range.
     """
     turn = _Z_FROM_Y if upward == "y" else np.eye(3)
     lower = np.min([part.corners.min(axis=(0, 1)) for part in parts], axis=0)
@@ -247,7 +247,7 @@ def scene_from_mesh_file(parts: Sequence[SurfacePart], upward: Up) -> NDArray[np
 
 
 class MeshSurface(Scene):
-    """Ray-castable parts of a model; neighbouring rays are ``spacing`` apart at distance 1."""
+    """Mesh for ray casting. ``spacing`` is the distance of neighbouring rays at distance 1 from the camera."""
 
     def __init__(
         self, model: Model, parts: Sequence[SurfacePart], upward: Up, spacing: float, engine: Engine = "auto"
@@ -290,7 +290,7 @@ class MeshSurface(Scene):
         self._holes = bool((self._cutoff > 0).any())
 
     def intersect(self, origins: ArrayLike, directions: ArrayLike) -> Hits:
-        """Intersect as :meth:`Scene.intersect`; normals point to the visible side."""
+        """Return the first hits as :meth:`Scene.intersect` does, with normals on the visible side."""
         hits = super().intersect(origins, directions)
         towards = np.asarray(directions, dtype=np.float32)[hits.hit]
         side = np.where(shading_dot(hits.face, towards) > 0, np.float32(-1), np.float32(1))[:, None]
@@ -301,7 +301,7 @@ class MeshSurface(Scene):
         return replace(hits, normal=side * hits.normal, face=side * hits.face, albedo=albedo, emission=emission)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
-        """Test occlusion as :meth:`Scene.occluded`; holes in textures let light through."""
+        """Return occlusion as :meth:`Scene.occluded` does, but light passes through holes in textures."""
         if not self._holes:
             return super().occluded(points, directions, distance)
         d = np.ascontiguousarray(directions, dtype=np.float32)
@@ -329,7 +329,7 @@ class MeshSurface(Scene):
         return triangle, u, v, distance
 
     def _is_hole(self, triangle: NDArray, u: NDArray, v: NDArray, distance: NDArray) -> NDArray[np.bool_]:
-        """Return (M,) bool: whether alpha at a hit is below the material's cutoff."""
+        """Return (M,) bool: whether the alpha of each hit is below the material's cutoff."""
         weight = np.stack([1 - u - v, u, v], axis=1, dtype=np.float32)
         cutoff = self._cutoff[triangle]
         able = np.flatnonzero(cutoff > 0)
@@ -339,9 +339,9 @@ class MeshSurface(Scene):
 
 
 class _MeshColourLayer:
-    """Colours of the faces ``kept`` (F,): corner values times textures.
+    """Colours of the faces with ``kept`` (F,) bool: interpolated corner colours times textures.
 
-    ``area`` (F,) is twice the area of a face in units of the squared distance of rays.
+    ``area`` (F,) is twice the area of each face, in units of the squared distance between rays.
     """
 
     def __init__(
@@ -370,7 +370,7 @@ class _MeshColourLayer:
         self._blur = np.sqrt(inside * texels[self._texture] / area[kept]).astype(np.float32)
 
     def sample_colours(self, triangle: NDArray, weight: NDArray[np.float32], distance: NDArray) -> NDArray[np.float32]:
-        """Return (M, 4) linear RGB and alpha at (M,) triangles with (M, 3) barycentric weights."""
+        """Return (M, 4) linear RGB and alpha of hits on triangles (M,) with barycentric weights (M, 3)."""
         found: NDArray[np.float32] = np.einsum("nk,nkc->nc", weight, self._colour[triangle])
         texture = self._texture[triangle]
         for index in np.unique(texture[texture >= 0]):
@@ -381,7 +381,7 @@ class _MeshColourLayer:
 
 
 def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
-    """Return (F,) bool: whether alpha is below the cutoff at all corners of a face."""
+    """Return (F,) bool: whether a face's alpha is below the cutoff at all corners."""
     if part.alpha is None or part.material.cutoff is None:
         return np.zeros(len(part.colour), dtype=np.bool_)
     clear: NDArray[np.bool_] = part.alpha.max(axis=1) < part.material.cutoff
@@ -389,7 +389,7 @@ def _transparent_faces(part: SurfacePart) -> NDArray[np.bool_]:
 
 
 def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool: _Pool) -> None:
-    """Warn once of translucent faces, which are drawn opaque or left out."""
+    """Warn once about translucent faces: they are drawn opaque or left out."""
     soft = {key for key, texture in pool.items() if np.any((0 < texture.alpha) & (texture.alpha < 255))}
     count = 0
     for part in parts:
@@ -403,7 +403,7 @@ def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool:
 
 
 def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:
-    """Give faces their own vertices where too many share one for smooth normals."""
+    """Duplicate vertices that too many faces share, so that each of these faces gets its own normal."""
     around = np.bincount(faces.ravel(), minlength=len(points))
     crowded = around[faces] > _MOST_AROUND
     alone = faces[crowded]
@@ -415,9 +415,9 @@ def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.in
 def _smooth_normals(
     given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh
 ) -> NDArray[np.float64]:
-    """Return (F, 3, 3) unit normals: the file's, flipped to the face's side, else smoothed ones.
+    """Return (F, 3, 3) unit normals: ``given`` ones, flipped to the face's side, or :func:`solid_corner_normals`.
 
-    The latter are :func:`solid_corner_normals`.
+    ``given`` are the file's normals; ``across`` (F, 3) are the face normals.
     """
     with np.errstate(all="ignore"):
         length = np.linalg.norm(given, axis=2, keepdims=True)

@@ -246,7 +246,7 @@ def parse_numbers(text: str) -> list[float]:
 
 
 def parse_number(text: str, low: float, high: float, expected: str, whole: bool = False) -> float:
-    """Parse a finite number from ``low`` to ``high``; with ``whole`` only digits. Errors say what was ``expected``."""
+    """Parse a finite number from ``low`` to ``high``; if ``whole``, allow only digits. Errors cite ``expected``."""
     try:
         value = float(text)
     except ValueError:

@@ -132,7 +132,7 @@ def read_launch_record(file: Path) -> LaunchRecord | None:
         runs = tuple(validate_settings(LaunchedRun, run, "runs") for run in data["runs"])
         for run in runs:
             if Path(run.name).name != run.name or run.name in ("", ".", ".."):
-                raise ValueError(f"name {run.name!r} is no folder's")
+                raise ValueError(f"{run.name!r} is not allowed as a folder name")
         return LaunchRecord(file, words, runs, validate_value(data.get("joined_steps"), int | None, "joined_steps"))
 
     return read_json_record(file, "a record of launched runs", "another --out DIR begins anew", _FORMAT, parse)

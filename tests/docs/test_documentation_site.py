@@ -46,7 +46,6 @@ def test_files_beside_the_pages_come_along(hooks: Any) -> None:
     assert hooks.on_page_markdown("[d](../dynamic.md)", page("api/vdb.md"), config, files) == "[d](../dynamic.md)"
     changes = hooks.on_page_markdown("", page("changelog.md"), config, files)
     assert "](relighting.md)" in changes and "](docs/" not in changes
-    assert "](contributing.md)" in changes and "](CONTRIBUTING.md)" not in changes
 
 
 def test_roles_become_links(hooks: Any) -> None:

@@ -80,7 +80,7 @@ class World:
         return self.inverse.scene_points(points)
 
     def scene_camera(self, camera: _Camera) -> _Camera:
-        """Return the camera in scene coordinates of a camera in world coordinates."""
+        """Convert a camera from world coordinates to scene coordinates."""
         if self.identity:
             return camera
         view, back = camera.viewmat.detach().double(), self.world_from_scene
@@ -90,7 +90,7 @@ class World:
         return replace(camera, viewmat=moved)
 
     def world_camera(self, camera: _Camera) -> _Camera:
-        """Return the camera in world coordinates of a camera in scene coordinates."""
+        """Convert a camera from scene coordinates to world coordinates."""
         return self.inverse.scene_camera(camera)
 
     def world_box(self, box: np.ndarray) -> np.ndarray:

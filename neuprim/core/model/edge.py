@@ -30,7 +30,7 @@ _SERIES_BELOW, _TERMS = (
 
 
 def edge_weight(square: Tensor, edge: int) -> Tensor:
-    """Return the weight (1 - u^2)^p from ``square`` = u^2 and ``edge`` = p; 0 outside the support, 1 if p = 0."""
+    """Return (1 - u^2)^p from ``square`` = u^2 and ``edge`` = p; 0 where u^2 > 1, unless p = 0: 1 for every u."""
     if edge == 0:
         return torch.ones_like(square)
     inner = (1 - square).clamp_min(0)

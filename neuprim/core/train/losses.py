@@ -160,8 +160,8 @@ def point_loss(
 ) -> PointLossResult:
     """Compare the extinction and source radiance of a model with known values at points.
 
-    The loss is a mean squared error, each error divided by its scale: of the extinction, plus a small fraction of that
-    of each extinction component, plus ``train.voxel_colour`` times that of the source radiance.
+    The loss sums mean squared errors, each error divided by its scale. Weights: 1 for the extinction, a small one for
+    each extinction component, ``train.voxel_colour`` for the source radiance.
     """
     check_point_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0

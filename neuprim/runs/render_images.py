@@ -53,8 +53,6 @@ class RenderRequest:
             differ in a condition become a WebP animation and others PNGs.
         out: file or folder to write; None for a folder in the run's ``frames``.
         frames: number of views of an orbit.
-        frame: numbers of source frames to render, e.g. "1001-1048x2", for volumes; they replace the condition "time"
-            and appear in file names.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
         fps: frames per second of an animation; None for the rate in the file of cameras, or 5 to 30 so that the
             animation takes about four seconds.
@@ -65,6 +63,8 @@ class RenderRequest:
         space: coordinates of cameras in files, lights and depths: "world" (those of the data's files) or "scene" (those
             of the model).
         overwrite: whether to replace pictures of the run's report.
+        frame: numbers of source frames to render, e.g. "1001-1048x2", for volumes; they replace the condition "time"
+            and appear in file names.
     """
 
     camera: str
@@ -72,7 +72,6 @@ class RenderRequest:
     format: str | None = None
     out: Path | None = None
     frames: int = 60
-    frame: str | None = None
     conditions: Mapping[str, str] = field(default_factory=dict)
     fps: float | None = None
     environment: EnvironmentFile | None = None
@@ -81,6 +80,7 @@ class RenderRequest:
     datatype: str | None = None
     space: str = WORLD
     overwrite: bool = False
+    frame: str | None = None
 
 
 def render_run(

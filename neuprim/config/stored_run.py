@@ -208,10 +208,10 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
             what = "a folder outside of the run, which would be written to"
         else:
             continue
-        allow = f"type {key}=... to use it" if typed is not None else f"{FLAG} allows it"
+        allow = f"type {key}=..." if typed is not None else f"add {FLAG}"
         raise ConfigError(
-            f"{config.source}: {key} is {cut_error_text(value)!r}, {what}; {allow}, {ENVIRONMENT}=1 in the "
-            "environment does so for all runs"
+            f"{config.source}: {key} is {cut_error_text(value)!r}, {what}; to allow it, {allow} or, for all runs, set "
+            f"{ENVIRONMENT}=1"
         )
 
 

@@ -31,13 +31,16 @@ def stored(folder: Path, *words: str) -> RunConfig:
 def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     config = stored(tmp_path / "run", *VOLUMES)
     config.scene["cache"] = address
-    with pytest.raises(ConfigError, match=r"config\.yaml: scene\.cache is .*; --trust allows it, NEUPRIM_TRUST=1"):
+    with pytest.raises(
+        ConfigError,
+        match=r"config\.yaml: scene\.cache is .*; to allow it, add --trust or, for all runs, set NEUPRIM_TRUST=1",
+    ):
         make_run_scene_context(config, lambda text, fraction: None)
     with trusting(True):
         refuse_untrusted_settings(config)
     refuse_untrusted_settings(replace(config, source=None))  # of the user's own words
     new = f"output_dir={tmp_path / 'new'}"
-    with pytest.raises(ConfigError, match=r"type scene\.cache=\.\.\. to use it"):
+    with pytest.raises(ConfigError, match=r"to allow it, type scene\.cache=\.\.\. or"):
         compose([new], stored=config)
     assert compose(["scene.cache=null", new], stored=config).scene["cache"] is None
     monkeypatch.setenv(ENVIRONMENT, "1")

@@ -111,15 +111,16 @@ def fit_quantizers(model: Primitives, table: BitTable) -> Quantizers:
 
 
 def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], error: float) -> Quantizers:
-    """Return quantizers of a canonical model such that every column (number per primitive) adds the same error.
+    """Return quantizers that make every column (one stored number of all primitives) add the same image error.
 
-    Rounding to steps of length s has a mean squared error of s^2 / 12. Equal errors spend bits best (reverse water
-    filling).
+    Rounding to steps of length s has a mean squared error of s^2 / 12. Equal errors need the fewest bits in total
+    (reverse water filling).
 
     Args:
-        effects: parameter -> (C,) mean squared change of images per variance of each column
+        model: from :func:`canonical_model`.
+        effects: parameter -> (C,) image MSE per MSE of each column
             (:class:`~neuprim.core.train.sensitivity.Sensitivity`).
-        error: mean squared change of images that one column may add.
+        error: image MSE that each column may add.
     """
     found: Quantizers = {}
     sparse = _sparse_quantized_parameters(model)

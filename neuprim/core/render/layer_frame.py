@@ -209,5 +209,5 @@ def select_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> 
         if name not in known:
             raise ConfigError(f"--layers {name}: no such layer; expected some of {', '.join(known)}")
     if not names:
-        raise ConfigError(f"--layers {text!r}: names none; expected some of {', '.join(known)}")
+        raise ConfigError(f"--layers {text!r}: no layers; expected some of {', '.join(known)}")
     return tuple(spec for spec in offered if spec.name in names)

@@ -63,7 +63,8 @@ def test_vertices_that_are_no_numbers(tmp_path: Path, value: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("where", "text"), [(-1, "a face has the vertex -1 of 24"), (24, "a face has the vertex 24 of 24")]
+    ("where", "text"),
+    [(-1, "a face uses vertex -1, but the file has only 24"), (24, "a face uses vertex 24, but the file has only 24")],
 )
 def test_faces_of_vertices_that_are_not_there(tmp_path: Path, where: int, text: str) -> None:
     vertices, faces, _ = cube()
@@ -101,7 +102,7 @@ def test_a_header_that_says_a_billion_takes_no_memory(tmp_path: Path) -> None:
         "b.ply": "1000000000 faces; expected at most 2000000",
         "c.ply": "expected a complete file",
         "d.stl": "1000000000 faces announced; expected 50000000084 bytes for them, found 584",
-        "e.gltf": "accessors[0] claims 1000000000 items, 36 bytes are there",
+        "e.gltf": "bytes, its view has 36",
         "f.gltf": "accessors[0] is sparse or compressed",
         "g.gltf": "buffers[0] has 44 bytes, 1000000000 announced",
         "h.glb": "24 bytes are there, 4294967295 announced",

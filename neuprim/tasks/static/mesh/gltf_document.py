@@ -149,7 +149,7 @@ class GltfDocument:
         if not count:
             return np.zeros((0, width), dtype)
         if start + (count - 1) * stride + row > len(data):
-            raise ValueError(f"{where} claims {count} items, {len(data)} bytes are there")
+            raise ValueError(f"{where} needs {start + (count - 1) * stride + row} bytes, its view has {len(data)}")
         values: NDArray = np.ndarray((count, width), dtype, data, start, (stride, dtype.itemsize))
         if accessor.get("normalized") and dtype.kind in "iu":
             return np.maximum(values.astype(np.float32) / np.iinfo(dtype).max, -1.0)

@@ -195,8 +195,8 @@ def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np
         return
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(positions):
-        found = f"a face has the vertex {high if low >= 0 else low} of {len(positions)}"
-        raise DataError(f"{path}: {found}; expected one that is there")
+        found = f"a face uses vertex {high if low >= 0 else low}"
+        raise DataError(f"{path}: {found}, but the file has only {len(positions)}, from 0")
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1) & np.isin(np.arange(len(positions)), faces))
     if len(bad):
         raise DataError(f"{path}: vertex {bad[0]} is at {positions[bad[0]].tolist()}; expected finite numbers")

@@ -100,8 +100,8 @@ def _read_obj_faces(path: Path, text: str) -> tuple[list[Faces], int]:
     check_vertices(path, v[:, :3], used[:, 0])
     for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
         if len(used) and used[:, column].max() >= len(table):
-            found = f"a face has the {what} {used[:, column].max() + 1} of {len(table)}"
-            raise DataError(f"{path}: {found}; expected one that is there")
+            found = f"a face uses {what} {used[:, column].max() + 1}"
+            raise DataError(f"{path}: {found}, but the file has only {len(table)}")
     faces, polygon = triangulate_polygons(path, v[used[:, 0], :3], np.array(sizes, np.int64))
     owner = np.array(owners, np.int64)[polygon]
     colours = _obj_vertex_colours(path, v)

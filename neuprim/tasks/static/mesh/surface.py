@@ -137,7 +137,7 @@ class MeshTexture:
         return self.levels[0][..., 3]
 
     def look_up(self, uv: NDArray[np.float32], blur: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Return (M, 4) linear RGB and alpha at (M, 2) ``uv``, v upward; a ray is ``blur`` (M,) texels wide."""
+        """Return (M, 4) linear RGBA at (M, 2) ``uv``, v upward; ``blur`` (M,) is the ray width in texels."""
         level = np.clip(np.round(np.log2(np.maximum(blur, 1.0))), 0, len(self.levels) - 1).astype(np.intp)
         found = np.empty((len(uv), 4), dtype=np.float32)
         for index in np.unique(level):

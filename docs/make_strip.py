@@ -1,7 +1,7 @@
 """The moving picture at the top of the README: films of three models side by side.
 
     neuprim run task=static scene=colmap scene.path=DIR/cup_colmap scene.downsample=2 effort=7 --out CUP
-    neuprim run task=dynamic scene=smoke_fire scene.lights=4 --out SMOKE
+    neuprim run task=dynamic scene=smoke_fire scene.lights=4 train.iterations=4000 --out SMOKE
     neuprim run task=relight scene=olat scene.path=DIR/pt_bunny train.iterations=3200 --out BUNNY
     python docs/make_strip.py CUP SMOKE BUNNY docs/pictures/strip.webp
 

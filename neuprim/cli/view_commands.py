@@ -244,9 +244,6 @@ VIEW_COMMAND = Command(
 # ---------------------------------------------------------------- vdb info
 
 
-_NO_SEQUENCE = "not one sequence"
-
-
 def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("action", choices=("info",), metavar="info", help="list the grids")
     parser.add_argument("path", type=Path, metavar="FILE|DIR", help="a .vdb file, or a folder of frames")
@@ -256,14 +253,13 @@ def _add_vdb_arguments(parser: argparse.ArgumentParser) -> None:
 
 def _vdb_info_command(arguments: argparse.Namespace) -> int:
     """Print a report on a file, or one table of the grids in a folder."""
-    files, notes = _find_vdb_command_files(arguments.path)
+    files, notes, one_sequence = _find_vdb_command_files(arguments.path)
     if arguments.json:
         record = {"files": [_describe_vdb_command_file(file) for file in files], "notes": notes}
         print(json.dumps(record, indent=1, allow_nan=False))
         return 0
     console = plain_console()
-    one_sequence = len(files) > 1 and not any(note.startswith(_NO_SEQUENCE) for note in notes)
-    if one_sequence and not arguments.frames:
+    if one_sequence and len(files) > 1 and not arguments.frames:
         _print_vdb_sequence(console, [_describe_vdb_command_file(file) for file in files])
     else:
         for file in files:
@@ -273,10 +269,12 @@ def _vdb_info_command(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
-    """Return the OpenVDB files at ``path``, frames in their order, and notes on the folder."""
+def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str], bool]:
+    """Return the OpenVDB files at ``path``, frames in their order, notes on the folder, and whether it holds one
+    sequence.
+    """
     if not path.is_dir():
-        return [path], []
+        return [path], [], False
     from neuprim.core.io.vdb import list_vdb_files
 
     try:
@@ -285,11 +283,11 @@ def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str]]:
         files = sorted(p for p in path.iterdir() if p.suffix.lower() == ".vdb" and p.is_file())
         if not files:
             raise
-        return files, [f"{_NO_SEQUENCE}: {error}"]
+        return files, [f"not one sequence: {error}"], False
     missing = ", ".join(str(a) if a == b else f"{a}–{b}" for a, b in frames.gaps)
     numbers = f"{frames.frames[0].number} to {frames.frames[-1].number}"
     note = f"{len(frames)} frames, {numbers}; missing: {missing or 'none'}"
-    return [frame.path for frame in frames.frames], [note]
+    return [frame.path for frame in frames.frames], [note], True
 
 
 def _describe_vdb_command_file(path: Path) -> dict[str, Any]:

@@ -70,7 +70,7 @@ def split_conditions(words: Sequence[str], specs: Sequence[ConditionSpec]) -> tu
 
 # ---------------------------------------------------------------- frame numbers
 
-_FRAME_RANGE = re.compile(r"(-?\d+)(?:-(-?\d+)(?:x(\d+))?)?")
+_FRAME_RANGE = re.compile(r"(-?[0-9]{1,18})(?:-(-?[0-9]{1,18})(?:x([0-9]{1,18}))?)?")
 
 
 def parse_frame_numbers(text: str) -> list[int]:

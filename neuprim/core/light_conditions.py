@@ -9,6 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.cameras.pinhole import horizontal_axes
 from neuprim.core.cameras.world import World
 from neuprim.core.data import Dataset
 from neuprim.core.environment import Environment, Illumination
@@ -55,11 +56,8 @@ def parse_light_positions(text: str, world: World | None = None) -> list[Tensor]
     across, height = distance * math.sin(math.radians(polar)), distance * math.cos(math.radians(polar))
     turns = torch.arange(frames, dtype=torch.float64) * (2 * math.pi / frames)
     up = world.up / world.up.norm()
-    first = torch.eye(3, dtype=torch.float64)[(int(up.abs().argmax()) + 1) % 3]  # x where up is z
-    first = first - (first @ up) * up
-    first = first / first.norm()
-    second = torch.linalg.cross(up, first)
-    around = turns.cos()[:, None] * first + turns.sin()[:, None] * second
+    second, back = horizontal_axes(up)
+    around = turns.sin()[:, None] * second - turns.cos()[:, None] * back  # from x towards y where up is z
     return list((across * around + height * up).float())
 
 

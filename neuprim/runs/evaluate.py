@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +21,7 @@ from neuprim.report.pictures import WorstRegions, error_map
 from neuprim.report.run_record import median_and_worst
 from neuprim.report.run_report import Viewer, write_report
 from neuprim.runs.fit import Fitted
-from neuprim.runs.measure import measure_views, render_image, summarize_run_metrics
+from neuprim.runs.measure import mask_rendering, measure_views, render_image, summarize_run_metrics
 from neuprim.webpage.model_page import (
     PageScene,
     held_out_webpage_views,
@@ -87,11 +86,9 @@ def evaluate_fitted(fitted: Fitted, directory: Path, command: str = "") -> dict[
     metrics = summarize_run_metrics(fitted, dataset, model, views, size, fitted.training, fitted.lpips)
     write_json(directory / "metrics.json", metrics)
     for i in set(median_and_worst(metrics["per_view"])) - shown:
-        view, pixels = dataset.test.view(i), dataset.test.pixels(i)
-        truth, rendered = pixels.over(dataset.background), render_image(model, view, settings, dataset.background)
-        if pixels.mask is not None:
-            rendered = torch.where(pixels.mask[..., None], rendered, truth)
-        write_view(i, view, rendered, truth)
+        view = dataset.test.view(i)
+        rendered = render_image(model, view, settings, dataset.background)
+        write_view(i, view, *mask_rendering(rendered, dataset.test.pixels(i), dataset.background))
     orbit = call_task_orbit(task, dataset, _ORBIT_FRAMES)
     frames = [display(render_image(model, view, settings, dataset.background)) for view in orbit]
     write_animation(folder / "orbit.webp", frames, fps=12.0)
@@ -111,7 +108,7 @@ def _make_run_viewer_page(fitted: Fitted, directory: Path) -> Viewer | None:
         return render_image(model, View("", camera, conditions), settings, dataset.background)
 
     # without images: the report shows them beside the model
-    views = [replace(view, truth="") for view in held_out_webpage_views(dataset, channels, _SHOWN_VIEWS)]
+    views = held_out_webpage_views(dataset, channels, _SHOWN_VIEWS, truths=False)
     scene = PageScene(
         webpage_subtitle(task.name, dataset.data_source),
         dataset.background.tolist(),

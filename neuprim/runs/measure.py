@@ -26,7 +26,7 @@ from neuprim.config import Job
 from neuprim.core.channels import Channels, find_channels
 from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
-from neuprim.core.data import Clip, Dataset, View
+from neuprim.core.data import Clip, Dataset, Pixels, View
 from neuprim.core.data.dataset_check import check_dataset_views, check_pixels
 from neuprim.core.data.starting_points import GIVE_POINTS
 from neuprim.core.errors import warn_once
@@ -137,18 +137,23 @@ def measure_views(
     return result
 
 
+def mask_rendering(rendered: Tensor, pixels: Pixels, background: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a rendering and its ground truth over ``background``. Outside the view's pixel mask the rendering is
+    replaced by the ground truth.
+    """
+    truth = pixels.over(background)
+    return rendered if pixels.mask is None else torch.where(pixels.mask[..., None], rendered, truth), truth
+
+
 def _measure_view(
     rendered: Tensor, seconds: float, task: TaskSpec, dataset: Dataset, index: int, lpips: Lpips | None
 ) -> tuple[ViewMetrics, Tensor, Tensor]:
-    """Return metrics, rendering and ground truth of a test view. Outside the view's pixel mask the rendering is
-    replaced by the ground truth.
-    """
+    """Return metrics of a test view, and its rendering and ground truth as :func:`mask_rendering` does."""
     view, pixels, background = dataset.test.view(index), dataset.test.pixels(index), dataset.background
     channels = find_channels(task, dataset)
     check_pixels("test", view, pixels, dataset.channels)
-    truth, empty = pixels.over(background), bool((rendered == background).all())
-    if pixels.mask is not None:
-        rendered = torch.where(pixels.mask[..., None], rendered, truth)
+    empty = bool((rendered == background).all())
+    rendered, truth = mask_rendering(rendered, pixels, background)
     mask = call_task_mask(task, dataset, index)
     more = _run_display_metrics(rendered, truth, dataset, channels, pixels.mask)
     more |= _mask_metrics(rendered, truth, dataset, mask) | _table_metrics(rendered, truth, channels, lpips)

@@ -152,7 +152,7 @@ class ViewerScene:
     def start_view(self) -> View:
         """First view of a page: the held-out view with most contrast, else the whole model from the side."""
         if self.dataset is not None:
-            views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES)
+            views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES, truths=False)
             if views:
                 return View(views[0].name, views[0].camera, self._initial_conditions(views))
         conditions = self._initial_conditions([])

@@ -183,15 +183,19 @@ def _field_script(kind: str, field: Field) -> str:
 # ---------------------------------------------------------------- scene
 
 
-def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int) -> list[PageView]:
-    """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; the one with most contrast first."""
+def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int, truths: bool = True) -> list[PageView]:
+    """Return up to ``limit`` held-out views of pinhole cameras, evenly spread; the one with most contrast first.
+
+    Args:
+        truths: whether the views hold their ground truth.
+    """
     count = min(limit, len(dataset.test))
     views, contrasts = [], []
     for index in (k * len(dataset.test) // count for k in range(count)):
         view = dataset.test.view(index)
         if isinstance(view.camera, Camera):
             image = channels.display(dataset.test.pixels(index).over(dataset.background)).clamp(0.0, 1.0)
-            truth = encode_webp_data_uri(image, _TRUTH_PIXELS)
+            truth = encode_webp_data_uri(image, _TRUTH_PIXELS) if truths else ""
             views.append(PageView(view.name, view.camera, view.conditions, truth))
             contrasts.append(float(image.std()))
     if views:  # the first frame of a sequence may be empty

@@ -118,13 +118,18 @@ def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
     return view
 
 
-def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
-    """Return ``count`` cameras on a circle around ``center``, ``elevation`` radians above its horizontal plane."""
-    up = (up / up.norm()).double()
+def horizontal_axes(up: Tensor) -> tuple[Tensor, Tensor]:
+    """Return two (3,) float64 unit vectors a and b, at right angles to the unit vector ``up``, with b = up x a."""
     helper = torch.tensor([1.0, 0, 0] if abs(up[0]) < 0.9 else [0, 1.0, 0], dtype=torch.float64)
     a = torch.linalg.cross(up, helper)
     a = a / a.norm()
-    b = torch.linalg.cross(up, a)
+    return a, torch.linalg.cross(up, a)
+
+
+def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
+    """Return ``count`` cameras on a circle around ``center``, ``elevation`` radians above its horizontal plane."""
+    up = (up / up.norm()).double()
+    a, b = horizontal_axes(up)
     views = []
     for i in range(count):
         t = 2 * math.pi * i / count

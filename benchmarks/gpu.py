@@ -1,6 +1,6 @@
 """The CUDA backend on a GPU: parity with the float64 reference, times, frames per second, peak memory.
 
-    python benchmarks/gpu.py [--parts parity times kernels train runs] [--scenes 5000 20000 100000 300000 1000000]
+    python benchmarks/gpu.py [--parts parity times steps kernels train runs] [--scenes 5000 20000 100000 300000 1000000]
         [--sizes 800x800 1920x1080] [--chair DIR] [--fire DIR] [--mic DIR] [--trained chair fire lit_solids] [--record]
     python benchmarks/gpu.py --print [--docs]
 
@@ -9,6 +9,8 @@
     times     random scenes whose primitives shrink as they multiply, 8 neurons and the default form: ms for a forward
               pass without gradients, a forward and backward pass, and a whole training step (L1 loss, Adam on every
               parameter), medians by CUDA events; frames per second, peak memory, primitive-pixel hits
+    steps     training steps of the trainer on random scenes, L1 + SSIM, replayed as a CUDA graph and not: ms a step, and
+              whether both end with the same bits
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
     train     preset quick of each task with its usual steps on the GPU: ms a step of the second half, PSNR on the test
               views
@@ -22,6 +24,7 @@ from __future__ import annotations
 
 import re
 import statistics
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -46,15 +49,22 @@ from shared.trials import Trial, begin
 
 from neuprim.config import compose
 from neuprim.core.cameras import Camera
+from neuprim.core.cameras.pinhole import orbit
+from neuprim.core.data import Dataset, Pixels, PointCloud, View, ViewSet
+from neuprim.core.model.cosine import OMEGA0, CosineDensity
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
-from neuprim.core.model.primitives import LoweredPrimitives
+from neuprim.core.model.primitives import LoweredPrimitives, Primitives
 from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.train.losses import photometric
+from neuprim.core.train.settings import PopulationSettings, TrainSettings
+from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import prepare_training, train_to_end
+from neuprim.tasks.static import SphericalHarmonics
 
 FOLDER, PAGE = RESULTS / "gpu", RESULT_PAGES / "gpu.md"
 FORMS = {"K=8 p=0": (8, 0), "K=2 p=2": (2, 2), "K=0 p=2": (0, 2)}
-PARTS = ("parity", "times", "kernels", "train", "runs")
+PARTS = ("parity", "times", "steps", "kernels", "train", "runs")
 RUNS = ((60, 25_000), (140, 30_000))
 """Seconds and primitives."""
 STEPS = {"chair": 2500, "fire": 4000, "smoke_fire": 4000, "lit_solids": 2600}
@@ -145,13 +155,84 @@ def measure_times(counts: Sequence[int], sizes: Sequence[tuple[int, int]]) -> It
             del lowered, leaves
 
 
+class RandomViews(ViewSet):
+    """Views of a random scene, with images of noise."""
+
+    def __init__(self, camera: Camera, count: int = 4) -> None:
+        self.cameras = orbit(camera, torch.zeros(3), torch.tensor([0.0, 1.0, 0.0]), 1.7, 0.3, count)
+        generator = torch.Generator().manual_seed(0)
+        shape = (camera.height, camera.width)
+        self.images = [
+            Pixels(torch.rand(*shape, 3, generator=generator), torch.ones(shape)) for _ in range(count)
+        ]
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def view(self, index: int) -> View:
+        return View(f"v{index}", self.cameras[index])
+
+    def pixels(self, index: int) -> Pixels:
+        return self.images[index]
+
+
+def random_trainer(count: int, neurons: int, edge: int, camera: Camera, device: str = "cuda") -> Trainer:
+    """A trainer of the random scene of the other benchmarks, with one colour per primitive."""
+    low = lower(random_scene(count))
+    g, d, c = low.geometry, low.density, low.colour
+    assert isinstance(d, Cosine) and isinstance(c, Constant)
+    scale = 1 / OMEGA0
+    params = {"means": g.means, "log_scales": g.log_scales, "quats": g.quats, "W1": scale * d.W1[:, :neurons]}
+    params |= {"b1": scale * d.b1[:, :neurons], "w2": d.w2[:, :neurons], "b2": d.b2.reshape(-1, 1), "sh_dc": c.rgb}
+    params = {name: value.detach().clone().contiguous() for name, value in params.items()}
+    model = Primitives(CosineDensity(neurons, edge=edge), SphericalHarmonics(0), params)
+    views, black = RandomViews(camera), torch.zeros(3)
+    start = PointCloud(params["means"], params["sh_dc"])
+    data = Dataset(
+        name="random", train=views, test=views, start=lambda *_: start, extent=1.0, background=black,
+        data_source="generated",
+    )  # fmt: skip
+    population = PopulationSettings(strategy="fixed")
+    train = TrainSettings(iterations=1_000_000, population=population)
+    renderer = RenderSettings(backend="cuda", device=device, near=0.1)
+    return Trainer(model, data, photometric({"ssim_weight": 0.2}), train, renderer, 0)
+
+
+def measure_steps(counts: Sequence[int], sizes: Sequence[tuple[int, int]], steps: int = 100) -> Iterator[Record]:
+    for name, form in FORMS.items():
+        for count in counts:
+            for width, height in sizes:
+                row: Record = {"form": name, "primitives": count, "width": width, "height": height}
+                states = []
+                for key in ("each_ms", "graph_ms"):
+                    trainer = random_trainer(count, *form, make_camera(width, height))
+                    if key == "each_ms":
+                        trainer.recorder = None
+                    torch.cuda.reset_peak_memory_stats()
+                    for _ in range(steps // 5):
+                        trainer.train_step()
+                    trainer.settle()
+                    torch.cuda.synchronize()
+                    start = time.perf_counter()
+                    for _ in range(steps):
+                        trainer.train_step()
+                    trainer.settle()
+                    torch.cuda.synchronize()
+                    row[key] = 1e3 * (time.perf_counter() - start) / steps
+                    states.append(trainer.state()[0])
+                    row["replayed"] = 0 if trainer.recorder is None else trainer.recorder.replayed
+                    row["peak_mb"] = torch.cuda.max_memory_allocated() / 1e6
+                    del trainer
+                yield {**row, "same": all(torch.equal(states[0][name], states[1][name]) for name in states[0])}
+
+
 def measure_kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
     """Milliseconds of each kernel in a training step, by form."""
     found = {}
     activities = [torch.profiler.ProfilerActivity.CUDA, torch.profiler.ProfilerActivity.CPU]
     for name, form in FORMS.items():
-        step = make_passes(*scene_on_gpu(count, *form), make_camera(width, height))["step_ms"]
-        for _ in range(3):
+        step = random_trainer(count, *form, make_camera(width, height)).train_step
+        for _ in range(12):  # the last ones are replayed
             step()
         with torch.profiler.profile(activities=activities) as profile:
             for _ in range(5):
@@ -226,6 +307,15 @@ COLUMNS: dict[str, Columns] = {
         "frames/s": lambda row: f"{1000 / row['forward_ms']:.0f}",
         "peak MB": lambda row: f"{row['peak_mb']:,.0f}",
     },
+    "steps": {
+        "form": lambda row: row["form"],
+        "primitives": lambda row: f"{row['primitives']:,}",
+        "size": lambda row: f"{row['width']}×{row['height']}",
+        "launched, ms": lambda row: f"{row['each_ms']:.2f}",
+        "graph, ms": lambda row: f"{row['graph_ms']:.2f}",
+        "same bits": lambda row: "yes" if row["same"] else "**no**",
+        "peak MB": lambda row: f"{row['peak_mb']:,.0f}",
+    },
     "train": {
         "scene": lambda row: row["scene"].replace("_", " "),
         "primitives": lambda row: f"{row['primitives']:,}",
@@ -264,7 +354,7 @@ def make_tables(records: Sequence[Record]) -> dict[str, str]:
     texts = {part: tables(part, columns) for part, columns in COLUMNS.items()}
     if first := tables("times_before", COLUMNS["times"]):
         texts["times"] += f"\n\nThe first version that ran there, up to a million primitives:\n\n{first}"
-    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-training": "train", "gpu-runs": "runs"}
+    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-steps": "steps", "gpu-training": "train", "gpu-runs": "runs"}
     return {marker: texts[part] for marker, part in markers.items() if texts[part]}
 
 
@@ -284,6 +374,7 @@ def main() -> None:
         measures: dict[str, Callable[[], Any]] = {
             "parity": lambda: list(measure_parity(args.device)),
             "times": lambda: list(measure_times(args.scenes, sizes)),
+            "steps": lambda: list(measure_steps(args.scenes, sizes)),
             "kernels": lambda: measure_kernels(max((c for c in args.scenes if c <= 100_000), default=5000), *sizes[0]),
             "train": lambda: list(measure_training(args.trained, vars(args))),
             "runs": lambda: list(measure_runs(args.mic)),

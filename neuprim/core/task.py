@@ -41,9 +41,10 @@ class Supervision:
     progress: float = 0.0
 
 
-Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, dict[str, float]]]
+Loss = Callable[[Tensor, Tensor, Supervision], tuple[Tensor, Mapping[str, float | Tensor]]]
 """Function (rendered (H, W, C), truth (H, W, C), :class:`Supervision`) -> (scalar with gradient, named numbers for the
-log)."""
+log, floats or tensors with one number). An attribute ``recordable = True`` of the function says that it never waits for
+a GPU and does the same in every step (it does not read ``Supervision.progress``), so that steps may be CUDA graphs."""
 
 Display = Callable[[Tensor], Tensor]
 """Function (H, W, C) colours in the data set's colour space -> (H, W, 3) sRGB values 0..1, pixel by pixel."""

@@ -115,11 +115,13 @@ def guard_loss(loss: Loss, source: PluginSource) -> Loss:
     if not callable(loss):
         raise PluginError(f"{source.label}: the loss is a {type(loss).__name__}; expected a function")
 
-    def call(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+    def call(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, Mapping[str, float | Tensor]]:
         with attribute_errors(source, "loss"):
             value, parts = loss(rendered, truth, frame)
             check_loss_returns(value, parts, rendered)
         return value, parts
+
+    call.recordable = getattr(loss, "recordable", False)  # type: ignore[attr-defined]
 
     return call
 
@@ -189,7 +191,8 @@ def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
     check_returns(gradient, "value", "no gradient", "one that depends on the rendered image")
     check_returns(isinstance(parts, dict), "parts", _describe_returned_type(parts), "a dictionary of names to numbers")
     for name, part in parts.items():
-        check_returns(isinstance(part, int | float), f"part {name!r}", _describe_returned_type(part), "a number")
+        number = isinstance(part, int | float) or (isinstance(part, Tensor) and not part.dim())
+        check_returns(number, f"part {name!r}", _describe_returned_type(part), "a number")
 
 
 def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:

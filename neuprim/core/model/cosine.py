@@ -69,6 +69,7 @@ class CosineDensity(DensityField):
     """
 
     init_settings = ("mode", "alpha")
+    stage = 0
 
     def __init__(self, neurons: int = 8, omega0: float = OMEGA0, edge: int = 0, gain: bool = False) -> None:
         if not isinstance(neurons, int) or not 0 <= neurons <= 16:

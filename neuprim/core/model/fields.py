@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, replace
 from importlib import resources
 from typing import TYPE_CHECKING, Any, Self
@@ -93,6 +93,11 @@ class Field(ABC):
     """Base class of density and colour fields: parameters of each primitive, and their meaning."""
 
     init_settings: tuple[str, ...] = ()  # keys under model.init that the field's start values depend on
+
+    stage: Hashable | None = None
+    """What ``lower`` depends on besides its arguments, such as the number of active SH bands: while it stays the same,
+    training steps may be replayed as a CUDA graph. None: steps are never recorded. A field with a stage computes with
+    torch operations on the device alone, and never waits for it."""
 
     @abstractmethod
     def parameters(self) -> list[ParameterSpec]:

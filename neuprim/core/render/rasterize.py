@@ -37,10 +37,11 @@ class RasterRequest:
     settings: RenderSettings
     stats: RenderStats
     differentiable: bool = False  # whether a backward pass may follow
+    capacity: Any = None  # sizes of the frame's arrays, for a backend that need not count them
 
     @classmethod
     def of(
-        cls, lowered: LoweredPrimitives, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: bool
+        cls, lowered: LoweredPrimitives, camera: Camera, settings: RenderSettings, stats: RenderStats, *rest: Any
     ) -> RasterRequest:
         density = lowered.density
         assert isinstance(density, Cosine), "the caller chooses a backend that knows the forms"
@@ -61,6 +62,7 @@ def rasterize(
     camera: Camera,
     background: Tensor | None,
     settings: RenderSettings,
+    capacity: Any = None,
 ) -> RenderOutput:
     """Render :class:`Cosine` densities with :class:`Constant` or :class:`RayNet` colours by ``operation``."""
     colour = lowered.colour
@@ -74,7 +76,7 @@ def rasterize(
         background = torch.zeros(palette.shape[1], device=palette.device)
     tensors = (camera.viewmat, background, palette, *rasterizer_tensors(lowered), *net)
     stats = RenderStats(name, lowered.geometry.count)
-    request = RasterRequest.of(lowered, camera, settings, stats, kernel_needs_grad(*tensors))
+    request = RasterRequest.of(lowered, camera, settings, stats, kernel_needs_grad(*tensors), capacity)
     rgb, transmittance, zsum = apply_kernel_operation(operation, request, *tensors)
     dtype = lowered.geometry.means.dtype
     alpha = 1 - transmittance

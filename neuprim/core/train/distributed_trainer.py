@@ -23,7 +23,8 @@ from neuprim.core.render.output import Contributions
 from neuprim.core.task import Loss
 from neuprim.core.train.process_group import ProcessGroup
 from neuprim.core.train.settings import TrainSettings
-from neuprim.core.train.trainer import StepReport, Trainer, ViewResult, ViewTask
+from neuprim.core.train.step_results import StepReport, ViewResult, ViewTask
+from neuprim.core.train.trainer import Trainer
 from neuprim.core.train.training_views import hash_training_views
 
 _ALIGNMENT = 16
@@ -74,6 +75,7 @@ class DistributedTrainer(Trainer):
                 f"train.supervision=voxels: {group.size} ranks have no views to share; expected one process"
             )
         self.group, self.rank, self.ranks = group, group.rank, group.size
+        self.recorder = None  # ranks exchange gradients in every step
         self._sums: GradientSum | None = None
         self._present: list[bool] = []
         self._checksum = 0  # sum of the bits of all positions before the step

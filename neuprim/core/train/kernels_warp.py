@@ -23,7 +23,6 @@ LAUNCH_PARAMETERS = 16
 
 _POINTERS = wp.types.vector(length=LAUNCH_PARAMETERS, dtype=wp.uint64)
 _LONGS = wp.types.vector(length=LAUNCH_PARAMETERS, dtype=wp.int64)
-_FLOATS = wp.types.vector(length=LAUNCH_PARAMETERS, dtype=wp.float32)
 
 _FINITE_CODE = """
     return isfinite(reinterpret_cast<const float*>(grad)[i]) ? 1 : 0;
@@ -66,14 +65,14 @@ def adam_kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def step_numbers(
         values: _POINTERS, grads: _POINTERS, firsts: _POINTERS, seconds: _POINTERS, ends: _LONGS, widths: _LONGS,
-        rates: _FLOATS,
+        rates: wp.array(dtype=float), first_rate: int,
         beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64),
         bad: wp.array(dtype=wp.int32),
     ):  # fmt: skip
         """Take an Adam step unless ``bad`` is set; one thread per element.
 
         ``widths``: elements per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
-        the betas; ``age``: steps of each row, including this one.
+        the betas; ``age``: steps of each row before this one; ``first_rate``: place of the first rate in ``rates``.
         """
         n = wp.int64(wp.tid())
         if bad[0] == 0:
@@ -83,8 +82,8 @@ def adam_kernels() -> tuple[Any, Any]:
                 begin = ends[k]
                 k += 1
             i = n - begin
-            t = float(age[int(i / widths[k])])
-            step = rates[k] / (1.0 - wp.exp(log1 * t))
+            t = float(age[int(i / widths[k])]) + 1.0
+            step = rates[first_rate + k] / (1.0 - wp.exp(log1 * t))
             slow = wp.sqrt(1.0 / (1.0 - wp.exp(log2 * t)))
             if t * log2 > -0.25:  # the difference would cancel: 1 - exp(x) = -x (1 + x/2 (1 + x/3 (1 + x/4 (1 + x/5))))
                 x = t * log2
@@ -96,19 +95,17 @@ def adam_kernels() -> tuple[Any, Any]:
 
 def adam_rows(
     values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor],
-    rates: Sequence[float],
-    age: Tensor, betas: tuple[float, float],
-) -> bool:  # fmt: skip
-    """Take one Adam step in place and return True; if a gradient is not finite, change nothing and return False.
-
-    Synchronises with the device once.
+    rates: Tensor, age: Tensor, betas: tuple[float, float], refused: Tensor,
+) -> None:  # fmt: skip
+    """Take one Adam step in place, unless ``refused`` is set; set it and change nothing if a gradient is not finite.
 
     Args:
         values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.
-        age: (N,) int64, steps of each row, including this one.
+        rates: (P,) float32, one rate per parameter.
+        age: (N,) int64, steps of each row before this one; grows by 1.
+        refused: (1,) int32.
     """
     device = age.device
-    bad = torch.zeros(1, dtype=torch.int32, device=device)
     check, step_numbers = adam_kernels()
     grads = [g.contiguous() for g in grads]
     groups = []
@@ -120,15 +117,15 @@ def adam_rows(
             _POINTERS(*[x.data_ptr() for x in group[some]], *[0] * spare) for group in (values, grads, firsts, seconds)
         ]
         widths = _LONGS(*[value[0].numel() for value in values[some]], *[1] * spare)
-        own_rates = _FLOATS(*rates[some], *[0.0] * spare)
-        groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, own_rates))
-    flag = array(bad, wp.int32)
+        groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, at))
+    flag = array(refused, wp.int32)
     for total, pointers, ends_, _, _ in groups:
         launch_kernel(check, total, (pointers[1], ends_, flag), device)
     constants = (*betas, *(1 - beta for beta in betas), *map(math.log, betas), array(age, wp.int64), flag)
-    for total, pointers, ends_, widths, own_rates in groups:
-        launch_kernel(step_numbers, total, (*pointers, ends_, widths, own_rates, *constants), device)
-    return int(bad) == 0
+    for total, pointers, ends_, widths, at in groups:
+        own = (array(rates, wp.float32), at)
+        launch_kernel(step_numbers, total, (*pointers, ends_, widths, *own, *constants), device)
+    age += refused == 0
 
 
 # ---------------------------------------------------------------- L1 + SSIM

@@ -37,7 +37,7 @@ _COMPONENT_WEIGHT = 0.1
 depend on it, and hardly moves primitives."""
 
 
-def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, float]]:
+def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -> tuple[Tensor, dict[str, Tensor]]:
     """Compute the photometric loss with kornia and autograd, on any device and dtype; the reference for the kernels.
 
     Args:
@@ -48,27 +48,27 @@ def photometric_reference(rendered: Tensor, truth: Tensor, ssim_weight: float) -
     """
     l1 = (rendered - truth).abs().mean()
     if ssim_weight == 0 or min(rendered.shape[:2]) < _WINDOW:
-        return l1, {"l1": l1.item()}
+        return l1, {"l1": l1.detach()}
     from kornia.metrics import ssim as kornia_ssim  # slow to import, and the fused versions do without
 
     with torch.backends.cudnn.flags(enabled=False):  # may round to ten bits, and variances are differences of blurs
         maps = kornia_ssim(rendered.permute(2, 0, 1)[None], truth.permute(2, 0, 1)[None], _WINDOW, padding="valid")
     similarity = maps.mean()
     loss = (1 - ssim_weight) * l1 + ssim_weight * (1 - similarity)
-    return loss, {"l1": l1.item(), "ssim": similarity.item()}
+    return loss, {"l1": l1.detach(), "ssim": similarity.detach()}
 
 
 class _Photometric(torch.autograd.Function):
     """The photometric loss, by kernels that compute value and gradient together."""
 
     @staticmethod
-    def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, float]) -> Tensor:
+    def forward(ctx: Any, rendered: Tensor, truth: Tensor, weight: float, parts: dict[str, Tensor]) -> Tensor:
         if device.on_numba(rendered):
             from neuprim.core.train.ssim_cpu import ssim_loss_with_gradient
         else:
             from neuprim.core.train.kernels_warp import ssim_loss_with_gradient
         means, grad = ssim_loss_with_gradient(rendered.detach(), truth.detach(), weight)
-        parts["l1"], parts["ssim"] = means.tolist()
+        parts["l1"], parts["ssim"] = means.unbind()
         ctx.save_for_backward(grad)
         return ((1 - weight) * means[0] + weight * (1 - means[1])).float()
 
@@ -82,15 +82,16 @@ def photometric(settings: Mapping[str, Any]) -> Loss:
     """Return the loss (1 - lambda) L1 + lambda (1 - SSIM); ``settings``: ``{"ssim_weight": lambda}``."""
     weight = float(settings["ssim_weight"])
 
-    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, Tensor]]:
         fits = rendered.dtype == truth.dtype == torch.float32 and min(rendered.shape[:2]) >= _WINDOW
         on_cpu = device.on_numba(rendered, truth) and rendered.shape[2] <= _MAX_CPU_CHANNELS
         if weight > 0 and fits and (on_cpu or device.on_warp(rendered, truth)):
-            parts: dict[str, float] = {}
+            parts: dict[str, Tensor] = {}
             value: Tensor = _Photometric.apply(rendered, truth, weight, parts)
             return value, parts
         return photometric_reference(rendered, truth, weight)
 
+    loss.recordable = True  # type: ignore[attr-defined]
     return loss
 
 
@@ -120,10 +121,11 @@ def relative_loss(settings: Mapping[str, Any]) -> Loss:
 
 
 def _image_loss(name: str, measure: Callable[[Tensor, Tensor], Tensor]) -> Loss:
-    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, float]]:
+    def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, Tensor]]:
         value = measure(rendered, truth)
-        return value, {name: value.item()}
+        return value, {name: value.detach()}
 
+    loss.recordable = True  # type: ignore[attr-defined]
     return loss
 
 

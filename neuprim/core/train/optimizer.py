@@ -8,7 +8,7 @@ each row.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -99,7 +99,7 @@ class _ParameterUpdate(NamedTuple):
     grad: Tensor
     m: Tensor
     v: Tensor
-    rate: float
+    rate: Any  # float, or a tensor with one number
 
 
 class RowAdam:
@@ -125,6 +125,29 @@ class RowAdam:
             NonFiniteError: a gradient is NaN or infinite. Nothing is changed; the message names parameter and
                 primitive.
         """
+        updates = self._updates(params, rates)
+        float32 = all(update.value.dtype == torch.float32 for update in updates)
+        if updates and float32 and device.on_warp(self.age):
+            refused = torch.zeros(1, dtype=torch.int32, device=self.age.device)
+            self._step_on_gpu(updates, torch.tensor([u.rate for u in updates], device=self.age.device), refused)
+            if int(refused):
+                raise NonFiniteError(_describe_bad_gradient(updates))
+        else:
+            self._step(updates, float32 and device.on_numba(self.age))
+        self._clamp(params)
+
+    def step_recorded(self, params: dict[str, Tensor], rates: Tensor, refused: Tensor) -> None:
+        """Update float32 ``params`` on a GPU without waiting for it.
+
+        Args:
+            rates: (P,) float32, a rate for each spec.
+            refused: (1,) int32; nothing is changed if it is set, and a gradient that is not finite sets it.
+        """
+        updates = self._updates(params, {spec.name: rate for spec, rate in zip(self.specs, rates, strict=True)})
+        self._step_on_gpu(updates, torch.stack([update.rate for update in updates]), refused)
+        self._clamp(params)
+
+    def _updates(self, params: dict[str, Tensor], rates: Mapping[str, Any]) -> list[_ParameterUpdate]:
         updates = []
         for name in (spec.name for spec in self.specs):
             grad = params[name].grad
@@ -132,9 +155,9 @@ class RowAdam:
                 updates.append(
                     _ParameterUpdate(name, params[name].detach(), grad, self.m[name], self.v[name], rates[name])
                 )
-        float32 = all(update.value.dtype == torch.float32 for update in updates)
-        if not (updates and float32 and device.on_warp(self.age) and self._step_on_gpu(updates)):
-            self._step(updates, float32 and device.on_numba(self.age))
+        return updates
+
+    def _clamp(self, params: dict[str, Tensor]) -> None:
         for spec in self.specs:
             if spec.low > -math.inf:
                 params[spec.name].detach().clamp_(min=spec.low)
@@ -149,16 +172,11 @@ class RowAdam:
         for update in updates:
             adam_step_reference(update.value, update.grad, update.m, update.v, update.rate, self.age, self.beta2)
 
-    def _step_on_gpu(self, updates: list[_ParameterUpdate]) -> bool:
-        """Update in two kernel launches and return True; False, with nothing changed, if a gradient is not finite."""
+    def _step_on_gpu(self, updates: list[_ParameterUpdate], rates: Tensor, refused: Tensor) -> None:
         from neuprim.core.train.kernels_warp import adam_rows
 
-        age, betas = self.age + 1, (BETA1, self.beta2)
-        _, values, grads, first, second, rates = zip(*updates, strict=True)
-        finite = adam_rows(values, grads, first, second, rates, age, betas)
-        if finite:
-            self.age = age
-        return finite
+        _, values, grads, first, second, _ = zip(*updates, strict=True)
+        adam_rows(values, grads, first, second, rates, self.age, (BETA1, self.beta2), refused)
 
     def _step_on_cpu(self, updates: list[_ParameterUpdate]) -> None:
         age = self.age.numpy()

@@ -10,32 +10,40 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuprim.core.compute.threads import limit_threads
-from neuprim.core.data import Dataset, PointSamples
+from neuprim.core.data import Dataset, Pixels, PointSamples, View
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import best_render_backend_device
 from neuprim.core.render.near_plane import near_plane_extent, resolve_near, typical_pixel_size
-from neuprim.core.render.output import Contributions, sum_contributions
+from neuprim.core.render.output import Contributions, RenderOutput, sum_contributions
 from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.losses import MaxScreenSize, PointLossResult, point_loss, scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.population import PopulationChange, make_population
+from neuprim.core.train.recorded_steps import StepRecorder, recording_fault
 from neuprim.core.train.settings import TrainSettings
+from neuprim.core.train.step_results import (
+    RenderedView,
+    StepReport,
+    ViewResult,
+    ViewTask,
+    summarize_numbers,
+    summarize_views,
+)
 from neuprim.core.train.trainer_state import check_state, select_state_tensors
 from neuprim.core.train.training_views import (
     Exposures,
     PixelLoader,
-    PixelStride,
     ViewCorrections,
     choose_stride,
     count_covered_pixels,
@@ -46,65 +54,6 @@ from neuprim.core.train.training_views import (
 __all__ = ["StepReport", "Trainer"]
 
 MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
-
-
-@dataclass(frozen=True)
-class StepReport:
-    """Result of one training step.
-
-    Attributes:
-        seconds: training time up to the end of this step.
-        psnr: PSNR of the training view (mean over views), or of the extinction at points in a step without views.
-        change: text about what population control changed; None if nothing.
-    """
-
-    step: int
-    seconds: float
-    loss: float
-    parts: dict[str, float]
-    psnr: float
-    primitives: int
-    view: str
-    change: str | None
-
-
-class ViewTask(NamedTuple):
-    """A training view to render: its index, background and pixels, and the index of the next view, if known."""
-
-    view: int
-    background: Tensor
-    stride: PixelStride
-    upcoming: int | None
-
-
-class ViewResult(NamedTuple):
-    """Results of one view of a step.
-
-    Attributes:
-        loss: the view's part of the step's loss; the part of the last view includes points and regularisers.
-        gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
-        correction: gradient of the view's corrections; None without them.
-    """
-
-    view: int
-    name: str
-    loss: float
-    psnr: float
-    parts: dict[str, float]
-    point_parts: dict[str, float]
-    gain: list[float] | None
-    correction: list[float] | None
-
-
-class _RenderedView(NamedTuple):
-    """A rendered view and its loss; the backward pass fills ``contributions``."""
-
-    loss: Tensor
-    parts: dict[str, float]
-    psnr: float
-    name: str
-    truth: Tensor
-    contributions: Contributions
 
 
 class Trainer:
@@ -123,6 +72,7 @@ class Trainer:
         rank: rank of this process among all processes that train the model.
         ranks: number of processes that train the model.
         stop_requested: function called after every step; True ends the training, see :attr:`stopping`.
+        recorder: replays steps as CUDA graphs; None where they cannot be recorded. :meth:`settle` waits for them.
     """
 
     rank, ranks = 0, 1
@@ -139,7 +89,7 @@ class Trainer:
         train = dataset.train
         settings = _check_training_settings(settings, model, dataset)
         cameras = [train.view(i).camera for i in range(len(train))]
-        self.model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
+        self.current_model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
         self.extent = near_plane_extent(dataset.extent, model.params["means"], cameras)
         self.pixel = typical_pixel_size(model.params["means"], cameras, self.extent)
@@ -159,7 +109,17 @@ class Trainer:
         self.zero_masks: dict[str, Tensor] = {}
         self.stop_requested: Callable[[], bool] = lambda: False
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
+        self._shown_progress = 0.0
+        self.recorder: StepRecorder | None = None
+        if recording_fault(self) is None:
+            self.recorder = StepRecorder(self)
         self._require_grad()
+
+    @property
+    def model(self) -> Primitives:
+        """The model after the last step."""
+        self.settle()
+        return self.current_model
 
     @property
     def progress(self) -> float:
@@ -179,17 +139,20 @@ class Trainer:
         """Whether training should stop after the last step, because a stop was requested."""
         return self.stop_requested()
 
-    def rates(self) -> dict[str, float]:
-        """Return the current learning rates by parameter: warm-up, exponential decay to ``final_rate``, cool-down."""
-        s = self.settings
-        factor = s.final_rate**self.progress
-        if s.cooldown and self.progress > 1 - s.cooldown:
-            factor *= max((1 - self.progress) / s.cooldown, MIN_COOLDOWN)
+    def rates(self, progress: float | None = None) -> dict[str, float]:
+        """Return the learning rates by parameter: warm-up, exponential decay to ``final_rate``, cool-down.
+
+        ``progress``: used fraction of the budget; None for the current one.
+        """
+        s, model, progress = self.settings, self.current_model, self.progress if progress is None else progress
+        factor = s.final_rate**progress
+        if s.cooldown and progress > 1 - s.cooldown:
+            factor *= max((1 - progress) / s.cooldown, MIN_COOLDOWN)
         if self.step < s.warmup_steps:
             factor *= (self.step + 1) / s.warmup_steps
         unit = {"absolute": 1.0, "extent": self.extent, "pixel": self.pixel}
-        units = {spec.name: unit[s.rate_units.get(spec.name, spec.lr_unit)] for spec in self.model.specs}
-        return {spec.name: s.rates.get(spec.name, spec.lr) * units[spec.name] * factor for spec in self.model.specs}
+        units = {spec.name: unit[s.rate_units.get(spec.name, spec.lr_unit)] for spec in model.specs}
+        return {spec.name: s.rates.get(spec.name, spec.lr) * units[spec.name] * factor for spec in model.specs}
 
     # ------------------------------------------------------------ the loop
 
@@ -206,64 +169,103 @@ class Trainer:
             DeviceMemoryError: the GPU has too little memory for a step; files are intact.
         """
         with self._limit_resources():
-            start, model, progress = time.perf_counter(), self.model, self.progress
-            model.density.set_progress(progress)
-            model.colour.set_progress(progress)
-            for value in model.params.values():
-                value.grad = None
-
-            # Draw the views and the points of this step.
+            start, progress = time.perf_counter(), self.progress
+            self._set_progress(progress)
             tasks, samples = self._draw_views(), self._draw_points()
-
-            # Add up losses and gradients, view by view. Points and regularisers join the last view.
-            points: PointLossResult | None = None
-            results, each = list[ViewResult](), list[Contributions]()
-            for number, task in enumerate(tasks, start=1):
-                view = self._render_view(task, progress)
-                loss = view.loss / (self.settings.views_per_step * self.ranks)
-                if number == len(tasks) and self.rank == self.ranks - 1:
-                    points = None if samples is None else self._compare_points(samples)
-                    loss = self._total_loss(loss, points)
-                cost = self._backward(loss, view, points)
-                gain = None if self.exposures is None else self.exposures.gradient(task.view)
-                moved = None if self.corrections is None else self.corrections.gradient(task.view)
-                point_parts = {} if points is None else points.parts
-                results.append(ViewResult(task.view, view.name, cost, view.psnr, view.parts, point_parts, gain, moved))
-                each.append(self._exchange_gradients(view.contributions))
-                del view, loss  # free what autograd saved before the next view is rendered
-            if tasks:
-                results, contributions = self._combine_views(results, each, start)
-                cost, parts, psnr, name = _summarize_training_views(results)
-            else:
-                assert samples is not None, "a step without views has points"
-                points = self._compare_points(samples)
-                cost = self._backward(self._total_loss(None, points), None, points)
-                contributions, parts, psnr, name = points.contributions(), points.parts, points.psnr, points.name
-
-            # Update the parameters, and the numbers of the views.
-            self.population.observe(model, contributions)
-            self.optimizer.step(model.params, self.rates())
-            if self.dataset.largest is not None:
-                model.limit(self.dataset.largest)
-            for parameter, mask in self.zero_masks.items():
-                model.params[parameter].detach()[mask] = 0
-            if self.exposures is not None:
-                self.exposures.step({result.view: result.gain for result in results})
-            if self.corrections is not None:
-                factor = self.settings.final_rate**progress
-                self.corrections.step({result.view: result.correction for result in results}, factor)
-            if self.max_screen_size is not None:
-                self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
+            report = None
+            if self.recorder is not None and samples is None:
+                report = self.recorder.take(tasks[0], progress)
+            if report is None:
+                self.settle()
+                report = self.pending_report("")
+                name = self._take_step(report, tasks, samples, progress, start)
+                report.__dict__["view"] = name
             self.step += 1
 
             # Apply population control.
             change = None
             if self.population.due(self.step, progress):
-                change = self.population.intervene(model, self.extent)
+                change = self.population.intervene(self.model, self.extent)
                 if change is not None:
                     self._apply_change(change)
-            self.elapsed, text = self._stop_clock(start), None if change is None else change.text
-            return StepReport(self.step, self.elapsed, cost, parts, psnr, model.count, name, text)
+            self.elapsed = self._stop_clock(start)
+            if self.finished:
+                self.settle()
+                self.elapsed = self._stop_clock(start)
+            known = {"step": self.step, "seconds": self.elapsed, "primitives": self.current_model.count}
+            report.__dict__.update(known, change=None if change is None else change.text)
+            return report
+
+    def _set_progress(self, progress: float) -> None:
+        self._shown_progress = progress
+        self.current_model.density.set_progress(progress)
+        self.current_model.colour.set_progress(progress)
+
+    def _take_step(
+        self, report: StepReport, tasks: list[ViewTask], samples: PointSamples | None, progress: float, start: float
+    ) -> str:
+        """Take a step that is not recorded, without population control; fill ``report`` and return its view."""
+        model = self.current_model
+        for value in model.params.values():
+            value.grad = None
+
+        # Add up losses and gradients, view by view. Points and regularisers join the last view.
+        points: PointLossResult | None = None
+        results, each = list[ViewResult](), list[Contributions]()
+        for number, task in enumerate(tasks, start=1):
+            view = self._render_view(task, progress)
+            loss = view.loss / (self.settings.views_per_step * self.ranks)
+            if number == len(tasks) and self.rank == self.ranks - 1:
+                points = None if samples is None else self._compare_points(samples)
+                loss = self.total_loss(loss, points)
+            cost, parts, psnr = self._backward(loss, view, points)
+            gain = None if self.exposures is None else self.exposures.gradient(task.view)
+            moved = None if self.corrections is None else self.corrections.gradient(task.view)
+            point_parts = {} if points is None else points.parts
+            results.append(ViewResult(task.view, view.name, cost, psnr, parts, point_parts, gain, moved))
+            each.append(self._exchange_gradients(view.contributions))
+            del view, loss  # free what autograd saved before the next view is rendered
+        if tasks:
+            results, contributions = self._combine_views(results, each, start)
+            cost, parts, psnr, name = summarize_views(results)
+        else:
+            assert samples is not None, "a step without views has points"
+            points = self._compare_points(samples)
+            cost, _, _ = self._backward(self.total_loss(None, points), None, points)
+            contributions, parts, psnr, name = points.contributions(), points.parts, points.psnr, points.name
+
+        # Update the parameters, and the numbers of the views.
+        self.population.observe(model, contributions)
+        self.optimizer.step(model.params, self.rates(progress))
+        self.limit_model()
+        for parameter, mask in self.zero_masks.items():
+            model.params[parameter].detach()[mask] = 0
+        if self.exposures is not None:
+            self.exposures.step({result.view: result.gain for result in results})
+        if self.corrections is not None:
+            factor = self.settings.final_rate**progress
+            self.corrections.step({result.view: result.correction for result in results}, factor)
+        if self.max_screen_size is not None:
+            self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
+        report.resolve(cost, parts, psnr)
+        return name
+
+    def settle(self) -> None:
+        """Wait for recorded steps, and repeat those that the device refused. Raises as :meth:`train_step`."""
+        again = [] if self.recorder is None else self.recorder.settle()
+        if not again:
+            return
+        step, progress = self.step, self._shown_progress
+        for flight in again:
+            self.step = flight.step
+            self._set_progress(flight.progress)
+            self._take_step(flight.report, [flight.task], None, flight.progress, 0.0)
+        self.step = step
+        self._set_progress(progress)
+
+    def pending_report(self, view: str) -> StepReport:
+        """Return a report on this step whose results are not known yet."""
+        return StepReport.pending(self.settle, view=view)
 
     @contextmanager
     def _limit_resources(self) -> Iterator[None]:
@@ -273,7 +275,7 @@ class Trainer:
         except torch.OutOfMemoryError as error:
             camera = self.dataset.train.view(0).camera
             raise DeviceMemoryError(
-                f"{self.device}: out of memory at step {self.step} with {self.model.count} primitives, images of "
+                f"{self.device}: out of memory at step {self.step} with {self.current_model.count} primitives, images of "
                 f"{camera.width} x {camera.height} pixels and train.views_per_step={self.settings.views_per_step}; "
                 "lower one of them. The last checkpoint is intact"
             ) from error
@@ -299,7 +301,7 @@ class Trainer:
 
         ``start``: time at the beginning of the step.
         """
-        return results, each[0] if len(each) == 1 else sum_contributions(each, self.model.count)
+        return results, each[0] if len(each) == 1 else sum_contributions(each, self.current_model.count)
 
     def _stop_clock(self, start: float) -> float:
         return self.elapsed + time.perf_counter() - start
@@ -313,7 +315,7 @@ class Trainer:
             self.order = torch.randperm(len(train), generator=self.generator)
         index, self.order = int(self.order[0]), self.order[1:]
         background = self._draw_background()
-        stride = choose_stride(settings.stride, self.covered_pixels, self.model.count, self.progress)
+        stride = choose_stride(settings.stride, self.covered_pixels, self.current_model.count, self.progress)
         return index, background, draw_stride(stride, train.view(index), self.generator)
 
     def _draw_background(self) -> Tensor:
@@ -337,22 +339,44 @@ class Trainer:
 
     def _quantized_model(self) -> Primitives:
         """Return the model to render, with quantized parameters if :attr:`fake_quantize` is set."""
+        model = self.current_model
         if self.fake_quantize is None:
-            return self.model
-        return Primitives(self.model.density, self.model.colour, self.fake_quantize(self.model.params))
+            return model
+        return Primitives(model.density, model.colour, self.fake_quantize(model.params))
 
-    def _render_view(self, task: ViewTask, progress: float) -> _RenderedView:
+    def load_view(self, task: ViewTask) -> tuple[View, Pixels]:
+        """Return a training view and its pixels, on the device of the model."""
+        pixels = self.loader.take(task.view, task.upcoming)
+        return task.stride.take(self.dataset.train.view(task.view), pixels)
+
+    def _render_view(self, task: ViewTask, progress: float) -> RenderedView:
         """Render a view and compare it with its image."""
-        index = task.view
-        view, pixels = task.stride.take(self.dataset.train.view(index), self.loader.take(index, task.upcoming))
+        view, pixels = self.load_view(task)
         if self.corrections is not None:
-            view = self.corrections.apply(index, view)
-        background = task.background.to(self.device, non_blocking=True)
+            view = self.corrections.apply(task.view, view)
+
+        def draw(view: View, background: Tensor) -> RenderOutput:
+            output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
+            if self.recorder is not None:
+                self.recorder.observe_counts(output.stats)
+            return output if self.exposures is None else replace(
+                output, rgb=self.exposures.apply(task.view, output.rgb)
+            )
+
+        return self.compare_view(view, pixels, task.background.to(self.device, non_blocking=True), progress, draw)
+
+    def compare_view(
+        self,
+        view: View,
+        pixels: Pixels,
+        background: Tensor,
+        progress: float,
+        draw: Callable[[View, Tensor], RenderOutput],
+    ) -> RenderedView:
+        """Render a view by ``draw`` and compare it with its image, without waiting for a GPU."""
         truth = pixels.over(background)
-        output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
-        rgb = output.rgb if self.exposures is None else self.exposures.apply(index, output.rgb)
-        if pixels.mask is not None:
-            rgb = torch.where(pixels.mask[..., None], rgb, truth)
+        output = draw(view, background)
+        rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
         loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
         with torch.no_grad():
             difference = rgb - truth
@@ -360,51 +384,70 @@ class Trainer:
             mean = torch.full((channels,), 1.0 / channels, device=self.device)
             contributions = output.request_contributions(difference.abs() @ mean)
             flat = difference.reshape(-1)
-            counted = flat.numel() if pixels.mask is None else int(pixels.mask.sum()) * channels
-            mse = torch.dot(flat, flat).item() / counted
-        psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
-        return _RenderedView(loss, parts, psnr, view.name, truth, contributions)
+            counted = flat.numel() if pixels.mask is None else pixels.mask.sum() * channels
+        return RenderedView(loss, parts, torch.dot(flat, flat), counted, view.name, truth, contributions)
 
     def _compare_points(self, samples: PointSamples) -> PointLossResult:
         return point_loss(self._quantized_model(), self.dataset, samples, self.settings, self.renderer.threads)
 
-    def _total_loss(self, loss: Tensor | None, points: PointLossResult | None) -> Tensor:
+    @property
+    def loss_stage(self) -> bool:
+        """Whether :meth:`total_loss` has the regulariser that begins at ``train.anisotropy_from``."""
+        return self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from
+
+    def total_loss(self, loss: Tensor | None, points: PointLossResult | None = None) -> Tensor:
         """Return the sum of the losses of views, points (None: none in this step) and regularisers."""
         if points is not None:
             loss = points.loss if loss is None else loss + self.settings.voxel_weight * points.loss
         assert loss is not None
+        log_scales = self.current_model.params["log_scales"]
         if self.settings.size_weight > 0:
-            loss = loss + self.settings.size_weight * self.model.params["log_scales"].exp().mean() / self.extent
-        if self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from:
-            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(self.model.params["log_scales"])
+            loss = loss + self.settings.size_weight * log_scales.exp().mean() / self.extent
+        if self.loss_stage:
+            loss = loss + self.settings.anisotropy_weight * scale_anisotropy(log_scales)
         return loss
 
-    def _backward(self, loss: Tensor, view: _RenderedView | None, points: PointLossResult | None) -> float:
-        """Run the backward pass of ``loss``, which adds to ``.grad`` of the parameters; return the loss as a float.
+    def limit_model(self) -> None:
+        """Limit the extinction of the primitives to the largest of the data, if the data have one."""
+        if self.dataset.largest is not None:
+            self.current_model.limit(self.dataset.largest)
+
+    def _backward(
+        self, loss: Tensor, view: RenderedView | None, points: PointLossResult | None
+    ) -> tuple[float, dict[str, float], float]:
+        """Run the backward pass of ``loss``, which adds to ``.grad`` of the parameters.
+
+        Returns the loss, and the parts and the PSNR of the view.
 
         Raises:
             NonFiniteError: the loss is NaN or infinite; names the view or points.
         """
-        cost = loss.item()
+        if view is None:
+            cost, parts, psnr = loss.item(), dict[str, float](), math.nan
+        else:
+            cost, parts, psnr = summarize_numbers(view.numbers(loss).tolist(), tuple(view.parts))
         if not math.isfinite(cost):
-            self.model.check_finite()
+            self.current_model.check_finite()
             where = f"points of {points.name}" if view is None and points is not None else ""
             if view is not None:
                 bad_pixels = not bool(torch.isfinite(view.truth).all())
                 where = f"view {view.name}{', whose pixels are NaN or infinite somewhere' if bad_pixels else ''}"
             raise NonFiniteError(f"loss is {cost} at step {self.step} on {where}")
         loss.backward()
-        return cost
+        return cost, parts, psnr
 
     def _apply_change(self, change: PopulationChange) -> None:
-        self.model.params = {spec.name: change.params[spec.name] for spec in self.model.specs}
+        model = self.current_model
+        model.params = {spec.name: change.params[spec.name] for spec in model.specs}
         self.optimizer.select(change.origin, change.fresh)
         self.zero_masks = {name: mask[change.origin] for name, mask in self.zero_masks.items()}
         self._require_grad()
 
     def _require_grad(self) -> None:
-        for name, value in self.model.params.items():
-            self.model.params[name] = value.detach().contiguous().requires_grad_()
+        for name, value in self.current_model.params.items():
+            self.current_model.params[name] = value.detach().contiguous().requires_grad_()
+        if self.recorder is not None:
+            self.recorder.reset()
 
     # ------------------------------------------------------------ exact state
 
@@ -466,11 +509,3 @@ def _check_training_settings(settings: TrainSettings, model: Primitives, dataset
             "photographs, as a gain would change the background that is put behind them"
         )
     return settings
-
-
-def _summarize_training_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
-    """Return summed loss, mean parts, mean PSNR and name of a step, from the results of its views."""
-    last, count = views[-1], len(views)
-    parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}
-    name = last.name if count == 1 else f"{last.name} and {count - 1} more"
-    return sum(view.loss for view in views), parts | last.point_parts, sum(view.psnr for view in views) / count, name

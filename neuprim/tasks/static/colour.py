@@ -34,6 +34,10 @@ class SphericalHarmonics(ColourField):
         self.degree, self.channels, self.sh_every = degree, channels, sh_every
         self.active = degree
 
+    @property
+    def stage(self) -> int:  # type: ignore[override]
+        return self.active
+
     def settings(self) -> dict[str, Any]:
         return {"degree": self.degree, "channels": self.channels}
 
@@ -78,6 +82,8 @@ class SphericalLobes(ColourField):
     per channel, an axis m_l (three parameters, normalised when used) and the logarithm of a sharpness s_l. Lobes start
     with random axes and amplitude zero.
     """
+
+    stage = 0
 
     def __init__(self, lobes: int = 2, channels: int = 3) -> None:
         _check_lobe_count(lobes)

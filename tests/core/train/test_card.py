@@ -162,7 +162,7 @@ def test_a_run_on_a_card_is_a_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
 # ---------------------------------------------------------------- waits, and views made ready ahead
 
 
-@pytest.mark.parametrize(("task", "waits", "gradients"), [("static", 4, 8), ("lights", 7, 11), ("time", 14, 8)])
+@pytest.mark.parametrize(("task", "waits", "gradients"), [("static", 2, 8), ("lights", 5, 11), ("time", 12, 8)])
 def test_a_step_waits_for_the_card_as_seldom_as_it_did(
     task: str, waits: int, gradients: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -34,7 +34,7 @@ def value_and_grad(loss, rendered: Tensor, truth: Tensor) -> tuple[float, Tensor
     value, parts = loss(leaf, truth, FRAME)
     value.backward()
     assert leaf.grad is not None
-    return value.item(), leaf.grad, parts
+    return value.item(), leaf.grad, {name: float(part) for name, part in parts.items()}
 
 
 @pytest.mark.parametrize("size", SIZES, ids=lambda s: f"{s[0]}x{s[1]}")

@@ -33,12 +33,14 @@ def test_adam_is_the_reference() -> None:
     age = torch.randint(0, 40_000, (ROWS,), generator=generator)
     age[:6] = 0  # fresh rows beside old ones
     rates = [10 ** -float(torch.rand(1, generator=generator) * 3) for _ in values]
+    refused = torch.zeros(1, dtype=torch.int32)
     for _ in range(20):
         grads = [
             torch.randn(v.shape, generator=generator) * 10 ** float(torch.randn(1, generator=generator)) for v in values
         ]
-        age += 1
-        assert adam_rows(values, grads, *moments, rates, age, BETAS)
+        before = age.clone()
+        adam_rows(values, grads, *moments, torch.tensor(rates), age, BETAS, refused)
+        assert not refused and torch.equal(age, before + 1)
         for k, grad in enumerate(grads):
             adam_step_reference(expected[k], grad.double(), doubles[0][k], doubles[1][k], rates[k], age)
     for value, double, rate in zip(values, expected, rates, strict=True):
@@ -54,11 +56,12 @@ def test_adam_changes_nothing_where_a_gradient_is_not_finite(bad: float, which: 
     grads[which].view(-1)[-1] = bad
     before = [x.clone() for x in (*values, *moments[0], *moments[1])]
     kept = torch.full((ROWS,), 5)
-    fine = adam_rows(values, grads, *moments, [0.1] * len(values), kept, BETAS)
+    refused = torch.zeros(1, dtype=torch.int32)
+    adam_rows(values, grads, *moments, torch.full((len(values),), 0.1), kept, BETAS, refused)
     # numbers of a launch without the bad one may have moved; those beside it have not
     first = which // LAUNCH_PARAMETERS * LAUNCH_PARAMETERS
     group = slice(first, first + LAUNCH_PARAMETERS)
-    assert not fine
+    assert refused and torch.equal(kept, torch.full((ROWS,), 5))
     assert all(torch.equal(a, b) for a, b in zip(before[: len(values)][group], values[group], strict=True))
     assert all(torch.equal(a, b) for a, b in zip(before, (*values, *moments[0], *moments[1]), strict=True))
 
@@ -73,5 +76,5 @@ def test_similarity_and_its_gradient_are_those_of_float64(shape: tuple[int, int,
     loss, parts = photometric_reference(exact, truth.double(), 0.2)
     loss.backward()
     assert exact.grad is not None
-    assert means.tolist() == pytest.approx([parts["l1"], parts["ssim"]], abs=1e-7)
+    assert means.tolist() == pytest.approx([float(parts["l1"]), float(parts["ssim"])], abs=1e-7)
     assert float((grad - exact.grad).abs().max()) <= 3e-6 * float(exact.grad.abs().max())

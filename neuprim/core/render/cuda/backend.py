@@ -12,6 +12,7 @@ from neuprim.core.cameras import Camera
 from neuprim.core.model.checks import check_primitive_colours_finite, non_finite_primitive_error
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.cuda import layout as L
+from neuprim.core.render.cuda.binning import FrameCapacity
 from neuprim.core.render.cuda.backward import ImageGradient, rasterizer_gradient_rows
 from neuprim.core.render.cuda.colour_net import (
     FIRST_COLOUR,
@@ -60,8 +61,10 @@ class _Rasterize(torch.autograd.Function):
         settings, stats, camera = request.settings, request.stats, request.camera
         stats.pairs, stats.extra["float64"] = frame.lists.pairs, frame.wide.shape[0]
         behind = background.detach().to(frame.device, torch.float32).contiguous()
-        drawn = composite_frame(frame, form, net, behind, settings, request.differentiable)
-        stats.extra["hits"] = drawn.hits.shape[0]
+        drawn = composite_frame(
+            frame, form, net, behind, settings, request.differentiable, capacity=request.capacity
+        )
+        stats.extra["hits"], stats.extra["float64_pairs"] = drawn.hits.shape[0], drawn.in_float64.shape[0]
         ctx.request, ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.background = request, frame, form, net, drawn, behind
         remember_rasterizer_inputs(ctx, (viewmat, background, palette, *tensors))
         h, w = camera.height, camera.width
@@ -110,10 +113,22 @@ class _Rasterize(torch.autograd.Function):
 
 
 def render(
-    lowered: LoweredPrimitives, camera: Camera, background: Tensor | None, settings: RenderSettings
+    lowered: LoweredPrimitives,
+    camera: Camera,
+    background: Tensor | None,
+    settings: RenderSettings,
+    capacity: FrameCapacity | None = None,
 ) -> RenderOutput:
-    """Render a frame; see :data:`neuprim.core.render.output.Draw`."""
-    return rasterize(_Rasterize, "cuda", lowered, camera, background, settings)
+    """Render a frame; see :data:`neuprim.core.render.output.Draw`. With a ``capacity`` the host never waits.
+
+    With a capacity, colours are :class:`Constant`, and sizes take the place of the counts in the statistics.
+    """
+    return rasterize(_Rasterize, "cuda", lowered, camera, background, settings, capacity)
+
+
+def frame_counts(stats: RenderStats) -> tuple[int, int, int, int]:
+    """Return the counts of a differentiable frame without capacity, in the order of :class:`FrameCapacity`."""
+    return stats.pairs, stats.extra["float64"], stats.extra["hits"], stats.extra["float64_pairs"]
 
 
 def render_slabs(

@@ -1,8 +1,8 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """Silhouettes, tile lists and pixels per pair; the CUDA version of :mod:`neuprim.core.render.cpu.tiles`.
 
-Outputs are counted before they are written, and sorted by integer keys, so reruns give the same bits. Synchronises
-once.
+Outputs are counted before they are written, and sorted by integer keys, so reruns give the same bits. The host waits
+once for the counts, unless the caller gives the sizes of the arrays (:class:`FrameCapacity`).
 """
 
 import functools
@@ -51,8 +51,27 @@ _MOST = 2**31  # indices of pairs are int32
 
 
 @dataclass(frozen=True)
+class FrameCapacity:
+    """Sizes of a frame's arrays, so that the host need not wait for the frame's counts.
+
+    A frame that does not fit, or has a primitive that is not finite, is drawn empty and sets ``refused``.
+    """
+
+    pairs: int  # (tile, primitive) pairs
+    in_float64: int  # primitives that are drawn in float64
+    slots: int  # pixels of all pairs
+    float64_pairs: int  # pairs of the primitives that are drawn in float64
+    refused: Tensor  # (1,) int32 on the device
+
+    def fits(self, counts: tuple[int, int, int, int]) -> bool:
+        """Return whether a frame with these counts, in the order of the fields, fits."""
+        held = (self.pairs, self.in_float64, self.slots, self.float64_pairs)
+        return all(count <= size for count, size in zip(counts, held, strict=True))
+
+
+@dataclass(frozen=True)
 class TileCounts:
-    """Total counts of a frame on the host, and running sums of counts on the device."""
+    """Sizes of a frame's arrays, and running sums of counts on the device."""
 
     pairs: int  # (tile, primitive) pairs
     in_float64: int  # primitives that are drawn in float64
@@ -62,7 +81,10 @@ class TileCounts:
 
 @dataclass(frozen=True)
 class TileLists:
-    """Pairs (tile, primitive), sorted by image (if there are several), then by tile, depth and index."""
+    """Pairs (tile, primitive), sorted by image (if there are several), then by tile, depth and index.
+
+    Within a :class:`FrameCapacity`, zeros follow the pairs of the frame, whose number is the last of ``starts``.
+    """
 
     starts: Tensor  # (tiles + 1,) int32, first pair of each tile, of all images
     ids: Tensor  # (pairs,) int32, primitive of each pair
@@ -75,11 +97,22 @@ class TileLists:
         return int(self.ids.shape[0])
 
 
-def count_tiles(counts: Tensor, bad: Tensor) -> TileCounts:
-    """Return totals and running sums of the stage's ``counts``. Synchronises. BackendUnavailable: too many pairs."""
-    ends = torch.stack(
-        [torch.cumsum(row, 0, dtype=torch.int64) for row in counts]
-    )  # torch's scan of a single row is ten times faster
+def running_sums(counts: Tensor) -> Tensor:
+    """Return the (R, N) int64 running sums of each row of ``counts``."""
+    ends = torch.empty(counts.shape, dtype=torch.int64, device=counts.device)
+    for row, out in zip(counts, ends, strict=True):  # torch's scan of a single row is ten times faster
+        torch.cumsum(row, 0, dtype=torch.int64, out=out)
+    return ends
+
+
+def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = None) -> TileCounts:
+    """Return sizes and running sums for the stage's ``counts``; waits for the device if there is no ``capacity``.
+
+    Raises BackendUnavailable if there are too many pairs.
+    """
+    ends = running_sums(counts)
+    if capacity is not None:
+        return TileCounts(capacity.pairs, capacity.in_float64, -1, ends)
     if counts.shape[1] == 0:
         return TileCounts(0, 0, -1, ends)
     pairs, in_float64, first_bad = torch.cat((ends[:, -1], bad.long())).tolist()
@@ -257,6 +290,13 @@ def tile_range(e: Ellipse, ty: int):
     return wp.vec2i(lo, hi)
 
 
+@wp.func
+def _primitives_fit(ends: Longs2d, keys: Longs, which: Ints):
+    """Return whether all pairs and all float64 primitives of a frame fit into its arrays."""
+    last = ends.shape[1] - 1
+    return ends[0, last] <= wp.int64(keys.shape[0]) and ends[1, last] <= wp.int64(which.shape[0])
+
+
 @functools.cache
 def _binning_kernels() -> tuple[Any, Any]:
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
@@ -270,13 +310,16 @@ def _binning_kernels() -> tuple[Any, Any]:
         """
         rank = wp.tid()
         i = int(order[rank])
-        last = int(ends[0, i])
+        fits = _primitives_fit(ends, keys, which)
+        last = int(0)
+        if fits:
+            last = int(ends[0, i])
         first[i + 1] = last
         slots[i] = -1
-        if counts[1, i] > 0:
+        if fits and counts[1, i] > 0:
             slots[i] = int(ends[1, i]) - 1
             which[slots[i]] = i
-        if counts[0, i] > 0:
+        if fits and counts[0, i] > 0:
             box, at = boxes[i], last - counts[0, i]
             origin = int(0)
             if tiles > 0:
@@ -290,11 +333,16 @@ def _binning_kernels() -> tuple[Any, Any]:
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def list_pairs(
-        keys: Longs, came_from: Longs, order: Longs, pairs: int, tiles: int, each: int,
+        keys: Longs, came_from: Longs, order: Longs, ends: Longs2d, which: Ints, tiles: int, each: int,
         starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
         """Fill the tile lists from sorted keys; dim (pairs,). ``tiles``: count in all images; ``each``: in one."""
         k = wp.tid()
+        pairs = int(0)
+        if _primitives_fit(ends, keys, which):
+            pairs = int(ends[0, ends.shape[1] - 1])
+        if k >= pairs:
+            return
         key = keys[k]
         tile, rank = int(key >> wp.int64(32)), int(key & wp.int64(0xFFFFFFFF))
         ids[k] = int(order[rank])
@@ -331,13 +379,14 @@ def bin_primitives(
     image_of, several = (None, 1) if images is None else (array(images[0], wp.int32), images[1])
     each = across * down
 
-    def integers(n: int) -> Tensor:
-        return torch.empty(n, dtype=torch.int32, device=device)
+    def integers(n: int) -> Tensor:  # zeros: there may be fewer pairs, and zero is an index
+        return torch.zeros(n, dtype=torch.int32, device=device)
 
     emit, list_pairs = _binning_kernels()
     order = torch.argsort(depth, stable=True)
-    first = torch.zeros(N + 1, dtype=torch.int32, device=device)
-    slots, which, keys = integers(N), integers(counted.in_float64), torch.empty(pairs, dtype=torch.int64, device=device)
+    first = integers(N + 1)
+    slots, which = integers(N), integers(counted.in_float64)
+    keys = torch.full((pairs,), torch.iinfo(torch.int64).max, device=device)  # sorts behind all pairs
     reached = (
         array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64),
         array(counts, wp.int32),
@@ -346,10 +395,11 @@ def bin_primitives(
     )  # fmt: skip
     launch_kernel(emit, N, reached, device, PER_BLOCK)
     keys, came_from = torch.sort(keys)
-    starts = torch.zeros(several * each + 1, dtype=torch.int32, device=device)
+    starts = integers(several * each + 1)
     ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
     found = (
-        array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), pairs, several * each, each,
+        array(keys, wp.int64), array(came_from, wp.int64), array(order, wp.int64), array(counted.ends, wp.int64),
+        array(which, wp.int32), several * each, each,
         array(starts, wp.int32), array(ids, wp.int32), array(tile_of, wp.int32), array(slots_of, wp.int32),
     )  # fmt: skip
     launch_kernel(list_pairs, pairs, found, device)
@@ -358,15 +408,19 @@ def bin_primitives(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def row_spans(
-    rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, ids: Ints, tiles: Ints, size: wp.vec2i, spans: Shorts2d,
-    counts: Ints,
+    rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, starts: Ints, ids: Ints, tiles: Ints, size: wp.vec2i,
+    spans: Shorts2d, counts: Ints2d,
 ):  # fmt: skip
     """Thread n writes which pixels of its tile pair n covers: start << 8 | last << 4 | first for each of 16 rows.
 
     Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. The slots
-    take a fifth of the memory of whole tiles.
+    take a fifth of the memory of whole tiles. ``counts`` (2, pairs): number of slots; 1 if the pair needs float64.
     """
     n = wp.tid()
+    if n >= starts[starts.shape[0] - 1]:  # the arrays are larger than the frame needs
+        counts[0, n] = 0
+        counts[1, n] = 0
+        return
     i = ids[n]
     across = (size[0] + L.TILE - 1) // L.TILE
     tx = (tiles[n] % across) * L.TILE
@@ -395,4 +449,34 @@ def row_spans(
                 last = high
                 total += high - low + 1
         spans[n, y] = wp.uint16(start << 8 | last << 4 | first)
-    counts[n] = total
+    counts[0, n] = total
+    counts[1, n] = int(rows[i, L.REST][3])
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+def list_float64_pairs(starts: Ints, counts: Ints2d, ends: Longs2d, found: Ints):
+    """Write the pairs that need float64 to ``found``, in order; from the counts of row_spans and their sums."""
+    n = wp.tid()
+    if counts[1, n] > 0 and n < starts[starts.shape[0] - 1]:  # a refused frame has no pairs
+        found[int(ends[1, n]) - 1] = n
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+def refuse_frame(
+    ends: Longs2d, slot_ends: Longs2d, bad: Ints, capacity: wp.vec4i, starts: Ints, refused: Ints,
+):  # fmt: skip
+    """Empty all tiles and set ``refused`` if the frame exceeds its capacity or a primitive is not finite.
+
+    ``capacity``: the sizes of :class:`FrameCapacity`; ``slot_ends``: running sums of the counts of row_spans.
+    """
+    t = wp.tid()
+    last, pair = ends.shape[1] - 1, slot_ends.shape[1] - 1
+    if (
+        ends[0, last] > wp.int64(capacity[0])
+        or ends[1, last] > wp.int64(capacity[1])
+        or slot_ends[0, pair] > wp.int64(capacity[2])
+        or slot_ends[1, pair] > wp.int64(capacity[3])
+        or bad[0] < ends.shape[1]
+    ):
+        starts[t] = 0
+        refused[0] = 1

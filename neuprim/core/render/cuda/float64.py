@@ -233,8 +233,9 @@ def float64_opacity_kernel(depth: bool) -> Any:
     ):  # fmt: skip
         """Store the opacities of ``pairs``, one warp each; ``slots[i]``: the row of primitive i in ``wide``."""
         member, lane = wp.tid()
-        n = pairs[member]
-        r = slots[ids[n]]
+        n, r = pairs[member], int(-1)
+        if n >= 0:  # -1 fills the list
+            r = slots[ids[n]]
         if r >= 0:
             across = (size[0] + L.TILE - 1) // L.TILE
             tx, ty, begin = (tiles[n] % across) * L.TILE, (tiles[n] // across) * L.TILE, offsets[n]
@@ -281,8 +282,9 @@ def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
         g_z: Floats, error: Floats, out: Floats,
     ):  # fmt: skip
         member, lane = wp.tid()
-        n = pairs[member]
-        r = slots[ids[n]]
+        n, r = pairs[member], int(-1)
+        if n >= 0:  # -1 fills the list
+            r = slots[ids[n]]
         if r >= 0:
             total = row_of()
             tile = tiles[n]

@@ -31,7 +31,13 @@ from neuprim.core.compute.warp import (
 from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.binning import row_spans
+from neuprim.core.render.cuda.binning import (
+    FrameCapacity,
+    list_float64_pairs,
+    refuse_frame,
+    row_spans,
+    running_sums,
+)
 from neuprim.core.render.cuda.block_ops import any_tile_thread, int_at, pixel_hit_at, set_pixel_hit, span_of
 from neuprim.core.render.cuda.chord import (
     chord_edge_profiles,
@@ -353,30 +359,32 @@ class KernelArrays:
         return self.ids, self.tile_of, self.spans, self.offsets
 
 
-def _marked_pairs(marked: Tensor, count: int) -> Tensor:
-    """Return the indices, (count,) int32, of the ``count`` True values of a mask; does not synchronise."""
-    place = torch.where(marked, torch.cumsum(marked, 0) - 1, count)
-    numbers = torch.arange(marked.shape[0], dtype=torch.int32, device=marked.device)
-    return torch.empty(count + 1, dtype=torch.int32, device=marked.device).index_copy_(0, place, numbers)[:count]
+def _count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -> tuple[int, Tensor, Tensor]:
+    """Return the number of slots, (pairs + 1,) first slots, and float64 pairs; -1 follows the latter.
 
-
-def _count_slots(frame: Frame, counts: Tensor) -> tuple[int, Tensor, Tensor]:
-    """Return slot count, (pairs + 1,) first slots, float64 pairs. Synchronises. BackendUnavailable: too many slots."""
-    in_float64 = torch.empty(0, dtype=torch.int32, device=frame.device)
-    offsets = torch.zeros(len(counts) + 1, dtype=torch.int32, device=frame.device)
-    ends = torch.cumsum(counts, 0, dtype=torch.int64)
-    offsets[1:] = ends
-    if frame.wide.shape[0] > 0:
-        marked = frame.slots[frame.lists.ids] >= 0
-        total, few = torch.stack((ends[-1], marked.sum())).tolist()
-        in_float64 = _marked_pairs(marked, few)
+    Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many slots.
+    """
+    device, pairs = frame.device, counts.shape[1]
+    ends = running_sums(counts)
+    offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
+    offsets[1:] = ends[0]
+    if capacity is None:
+        total, few = ends[:, -1].tolist()
+        if total >= _MAX_HITS:
+            raise BackendUnavailable(
+                f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
+                f"image"
+            )
     else:
-        total = int(ends[-1])
-    if total >= _MAX_HITS:
-        raise BackendUnavailable(
-            f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
-            f"image"
-        )
+        total, few = capacity.slots, capacity.float64_pairs
+        starts, sizes = frame.lists.starts, wp.vec4i(capacity.pairs, capacity.in_float64, total, few)
+        sums = (warp_array(frame.ends), warp_array(ends), warp_array(frame.bad))
+        inputs = (*sums, sizes, warp_array(starts), warp_array(capacity.refused))
+        launch_kernel(refuse_frame, len(starts), inputs, device)
+    in_float64 = torch.full((few,), -1, dtype=torch.int32, device=device)
+    if few:
+        inputs = tuple(warp_array(x) for x in (frame.lists.starts, counts, ends, in_float64))
+        launch_kernel(list_float64_pairs, pairs, inputs, device)
     return total, offsets, in_float64
 
 
@@ -388,25 +396,29 @@ def composite_frame(
     settings: RenderSettings,
     differentiable: bool,
     images: int = 1,
+    capacity: FrameCapacity | None = None,
 ) -> CompositedFrame:
-    """Composite one image, or several (without gradients, sorted by centres). Synchronises if slots are needed."""
+    """Composite one image, or several (without gradients, sorted by centres).
+
+    Waits for the device if slots are needed and there is no ``capacity``.
+    """
     lists, device, camera = frame.lists, frame.device, frame.projection.camera
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
 
     def empty(*shape: int, dtype: torch.dtype = torch.float32) -> Tensor:
         return torch.empty(shape, dtype=dtype, device=device)
 
-    spans, counts = empty(pairs, L.TILE, dtype=torch.int16), empty(pairs, dtype=torch.int32)
+    spans, counts = empty(pairs, L.TILE, dtype=torch.int16), empty(2, pairs, dtype=torch.int32)
     offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
     a = KernelArrays(frame, net, settings, spans, offsets)
     silhouettes = (warp_array(frame.spans), array(frame.boxes, wp.vec4i))
-    inputs = (a.rows, *silhouettes, a.ids, a.tile_of, a.size, a.spans, warp_array(counts))
+    inputs = (a.rows, *silhouettes, a.starts, a.ids, a.tile_of, a.size, a.spans, warp_array(counts))
     launch_kernel(row_spans, pairs, inputs, device)
     sorts = settings.sort == "entry"
-    keep = differentiable or sorts or frame.wide.shape[0] > 0
+    keep = differentiable or sorts or frame.wide.shape[0] > 0 or capacity is not None
     total, in_float64 = 0, empty(0, dtype=torch.int32)
     if keep and pairs:
-        total, offsets, in_float64 = _count_slots(frame, counts)
+        total, offsets, in_float64 = _count_slots(frame, counts, capacity)
         a.offsets = warp_array(offsets)
     hits, depths = empty(total, 2), empty(total if settings.depth else 0)
     hues = empty(total if net is not None else 0, form.channels)

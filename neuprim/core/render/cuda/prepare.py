@@ -337,6 +337,8 @@ class Frame:
     depth: Tensor  # (N,) float64, camera z of the centres
     status: Tensor  # (N,) uint8, VISIBLE or CULLED
     lists: TileLists  # which primitives reach which tile
+    ends: Tensor  # (2, N) int64, running sums of the tiles reached and of the primitives in float64
+    bad: Tensor  # (1,) int32, the first primitive that is not finite, or N
 
     @property
     def device(self) -> torch.device:
@@ -371,7 +373,7 @@ def prepare_frame(
     forced: Tensor | None = None,
     images: tuple[Tensor, int] | None = None,
 ) -> Frame:
-    """Return the data of one view for the pixel kernels; synchronises with the device once.
+    """Return the data of one view for the pixel kernels; waits for the device once if ``request`` has no capacity.
 
     Args:
         palette: (N, C) colours.
@@ -407,11 +409,12 @@ def prepare_frame(
     asked = None if forced is None else array(forced.contiguous(), wp.bool)
     arguments = (*inputs, colours, asked, *view, *size, *filled)
     launch_kernel(project_primitives_kernel(double), N, arguments, device, PER_BLOCK)
-    counted = count_tiles(counts, bad)
+    counted = count_tiles(counts, bad, request.capacity)
     if counted.bad >= 0:
         raise NotFinitePrimitive(counted.bad)
     tile_lists, slots, which = bin_primitives(rows, spans, boxes, depth, counts, counted, camera, images)
     wide = empty(counted.in_float64, L.wide_width(K), dtype=torch.float64)
     wanted = (array(which, wp.int32), *inputs, *view, projection.near, projection.turns, K, array(wide, wp.float64))
     launch_kernel(wide_kernel(double), counted.in_float64, wanted, device, PER_BLOCK)
-    return Frame(projection, parameters, rows, wide, slots, which, spans, boxes, depth, status, tile_lists)
+    made = (rows, wide, slots, which, spans, boxes, depth, status, tile_lists, counted.ends, bad)
+    return Frame(projection, parameters, *made)

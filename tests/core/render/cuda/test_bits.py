@@ -46,7 +46,7 @@ def _tile_by_tile(
 ) -> None:
     """Tiles one at a time, the last first: what a launch leaves of the others is thrown away."""
     args = Args(kernel, inputs)
-    if "starts" in args:
+    if "starts" in args and "reached" in args:
         starts = args.tensor("starts")
         size = args.values[args.names.index("size")]
         across, pixels = -(-size[0] // L.TILE), torch.arange(size[0] * size[1])

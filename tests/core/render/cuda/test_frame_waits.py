@@ -52,9 +52,9 @@ def test_a_frame_waits_this_often(kind: str, expected: int, monkeypatch: pytest.
     low.geometry.means.requires_grad_(kind == "gradients")
     genuine = backend.composite_frame
 
-    def reading(frame: Any, *rest: Any) -> Any:
+    def reading(frame: Any, *rest: Any, **more: Any) -> Any:
         assert float(frame.rows.sum()) != 0.5 and len(frame.rows[frame.rows > 0]) > 0
-        return genuine(frame, *rest)
+        return genuine(frame, *rest, **more)
 
     if kind == "reads":
         monkeypatch.setattr(backend, "composite_frame", reading)

@@ -1,0 +1,120 @@
+"""Results of training steps and of their views."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import torch
+from torch import Tensor
+
+from neuprim.core.render.output import Contributions
+from neuprim.core.train.training_views import PixelStride
+
+
+@dataclass(frozen=True)
+class StepReport:
+    """Result of one training step.
+
+    On a GPU, the first look at ``loss``, ``parts`` or ``psnr`` waits for the step to end.
+
+    Attributes:
+        seconds: training time up to the end of this step.
+        psnr: PSNR of the training view (mean over views), or of the extinction at points in a step without views.
+        change: text about what population control changed; None if nothing.
+    """
+
+    step: int
+    seconds: float
+    loss: float
+    parts: dict[str, float]
+    psnr: float
+    primitives: int
+    view: str
+    change: str | None
+
+    @classmethod
+    def pending(cls, settle: Callable[[], None], **known: Any) -> StepReport:
+        """Return a report without loss, parts and psnr; ``settle`` calls :meth:`resolve` with them."""
+        report = cls.__new__(cls)
+        report.__dict__.update(known, _settle=settle)
+        return report
+
+    def resolve(self, loss: float, parts: dict[str, float], psnr: float) -> None:
+        """Fill a pending report."""
+        self.__dict__.update(loss=loss, parts=parts, psnr=psnr)
+
+    def __getattr__(self, name: str) -> Any:
+        if name not in ("loss", "parts", "psnr") or "_settle" not in self.__dict__:
+            raise AttributeError(name)
+        self.__dict__["_settle"]()
+        return self.__dict__[name]
+
+
+class ViewTask(NamedTuple):
+    """A training view to render: its index, background and pixels, and the index of the next view, if known."""
+
+    view: int
+    background: Tensor
+    stride: PixelStride
+    upcoming: int | None
+
+
+class ViewResult(NamedTuple):
+    """Results of one view of a step.
+
+    Attributes:
+        loss: the view's part of the step's loss; the part of the last view includes points and regularisers.
+        gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
+        correction: gradient of the view's corrections; None without them.
+    """
+
+    view: int
+    name: str
+    loss: float
+    psnr: float
+    parts: dict[str, float]
+    point_parts: dict[str, float]
+    gain: list[float] | None
+    correction: list[float] | None
+
+
+@dataclass
+class RenderedView:
+    """A rendered view and its loss; the backward pass fills ``contributions``."""
+
+    loss: Tensor
+    parts: dict[str, float | Tensor]
+    squared: Tensor  # sum of squared errors
+    counted: int | Tensor  # numbers that count
+    name: str
+    truth: Tensor
+    contributions: Contributions
+
+    def numbers(self, cost: Tensor) -> Tensor:
+        """Return ``cost``, ``squared``, ``counted`` and the parts as one float64 tensor, which takes one wait."""
+        values = (cost.detach(), self.squared, self.counted, *self.parts.values())
+        like = self.squared
+        return torch.stack(
+            [x.detach().double() if isinstance(x, Tensor) else like.new_full((), x, dtype=torch.float64) for x in values]
+        )
+
+
+def summarize_numbers(
+    numbers: Sequence[float], parts: Sequence[str]
+) -> tuple[float, dict[str, float], float]:
+    """Return loss, parts by name and PSNR from :meth:`RenderedView.numbers`."""
+    cost, squared, counted, *values = numbers
+    mse = squared / counted
+    psnr = -10 * math.log10(max(mse, 1e-20)) if math.isfinite(mse) else math.nan
+    return cost, dict(zip(parts, values, strict=False)), psnr
+
+
+def summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
+    """Return summed loss, mean parts, mean PSNR and name of a step, from the results of its views."""
+    last, count = views[-1], len(views)
+    parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}
+    name = last.name if count == 1 else f"{last.name} and {count - 1} more"
+    return sum(view.loss for view in views), parts | last.point_parts, sum(view.psnr for view in views) / count, name

@@ -1,0 +1,129 @@
+"""Recorded training steps, run here on Warp's CPU blocks without a graph: the bits of steps that are not recorded."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor
+
+pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
+
+from neuprim.core.compute import device
+from neuprim.core.errors import NonFiniteError
+from neuprim.core.model.cosine import CosineDensity
+from neuprim.core.render import RenderSettings
+from neuprim.core.render.cuda.binning import FrameCapacity
+from neuprim.core.train.initial_model import initial_model_to_train
+from neuprim.core.train.losses import photometric
+from neuprim.core.train.recorded_steps import StepRecorder
+from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
+from neuprim.core.train.step_results import StepReport
+from neuprim.core.train.trainer import Trainer
+from neuprim.tasks.static import SphericalHarmonics
+from tests.core import tiny
+
+pytestmark = pytest.mark.filterwarnings("ignore:renderer.backend=cuda is slow on the cpu")
+STEPS = 24
+
+
+@pytest.fixture(autouse=True)
+def kernels_of_a_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Losses, colours and Adam by the Warp kernels, in steps that are not recorded too."""
+    monkeypatch.setattr(device, "on_numba", lambda *tensors: False)
+    monkeypatch.setattr(device, "on_warp", lambda *tensors: True)
+
+
+def trainer(recorded: bool, near: float = 0.05, **settings: Any) -> Trainer:
+    data = tiny.two_primitives(random_background=True)
+    population = PopulationSettings(every=9, start=0.0, stop=1.0, fraction=0.2)
+    train = TrainSettings(iterations=STEPS, population=population, **settings)
+    density = CosineDensity(4, edge=2)  # chords that the near plane cuts are integrated in float64
+    model = initial_model_to_train(density, SphericalHarmonics(1, 3, 0.25), data, ModelSettings(primitives=12), 0)
+    renderer = RenderSettings(backend="cuda", device="cpu", near=near)
+    made = Trainer(model, data, photometric({"ssim_weight": 0.2}), train, renderer, 0)
+    assert made.recorder is None, "without a GPU"
+    made.recorder = StepRecorder(made) if recorded else None
+    return made
+
+
+def state(made: Trainer) -> dict[str, Tensor]:
+    return {name: value.clone() for name, value in made.state()[0].items()}
+
+
+def reports(made: Trainer) -> list[StepReport]:
+    return [replace(report, seconds=0.0) for report in list(made.run())]
+
+
+def assert_same(one: Trainer, other: Trainer) -> None:
+    mine, theirs = state(one), state(other)
+    assert mine.keys() == theirs.keys()
+    assert not [name for name, value in mine.items() if not torch.equal(value, theirs[name])]
+
+
+@pytest.mark.parametrize("near", [0.05, 2.0], ids=["in front", "cut by the near plane, in float64"])
+def test_recorded_steps_are_the_steps_bit_for_bit(near: float) -> None:
+    """With interventions of the population and a band of harmonics that becomes active."""
+    plain, fast = (trainer(recorded, near, anisotropy_weight=0.1, anisotropy_from=11) for recorded in (False, True))
+    expected, found = reports(plain), reports(fast)
+    assert fast.recorder is not None and fast.recorder.replayed >= STEPS // 2
+    assert expected == found and any(report.change for report in found)
+    assert_same(plain, fast)
+    capacity = fast.recorder.capacity
+    assert capacity is not None and (capacity.float64_pairs > 256) == (near > 1)
+
+
+@pytest.mark.parametrize("small", range(4), ids=["pairs", "in_float64", "slots", "float64_pairs"])
+def test_a_step_that_does_not_fit_is_taken_again(small: int) -> None:
+    """With larger arrays; the steps after it, which changed nothing, are taken again too."""
+    plain, fast = trainer(False, 2.0), trainer(True, 2.0)
+    assert fast.recorder is not None
+    expected, found = reports(plain), []
+    for _ in range(STEPS):
+        found.append(fast.train_step())
+        if fast.step == 4:
+            fast.settle()
+            held = fast.recorder.capacity
+            assert held is not None
+            sizes = [held.pairs, held.in_float64, held.slots, held.float64_pairs]
+            sizes[small] = 1
+            fast.recorder.capacity = FrameCapacity(*sizes, held.refused)
+    assert fast.recorder.repeated > 0 and [replace(report, seconds=0.0) for report in found] == expected
+    assert_same(plain, fast)
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "w2"])
+def test_numbers_that_are_not_finite_are_refused_with_their_step(name: str) -> None:
+    made = trainer(True)
+    for _ in range(6):
+        made.train_step()
+    assert made.recorder is not None and made.recorder.replayed > 0
+    before = state(made)
+    made.model.params[name].detach()[3] = torch.nan
+    with pytest.raises(NonFiniteError, match=f"{name} of primitive 3 is not finite"):
+        for _ in range(3):
+            made.train_step()
+        made.settle()
+    after = {key: value for key, value in state(made).items() if key.startswith("params")}
+    after[f"params.{name}"][3] = before[f"params.{name}"][3]
+    assert all(torch.equal(value, before[key]) for key, value in after.items()), "nothing else changed"
+
+
+def test_a_loss_or_field_of_others_is_not_recorded() -> None:
+    from neuprim.core.train.recorded_steps import recording_fault
+
+    made = trainer(False)
+    made.device = torch.device("cuda")
+    assert recording_fault(made) == "the renderer is not the cuda backend" or recording_fault(made) is None
+    made.current_model.density.stage = None
+    assert recording_fault(made) is not None
+
+
+def test_a_report_waits_when_it_is_read() -> None:
+    made = trainer(True)
+    found = [made.train_step() for _ in range(6)]
+    assert "loss" not in vars(found[-1]) and found[-1].psnr > 0 and "loss" in vars(found[-2])
+    with pytest.raises(AttributeError):
+        found[-1].unknown  # noqa: B018

@@ -61,8 +61,8 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         yield "prepare, backward", prepare_backward._prepare_backward_kernel(False), PER_BLOCK
         yield "rows in float64", prepare.wide_kernel(False), PER_BLOCK
         yield "network units", colour_net._colour_net_kernels(False)[0], PER_BLOCK
-        yield "emit", binning._binning_kernels()[0], PER_BLOCK
-        yield "list", binning._binning_kernels()[1], BLOCK
+        yield "emit", binning._binning_kernels(True)[0], PER_BLOCK
+        yield "list", binning._binning_kernels(True)[1], BLOCK
         yield "spans", binning.row_spans, BLOCK
         yield "sums", backward.sum_pairs, BLOCK
         yield "float64 pairs", float64.float64_opacity_kernel(False), L.WARP
@@ -70,7 +70,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
     if name == BESIDE:
         for title, made in (
             ("harmonics", colours_warp._harmonic_kernels(3)),
-            ("Adam", kernels_warp.adam_kernels()),
+            ("Adam", (kernels_warp.check_adam_gradient, kernels_warp.take_adam_step)),
             ("SSIM", kernels_warp.ssim_loss_kernels()),
         ):
             for number, kernel in enumerate(made, 1):

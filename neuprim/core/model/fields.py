@@ -97,7 +97,8 @@ class Field(ABC):
     stage: Hashable | None = None
     """What ``lower`` depends on besides its arguments, such as the number of active SH bands: while it stays the same,
     training steps may be replayed as a CUDA graph. None: steps are never recorded. A field with a stage computes with
-    torch operations on the device alone, and never waits for it."""
+    torch operations on the device alone, never waits for it, and lowers to zero density where ``active_rows`` leaves a
+    primitive out."""
 
     @abstractmethod
     def parameters(self) -> list[ParameterSpec]:

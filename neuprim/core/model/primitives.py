@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from neuprim.core.cameras.pinhole import AnyCamera
+from neuprim.core.compute import device
 from neuprim.core.errors import ConfigError, FormError, NonFiniteError, nearest
 from neuprim.core.model.checks import (
     check_active_primitive_rows,
@@ -237,7 +238,9 @@ class Primitives:
         Raises:
             FormError: a field returned tensors of a wrong type, shape or device.
         """
-        active = self.active(conditions)
+        # a GPU renders primitives without extinction faster than it counts the others
+        everything = self.density.stage is not None and device.on_warp(self.params["means"])
+        active = self.active(conditions, everything=everything)
         geometry, (density, sizes) = (
             active.geometry,
             self._lower_density(active),
@@ -274,8 +277,11 @@ class Primitives:
         return Primitives(self.density, self.colour, {**self.params, **scaled})
 
     @torch.no_grad()
-    def limit(self, largest: float) -> None:
-        """Scale the densities of primitives in place, so that none exceeds the extinction ``largest``, 1/scene unit."""
+    def limit(self, largest: float, when: Tensor | None = None) -> None:
+        """Scale the densities of primitives in place, so that none exceeds the extinction ``largest``, 1/scene unit.
+
+        ``when``: (1,) bool on the device; False leaves all as they are.
+        """
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
         if found is None:
@@ -283,11 +289,16 @@ class Primitives:
         scaled = self.density.scale_density(own, (largest / found).clamp_max(1))
         for name, value in scaled.items():
             if value is not own[name]:
-                own[name].copy_(value)
+                own[name].copy_(value if when is None else torch.where(when, value, own[name]))
 
-    def active(self, conditions: Conditions, dtype: torch.dtype | None = None) -> ActivePrimitives:
-        """Return the active primitives of a frame; differentiable. With ``dtype``, detached and of this dtype."""
-        rows = self.density.active_rows(self.of(self.density), conditions)
+    def active(
+        self, conditions: Conditions, dtype: torch.dtype | None = None, everything: bool = False
+    ) -> ActivePrimitives:
+        """Return the active primitives of a frame; differentiable. With ``dtype``, detached and of this dtype.
+
+        ``everything``: keep the others, too.
+        """
+        rows = None if everything else self.density.active_rows(self.of(self.density), conditions)
         params = self.params
         if rows is not None:
             from neuprim.core.model.rows import take_primitive_rows  # numba, loaded when first needed

@@ -1,12 +1,10 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
-"""Warp kernels for training steps on a GPU: Adam in two launches, and L1 + SSIM with its gradient in four.
+"""Warp kernels for training steps on a GPU: Adam in two launches a parameter, and L1 + SSIM with its gradient in four.
 
-In torch, a step of Adam takes about a hundred launches, longer than rendering a small frame. For the derivation of
-SSIM's gradient see :mod:`neuprim.core.train.ssim_cpu`. Warp is imported with this module.
+For the derivation of SSIM's gradient see :mod:`neuprim.core.train.ssim_cpu`. Warp is imported with this module.
 """
 
 import functools
-import itertools
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -14,83 +12,43 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import OPTIONS, array, launch_kernel, wp
+from neuprim.core.compute.warp import OPTIONS, Floats, Ints, Longs, array, launch_kernel, wp
 from neuprim.core.train.ssim_cpu import SSIM_TAPS, SSIM_WINDOW
 
 # ---------------------------------------------------------------- Adam
 
-LAUNCH_PARAMETERS = 16
 
-_POINTERS = wp.types.vector(length=LAUNCH_PARAMETERS, dtype=wp.uint64)
-_LONGS = wp.types.vector(length=LAUNCH_PARAMETERS, dtype=wp.int64)
-
-_FINITE_CODE = """
-    return isfinite(reinterpret_cast<const float*>(grad)[i]) ? 1 : 0;
-"""
-_STEP_CODE = """
-    const float g = reinterpret_cast<const float*>(grad)[i];
-    float& m = reinterpret_cast<float*>(first)[i];
-    float& v = reinterpret_cast<float*>(second)[i];
-    m = beta1 * m + rest1 * g;
-    v = beta2 * v + rest2 * g * g;
-    reinterpret_cast<float*>(value)[i] -= step * m / (sqrtf(v) * slow + 1e-15f);
-"""
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+def check_adam_gradient(grad: Floats, refused: Ints):
+    """Set ``refused`` if a gradient is not finite; one thread per number."""
+    if not wp.isfinite(grad[wp.tid()]):
+        refused[0] = 1  # whichever thread writes it
 
 
-@wp.func_native(_FINITE_CODE)
-def _finite_gradient(grad: wp.uint64, i: wp.int64) -> int: ...
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+def take_adam_step(
+    value: Floats, grad: Floats, first: Floats, second: Floats, width: int, rates: Floats, parameter: int,
+    beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: Longs, refused: Ints,
+):  # fmt: skip
+    """Take an Adam step unless ``refused`` is set; one thread per number.
 
-
-@wp.func_native(_STEP_CODE)
-def _step_number(
-    value: wp.uint64, grad: wp.uint64, first: wp.uint64, second: wp.uint64, i: wp.int64, step: float, slow: float,
-    beta1: float, beta2: float, rest1: float, rest2: float,
-): ...  # fmt: skip
-
-
-@functools.cache
-def adam_kernels() -> tuple[Any, Any]:
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
-    def check(grads: _POINTERS, ends: _LONGS, bad: wp.array(dtype=wp.int32)):
-        """Set ``bad`` if a gradient is not finite; one thread per element. ``ends``: cumulative sizes of parameters."""
-        n = wp.int64(wp.tid())
-        k = int(0)
-        begin = wp.int64(0)
-        while n >= ends[k]:
-            begin = ends[k]
-            k += 1
-        if _finite_gradient(grads[k], n - begin) == 0:
-            bad[0] = 1  # whichever thread writes it
-
-    @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
-    def step_numbers(
-        values: _POINTERS, grads: _POINTERS, firsts: _POINTERS, seconds: _POINTERS, ends: _LONGS, widths: _LONGS,
-        rates: wp.array(dtype=float), first_rate: int,
-        beta1: float, beta2: float, rest1: float, rest2: float, log1: float, log2: float, age: wp.array(dtype=wp.int64),
-        bad: wp.array(dtype=wp.int32),
-    ):  # fmt: skip
-        """Take an Adam step unless ``bad`` is set; one thread per element.
-
-        ``widths``: elements per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of
-        the betas; ``age``: steps of each row before this one; ``first_rate``: place of the first rate in ``rates``.
-        """
-        n = wp.int64(wp.tid())
-        if bad[0] == 0:
-            k = int(0)
-            begin = wp.int64(0)
-            while n >= ends[k]:
-                begin = ends[k]
-                k += 1
-            i = n - begin
-            t = float(age[int(i / widths[k])]) + 1.0
-            step = rates[first_rate + k] / (1.0 - wp.exp(log1 * t))
-            slow = wp.sqrt(1.0 / (1.0 - wp.exp(log2 * t)))
-            if t * log2 > -0.25:  # the difference would cancel: 1 - exp(x) = -x (1 + x/2 (1 + x/3 (1 + x/4 (1 + x/5))))
-                x = t * log2
-                slow = wp.sqrt(1.0 / (-x * (1.0 + x * 0.5 * (1.0 + x / 3.0 * (1.0 + x * 0.25 * (1.0 + x * 0.2))))))
-            _step_number(values[k], grads[k], firsts[k], seconds[k], i, step, slow, beta1, beta2, rest1, rest2)
-
-    return check, step_numbers
+    ``width``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of the
+    betas; ``age``: steps of each row before this one.
+    """
+    i = wp.tid()
+    if refused[0] == 0:
+        t = float(age[i // width]) + 1.0
+        step = rates[parameter] / (1.0 - wp.exp(log1 * t))
+        slow = wp.sqrt(1.0 / (1.0 - wp.exp(log2 * t)))
+        if t * log2 > -0.25:  # the difference would cancel: 1 - exp(x) = -x (1 + x/2 (1 + x/3 (1 + x/4 (1 + x/5))))
+            x = t * log2
+            slow = wp.sqrt(1.0 / (-x * (1.0 + x * 0.5 * (1.0 + x / 3.0 * (1.0 + x * 0.25 * (1.0 + x * 0.2))))))
+        g = grad[i]
+        m = beta1 * first[i] + rest1 * g
+        v = beta2 * second[i] + rest2 * g * g
+        first[i] = m
+        second[i] = v
+        value[i] -= step * m / (wp.sqrt(v) * slow + 1e-15)
 
 
 def adam_rows(
@@ -105,26 +63,15 @@ def adam_rows(
         age: (N,) int64, steps of each row before this one; grows by 1.
         refused: (1,) int32.
     """
-    device = age.device
-    check, step_numbers = adam_kernels()
-    grads = [g.contiguous() for g in grads]
-    groups = []
-    for at in range(0, len(values), LAUNCH_PARAMETERS):
-        some = slice(at, at + LAUNCH_PARAMETERS)
-        ends = list(itertools.accumulate(value.numel() for value in values[some]))
-        total, spare = ends[-1], LAUNCH_PARAMETERS - len(ends)
-        pointers = [
-            _POINTERS(*[x.data_ptr() for x in group[some]], *[0] * spare) for group in (values, grads, firsts, seconds)
-        ]
-        widths = _LONGS(*[value[0].numel() for value in values[some]], *[1] * spare)
-        groups.append((total, pointers, _LONGS(*ends, *[total + 1] * spare), widths, at))
-    flag = array(refused, wp.int32)
-    for total, pointers, ends_, _, _ in groups:
-        launch_kernel(check, total, (pointers[1], ends_, flag), device)
+    device, flag = age.device, array(refused, wp.int32)
+    flat = [tuple(array(x.contiguous().view(-1), wp.float32) for x in each) for each in zip(
+        values, grads, firsts, seconds, strict=True)]  # fmt: skip
+    for value, (_, grad, _, _) in zip(values, flat, strict=True):
+        launch_kernel(check_adam_gradient, value.numel(), (grad, flag), device)
     constants = (*betas, *(1 - beta for beta in betas), *map(math.log, betas), array(age, wp.int64), flag)
-    for total, pointers, ends_, widths, at in groups:
-        own = (array(rates, wp.float32), at)
-        launch_kernel(step_numbers, total, (*pointers, ends_, widths, *own, *constants), device)
+    for at, (value, arrays) in enumerate(zip(values, flat, strict=True)):
+        own = (value[0].numel(), array(rates, wp.float32), at)
+        launch_kernel(take_adam_step, value.numel(), (*arrays, *own, *constants), device)
     age += refused == 0
 
 

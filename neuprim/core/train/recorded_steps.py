@@ -285,7 +285,8 @@ class StepRecorder:
         weight, error = (torch.where(accepted, x, 0.0) for x in rendered.contributions.of_all(model.count))
         trainer.population.observe(model, Contributions(weight, error))
         trainer.optimizer.step_recorded(model.params, rates, self._refused)
-        trainer.limit_model()
+        accepted = self._refused == 0
+        trainer.limit_model(accepted)
         parts = tuple(rendered.parts)
         return torch.cat([self._refused.double(), rendered.numbers(loss)]), parts
 

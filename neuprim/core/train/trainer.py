@@ -407,10 +407,10 @@ class Trainer:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(log_scales)
         return loss
 
-    def limit_model(self) -> None:
+    def limit_model(self, when: Tensor | None = None) -> None:
         """Limit the extinction of the primitives to the largest of the data, if the data have one."""
         if self.dataset.largest is not None:
-            self.current_model.limit(self.dataset.largest)
+            self.current_model.limit(self.dataset.largest, when)
 
     def _backward(
         self, loss: Tensor, view: RenderedView | None, points: PointLossResult | None

@@ -51,6 +51,10 @@ class TimeHarmonics(ColourField):
         self.powers, self.waves, self.frequencies = powers, waves, frequencies
         self.active = degree
 
+    @property
+    def stage(self) -> int:  # type: ignore[override]
+        return self.active
+
     def settings(self) -> dict[str, Any]:
         names = ("degree", "channels", "powers", "waves", "frequencies")
         return {name: getattr(self, name) for name in names}

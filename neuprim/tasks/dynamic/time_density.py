@@ -108,6 +108,7 @@ class TimeDensity(DensityField):
     """
 
     init_settings = (*CosineDensity.init_settings, "window", "window_frames", "rate")
+    stage = 0
 
     def __init__(
         self, neurons: int = 8, time: str = "phase", omega0: float = OMEGA0, edge: int = 0, gain: bool = False,

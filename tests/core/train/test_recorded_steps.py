@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import pytest
@@ -11,8 +12,10 @@ from torch import Tensor
 
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
+from neuprim.config import compose
 from neuprim.core.compute import device
 from neuprim.core.errors import NonFiniteError
+from neuprim.core.io.vdb import write_vdb
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda.binning import FrameCapacity
@@ -22,8 +25,10 @@ from neuprim.core.train.recorded_steps import StepRecorder
 from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
 from neuprim.core.train.step_results import StepReport
 from neuprim.core.train.trainer import Trainer
+from neuprim.runs.fit import prepare_training
 from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
+from tests.tasks.dynamic.sequences import blob
 
 pytestmark = pytest.mark.filterwarnings("ignore:renderer.backend=cuda is slow on the cpu")
 STEPS = 24
@@ -73,6 +78,24 @@ def test_recorded_steps_are_the_steps_bit_for_bit(near: float) -> None:
     assert_same(plain, fast)
     capacity = fast.recorder.capacity
     assert capacity is not None and (capacity.float64_pairs > 256) == (near > 1)
+
+
+def test_steps_of_volumes_are_recorded_between_looks_at_voxels(tmp_path: Path) -> None:
+    """With windows in time, extinction limited to that of the files, and a time of each view."""
+    folder = tmp_path / "ball"
+    folder.mkdir()
+    for number in range(1, 4):
+        write_vdb(folder / f"ball_{number}.vdb", blob(6.0 + 3 * number))
+    words = "task=dynamic scene=vdb scene.look=smoke_fire scene.size=24 scene.cameras=4 scene.samples=1".split()
+    words += [f"scene.vdb='{folder}'", "model.primitives=80", "train.voxels_every=4", "train.iterations=20"]
+    words += ["renderer.backend=cuda", "renderer.device=cpu", "train.population.every=9", "train.population.start=0.0"]
+    plain = prepare_training(compose([*words, f"output_dir={tmp_path / 'run'}"]))
+    fast = prepare_training(plain.config, dataset=plain.dataset).trainer
+    fast.recorder = StepRecorder(fast)
+    expected, found = reports(plain.trainer), reports(fast)
+    assert fast.dataset.largest is not None and fast.recorder.replayed >= 8
+    assert found == expected and any("voxel_sigma" in report.parts for report in found)
+    assert_same(plain.trainer, fast)
 
 
 @pytest.mark.parametrize("small", range(4), ids=["pairs", "in_float64", "slots", "float64_pairs"])

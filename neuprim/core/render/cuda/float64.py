@@ -231,7 +231,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
         pairs: Ints, wide: Doubles2d, slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints,
         lens: wp.vec4, limits: wp.vec4, size: wp.vec2i, neurons: int, edge: int, hits: Vec2s, depths: Floats,
     ):  # fmt: skip
-        """Store the opacities of ``pairs``, one warp each; ``slots[i]``: the row of primitive i in ``wide``."""
+        """Store the opacities of ``pairs``, one block each; ``slots[i]``: the row of primitive i in ``wide``."""
         member, lane = wp.tid()
         n, r = pairs[member], int(-1)
         if n >= 0:  # -1 fills the list
@@ -239,7 +239,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
         if r >= 0:
             across = (size[0] + L.TILE - 1) // L.TILE
             tx, ty, begin = (tiles[n] % across) * L.TILE, (tiles[n] // across) * L.TILE, offsets[n]
-            for s in range(lane, offsets[n + 1] - begin, wp.static(L.WARP)):
+            for s in range(lane, offsets[n + 1] - begin, wp.static(L.PIXELS)):
                 at = pixel_of_slot(spans, n, s)
                 X, Y = tx + at[0], ty + at[1]
                 c = intersect_chord64(wide, r, X, Y)

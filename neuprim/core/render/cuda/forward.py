@@ -426,7 +426,8 @@ def composite_frame(
         few, which = (len(in_float64), L.WARP), warp_array(in_float64)
         kept = (array(hits, wp.vec2), warp_array(depths))
         wide = (which, a.wide, a.slots, *a.covered, a.lens, a.limits, a.size, form.neurons, form.edge, *kept)
-        launch_kernel(float64_opacity_kernel(settings.depth), few, wide, device, L.WARP)
+        dims = (len(in_float64), L.PIXELS)
+        launch_kernel(float64_opacity_kernel(settings.depth), dims, wide, device, L.PIXELS)
         if net is not None and net.hidden:
             units = (array(net.wide, wp.vec4d), a.units, a.rows, L.rasterizer_colour_column(form.neurons), net.hidden)
             wide = (which, a.wide, *units, a.slots, *a.covered, a.size, warp_array(hues))

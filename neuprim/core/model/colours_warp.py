@@ -144,7 +144,8 @@ class _HarmonicColors(torch.autograd.Function):
             array(color, wp.float32),
         )
         launch_kernel(_harmonic_kernels(degree)[0], len(means), arrays, means.device)
-        ctx.tensors, ctx.degree, ctx.origin = (means, rest, centre, color), degree, (origin.dtype, origin.device)
+        ctx.tensors = means, rest, centre, color.detach()  # the output itself would be a cycle
+        ctx.degree, ctx.origin = degree, (origin.dtype, origin.device)
         return color
 
     @staticmethod
@@ -272,7 +273,7 @@ class _LobeColors(torch.autograd.Function):
         means, dc, amplitude, axis, log_sharpness, origin = (x.detach().contiguous() for x in tensors)
         centre = device.to_device_like(origin.double(), means.double())
         color = torch.empty(dc.shape, dtype=torch.float32, device=dc.device)
-        ctx.tensors = (means, amplitude, axis, log_sharpness, centre, color)
+        ctx.tensors = (means, amplitude, axis, log_sharpness, centre, color.detach())  # the output itself would be a cycle
         ctx.origin = (tensors[-1].dtype, tensors[-1].device)
         launch_kernel(
             _lobe_forward, len(means),

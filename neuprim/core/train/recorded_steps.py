@@ -243,8 +243,6 @@ class StepRecorder:
                     take_step()
                 program.run = graph.replay
                 graph.replay()
-            for value in trainer.current_model.params.values():
-                value.grad = None  # in the memory of the graph
 
         program.run = record if self._on_gpu else take_step
         return program
@@ -271,24 +269,25 @@ class StepRecorder:
 
     def _take_step(self, view: View, pixels: Pixels, rest: Tensor) -> tuple[Tensor, tuple[str, ...]]:
         """Take a step on the device; return (refused, numbers...) and the names of the loss's parts."""
-        trainer, model = self.trainer, self.trainer.current_model
+        trainer, model, params = self.trainer, self.trainer.current_model, self.trainer.current_model.params
         background, rates = rest[: trainer.dataset.channels].float(), rest[trainer.dataset.channels :].float()
-        for value in model.params.values():
-            value.grad = None
-        rendered = trainer.compare_view(view, pixels, background, 0.0, self._draw)
-        loss = trainer.total_loss(rendered.loss / 1)
-        torch.maximum(self._refused, (~loss.detach().isfinite()).int().reshape(1), out=self._refused)
-        wanted = [value for value in model.params.values() if value.numel()]
-        for value, grad in zip(wanted, torch.autograd.grad(loss, wanted, allow_unused=True), strict=True):
-            value.grad = grad
-        accepted = self._refused == 0
-        weight, error = (torch.where(accepted, x, 0.0) for x in rendered.contributions.of_all(model.count))
-        trainer.population.observe(model, Contributions(weight, error))
-        trainer.optimizer.step_recorded(model.params, rates, self._refused)
-        accepted = self._refused == 0
-        trainer.limit_model(accepted)
-        parts = tuple(rendered.parts)
-        return torch.cat([self._refused.double(), rendered.numbers(loss)]), parts
+        # leaves of their own, as those of earlier steps may belong to another stream
+        model.params = {name: value.detach().requires_grad_() for name, value in params.items()}
+        try:
+            rendered = trainer.compare_view(view, pixels, background, 0.0, self._draw)
+            loss = trainer.total_loss(rendered.loss / 1)
+            torch.maximum(self._refused, (~loss.detach().isfinite()).int().reshape(1), out=self._refused)
+            wanted = [value for value in model.params.values() if value.numel()]
+            for value, grad in zip(wanted, torch.autograd.grad(loss, wanted, allow_unused=True), strict=True):
+                value.grad = grad
+            accepted = self._refused == 0
+            weight, error = (torch.where(accepted, x, 0.0) for x in rendered.contributions.of_all(model.count))
+            trainer.population.observe(model, Contributions(weight, error))
+            trainer.optimizer.step_recorded(model.params, rates, self._refused)
+            trainer.limit_model(self._refused == 0)
+        finally:
+            model.params = params
+        return torch.cat([self._refused.double(), rendered.numbers(loss)]), tuple(rendered.parts)
 
     def _draw(self, view: View, background: Tensor) -> RenderOutput:
         from neuprim.core.render.cuda.backend import render

@@ -239,7 +239,8 @@ class StepRecorder:
             else:
                 graph = torch.cuda.CUDAGraph()
                 self._stream.wait_stream(torch.cuda.current_stream(where))
-                with torch.cuda.graph(graph, pool=self._pool, stream=self._stream):
+                # "thread_local": another thread may be loading the next view
+                with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
                     take_step()
                 program.run = graph.replay
                 graph.replay()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import shlex
 import sys
 import time
@@ -24,6 +25,8 @@ from neuprim.config.command_settings import LOOPBACK, LauncherSettings, ViewerSe
 from neuprim.config.overrides import CommandLine
 from neuprim.runs.fit import Evaluated, Event, Finishing, Note, Preparing, Step
 from neuprim.runs.launch.jobs import JobStatus
+
+_REFRESH = 0.1  # seconds between two updates of a training's bar
 
 
 class _ProgressBar:
@@ -57,6 +60,7 @@ class RunProgress(_ProgressBar):
         self.title, self._quiet = title, search and not self.live
         self._stage, self._printed, self._started = "", -1.0, time.monotonic()
         self._smooth: float | None = None
+        self._shown = -math.inf
         self._held_out = ""
 
     def __call__(self, event: Event) -> None:
@@ -92,13 +96,17 @@ class RunProgress(_ProgressBar):
 
     def _show_step(self, event: Step) -> None:
         report, progress = event.report, event.progress
-        self._smooth = report.psnr if self._smooth is None else 0.98 * self._smooth + 0.02 * report.psnr
         if self._stage != "training":
-            self._stage, self._printed = "training", -1.0
+            self._stage, self._printed, self._shown = "training", -1.0, -math.inf
             self.bar.reset(self.task)
+        prints = not self.live and progress >= self._printed + 0.1
+        if time.monotonic() < self._shown + _REFRESH and not prints and progress < 1.0:
+            return  # reading a report waits for a GPU
+        self._shown = time.monotonic()
+        self._smooth = report.psnr if self._smooth is None else 0.9 * self._smooth + 0.1 * report.psnr
         info = f"step {report.step}  train {self._smooth:.2f} dB{self._held_out}  {report.primitives} primitives"
         self.bar.update(self.task, completed=progress, info=info)
-        if not self.live and progress >= self._printed + 0.1:
+        if prints:
             self._printed = progress
             self._print(
                 f"{progress:4.0%}  {report.seconds:6.1f} s{_format_time_left(report.seconds, progress)}  {info}"

@@ -92,7 +92,7 @@ def test_the_plugins_of_a_run(site: Path) -> None:
         (lambda value: (value.expand(2), {}), "value: found torch.float32 of shape (2,)"),
         (lambda value: (value.detach(), {}), "value: found no gradient"),
         (lambda value: (value, 3), "parts: found a int"),
-        (lambda value: (value, {"mse": value}), "part 'mse': found torch.float32"),
+        (lambda value: (value, {"mse": value.reshape(1)}), "part 'mse': found torch.float32"),
     ],
 )
 def test_a_loss_that_returns_something_else_is_named(returned: Any, text: str) -> None:

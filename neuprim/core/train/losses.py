@@ -17,8 +17,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.data import Dataset, PointSamples, ViewSet
-from neuprim.core.data.dataset_check import check_point_samples
+from neuprim.core.data import PointSamples, ViewSet
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render.output import Contributions
 from neuprim.core.task import Loss, Supervision
@@ -31,6 +30,8 @@ _WINDOW = 11
 _MAX_CPU_CHANNELS = 51
 _MU = 16.0
 _DARK = 0.05
+
+_ROWS = 65_536  # primitives whose distances from all cameras are in memory at once
 
 _COMPONENT_WEIGHT = 0.1
 """Weight of the loss of an extinction's components. It trains the primitives' shares, whose learning speed does not
@@ -138,17 +139,15 @@ class PointLossResult:
 
     Attributes:
         loss: differentiable scalar.
-        parts: named parts of the loss, for the log.
-        psnr: PSNR of the extinction at the points, relative to the largest true extinction.
-        name: name of the frame.
+        parts: named parts of the loss, for the log, one number each.
+        samples: the points and their true values.
         rows, shares: active primitives and their parts of the values, from
             :func:`~neuprim.core.volumes.points.volume_values_at`.
     """
 
     loss: Tensor
-    parts: dict[str, float]
-    psnr: float
-    name: str
+    parts: dict[str, Tensor]
+    samples: PointSamples
     rows: Tensor | None
     shares: PointShares
 
@@ -156,33 +155,33 @@ class PointLossResult:
         """Return how much each primitive contributes to the points; call this method after the backward pass."""
         return Contributions(self.shares.weight, self.shares.error_weight, self.rows)
 
+    def psnr(self) -> float:
+        """Return the PSNR of the extinction at the points, relative to the largest true extinction."""
+        peak = max(float(self.samples.sigma.max()), 1e-30) / float(self.samples.sigma_scale)
+        return -10 * math.log10(max(float(self.parts["voxel_sigma"]) / peak**2, 1e-20))
 
-def point_loss(
-    model: Primitives, dataset: Dataset, samples: PointSamples, settings: TrainSettings, threads: int = 0
-) -> PointLossResult:
+
+def point_loss(model: Primitives, samples: PointSamples, settings: TrainSettings, threads: int = 0) -> PointLossResult:
     """Compare the extinction and source radiance of a model with known values at points.
 
     The loss sums mean squared errors, each error divided by its scale. Weights: 1 for the extinction, a small one for
     each extinction component, ``train.voxel_colour`` for the source radiance.
     """
-    check_point_samples(samples, dataset)
     colour = samples.source is not None and settings.voxel_colour > 0
     found = volume_values_at(model, samples.conditions, samples.points, colour, threads)
     where = found.sigma.device
-    wrong = (found.sigma - device.copy_to_device(samples.sigma, where)) / samples.sigma_scale
+    wrong = (found.sigma - device.copy_to_device(samples.sigma, where)) * (1 / samples.sigma_scale)
     loss = wrong.square().mean()
-    parts = {"voxel_sigma": loss.item()}
+    parts = {"voxel_sigma": loss.detach()}
     if found.source is not None and samples.source is not None:
-        light = ((found.source - device.copy_to_device(samples.source, where)) / samples.source_scale).square().mean()
-        parts["voxel_source"] = light.item()
-        loss = loss + settings.voxel_colour * light
+        light = (found.source - device.copy_to_device(samples.source, where)) * (1 / samples.source_scale)
+        parts["voxel_source"] = light.detach().square().mean()
+        loss = loss + settings.voxel_colour * light.square().mean()
     for name, (value, scale) in samples.components.items():
         if name in found.components:
-            part = ((found.components[name] - device.copy_to_device(value, where)) / scale).square().mean()
-            loss = loss + _COMPONENT_WEIGHT * part
-    peak = max(float(samples.sigma.max()), 1e-30) / samples.sigma_scale
-    psnr = -10 * math.log10(max(parts["voxel_sigma"] / peak**2, 1e-20))
-    return PointLossResult(loss, parts, psnr, samples.name, found.rows, found.request_shares(wrong.detach().abs()))
+            part = (found.components[name] - device.copy_to_device(value, where)) * (1 / scale)
+            loss = loss + _COMPONENT_WEIGHT * part.square().mean()
+    return PointLossResult(loss, parts, samples, found.rows, found.request_shares(wrong.detach().abs()))
 
 
 # ---------------------------------------------------------------- sizes
@@ -211,13 +210,24 @@ class MaxScreenSize:
 
     def __init__(self, views: ViewSet, share: float, every: int = 10) -> None:
         eyes = torch.stack([views.view(i).camera.position.detach().double() for i in range(len(views))])
-        self.share, self.every, self._eyes = share, every, cKDTree(eyes.numpy())
+        self.share, self.every, self._eyes, self._tree = share, every, eyes, cKDTree(eyes.numpy())
 
-    def apply(self, step: int, means: Tensor, log_scales: Tensor) -> None:
-        """Shrink primitives beyond the limit, all three axes by one factor: changes ``log_scales`` (N, 3) in place."""
-        if step % self.every:
-            return
-        distance = torch.from_numpy(self._eyes.query(means.detach().cpu().numpy())[0]).to(log_scales)
-        limit = (self.share * distance.clamp_min(1e-12)).log()
+    def due(self, step: int) -> bool:
+        """Return whether :meth:`apply` belongs to this step."""
+        return step % self.every == 0
+
+    def apply(self, means: Tensor, log_scales: Tensor, when: Tensor | None = None) -> None:
+        """Shrink primitives beyond the limit, all three axes by one factor: changes ``log_scales`` (N, 3) in place.
+
+        ``when``: (1,) bool on the device; False changes nothing.
+        """
         with torch.no_grad():
-            log_scales -= (log_scales.max(dim=1).values - limit).clamp_min(0.0)[:, None]
+            if device.on_numba(means):
+                distance = torch.from_numpy(self._tree.query(means.detach().numpy())[0]).to(log_scales)
+            else:  # without a wait; a row of distances per primitive, of some thousand primitives at a time
+                self._eyes = self._eyes.to(means.device)
+                near = [torch.cdist(part.double(), self._eyes).amin(1) for part in means.detach().split(_ROWS)]
+                distance = torch.cat(near).to(log_scales)
+            limit = (self.share * distance.clamp_min(1e-12)).log()
+            excess = (log_scales.max(dim=1).values - limit).clamp_min(0.0)[:, None]
+            log_scales -= excess if when is None else torch.where(when, excess, 0.0)

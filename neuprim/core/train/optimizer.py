@@ -196,13 +196,14 @@ class RowAdam:
         parallel_for(step_rows, len(work), 1, 0)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
-        """Apply a population change: row i takes the state of old row ``rows[i]``, or zeros where ``fresh``."""
+        """Apply a population change: row i takes the state of old row ``rows[i]``, or zeros where ``fresh``.
+
+        If the number of rows stays the same, the tensors keep their memory.
+        """
+        self.age = _select_rows(self.age, rows, fresh)
         for moments in (self.m, self.v):
-            for name in moments:
-                moments[name] = moments[name][rows]
-                moments[name][fresh] = 0
-        self.age = self.age[rows]
-        self.age[fresh] = 0
+            for name, value in moments.items():
+                moments[name] = _select_rows(value, rows, fresh)
 
     def state(self) -> dict[str, Tensor]:
         """Return the tensors that a checkpoint needs."""
@@ -212,6 +213,12 @@ class RowAdam:
         """Restore the result of :meth:`state`, with tensors on the device of the model."""
         self.m, self.v = ({name: state[f"{moment}.{name}"] for name in self.m} for moment in "mv")
         self.age = state["age"]
+
+
+def _select_rows(value: Tensor, rows: Tensor, fresh: Tensor) -> Tensor:
+    chosen = value[rows]
+    chosen[fresh] = 0
+    return value.copy_(chosen) if len(chosen) == len(value) else chosen
 
 
 def _describe_bad_gradient(updates: list[_ParameterUpdate]) -> str:

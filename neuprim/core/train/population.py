@@ -95,6 +95,10 @@ class Population(ABC):
     def observe(self, model: Primitives, contributions: Contributions) -> None:
         """Collect statistics of a step, after its backward passes and before ``.grad`` is cleared."""
 
+    def sums(self) -> tuple[Tensor | None, ...]:
+        """Return the tensors that :meth:`observe` adds to; None for one that the next step creates."""
+        return ()
+
     @abstractmethod
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
         """Return the change of the population, or None for no change; resets the statistics."""
@@ -156,11 +160,15 @@ class RelocatePopulation(Population):
         self.weight += weight
         self.error += error
 
+    def sums(self) -> tuple[Tensor | None, ...]:
+        return self.weight, self.error
+
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
-        weight, error = self.weight, self.error
-        self.weight = self.error = None
-        if weight is None or error is None:
+        if self.weight is None or self.error is None or not bool(self.weight.any()):
             return None
+        weight, error = self.weight.clone(), self.error.clone()
+        self.weight.zero_()
+        self.error.zero_()
         count = len(weight)
         budget = int(self.settings.fraction * count)
         births = self._count_births(count)
@@ -181,6 +189,8 @@ class RelocatePopulation(Population):
         parents = busiest[: moves + births]
         if len(parents) == 0:
             return None
+        if births:
+            self.weight = self.error = None
         new = torch.arange(count, count + births, device=weight.device)
         text = ", ".join(f"{what} {number}" for what, number in (("moved", moves), ("grew by", births)) if number)
         return _split_population_into_rows(model, parents, torch.cat([idle, new]), births, text)
@@ -246,6 +256,9 @@ class GradientPopulation(Population):
                 norm += grad.reshape(model.count, -1).norm(dim=1)
         self.total += torch.where(saw, norm, torch.zeros_like(norm))
         self.seen += saw
+
+    def sums(self) -> tuple[Tensor | None, ...]:
+        return self.total, self.seen
 
     def intervene(self, model: Primitives, extent: float) -> PopulationChange | None:
         if self.total is None or self.seen is None:

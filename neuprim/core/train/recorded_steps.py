@@ -9,15 +9,16 @@ So results are the bits of steps that are not recorded.
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from itertools import zip_longest
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
-from neuprim.core.data import Pixels, View
+from neuprim.core.data import Pixels, PointSamples, View
 from neuprim.core.errors import warn_once
 from neuprim.core.model.fields import Constant
 from neuprim.core.render import backends
@@ -60,20 +61,34 @@ class _Key(NamedTuple):
 
     intrinsics: tuple[float, ...]
     size: tuple[int, int]
-    alpha: bool
-    mask: bool
-    conditions: tuple[str, ...]
+    shapes: tuple[Any, ...]  # of pixels, conditions and points
     stages: tuple[Any, ...]
+
+
+@dataclass
+class _Inputs:
+    """The inputs of a step on the device: those of a recording are always in the same memory."""
+
+    view: View
+    pixels: Pixels
+    samples: PointSamples | None
+    numbers: Tensor  # float64: view matrix, background, learning rates, scales of the points
+
+    def tensors(self) -> list[Tensor]:
+        """Return all tensors but ``numbers``."""
+        found = [self.pixels.rgb, self.pixels.alpha, self.pixels.mask, *self.view.conditions.values()]
+        if self.samples is not None:
+            found += [*self.samples.conditions.values(), self.samples.points, self.samples.sigma, self.samples.source]
+            found += [value for value, _ in self.samples.components.values()]
+        return [x for x in found if x is not None]
 
 
 @dataclass
 class _Program:
     """A recorded step: its inputs, its results and the function that runs it."""
 
-    packed: Tensor  # (16 + C + P,) float64: view matrix, background, learning rates
-    pixels: Pixels
-    conditions: dict[str, Tensor]
-    run: Callable[[], None]
+    inputs: _Inputs
+    run: Callable[[], None] = lambda: None
     numbers: Tensor | None = None  # float64: refused, then those of RenderedView.numbers
     parts: tuple[str, ...] = ()
 
@@ -84,9 +99,10 @@ class _Flight(NamedTuple):
     step: int
     progress: float
     task: ViewTask
+    samples: PointSamples | None
     report: StepReport
     parts: tuple[str, ...]
-    host: Tensor
+    memory: tuple[Tensor, Tensor]  # of the host: numbers given, numbers found
     event: Any
 
 
@@ -100,15 +116,16 @@ class StepRecorder:
     """
 
     def __init__(self, trainer: Trainer) -> None:
-        self.trainer, self.capacity, self.replayed, self.repeated = trainer, None, 0, 0
-        self.capacity: FrameCapacity | None
+        self.trainer, self.replayed, self.repeated = trainer, 0, 0
+        self.capacity: FrameCapacity | None = None
         self._on_gpu = trainer.device.type == device.CUDA
         self._refused = torch.zeros(1, dtype=torch.int32, device=trainer.device)
         self._counts = (0, 0, 0, 0)
         self._programs: dict[_Key, _Program] = {}
         self._seen: Counter[_Key] = Counter()
+        self._sums: tuple[Tensor | None, ...] = ()
         self._flights: deque[_Flight] = deque()
-        self._hosts: list[Tensor] = []
+        self._memory: list[tuple[Tensor, Tensor]] = []
         self._tried = self._failed = False
         self._stream = torch.cuda.Stream(trainer.device) if self._on_gpu else None
         self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
@@ -116,7 +133,7 @@ class StepRecorder:
     # ------------------------------------------------------------ what the trainer calls
 
     def reset(self) -> None:
-        """Forget all recordings, because the tensors of the model were replaced; there must be no unread results."""
+        """Forget all recordings, because tensors were replaced; there must be no unread results."""
         assert not self._flights, "settle() comes first"
         self._programs.clear()
         self._seen.clear()
@@ -134,76 +151,80 @@ class StepRecorder:
         self.capacity = FrameCapacity(*sizes, self._refused)
         self.reset()
 
-    def take(self, task: ViewTask, progress: float) -> StepReport | None:
+    def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
         """Replay one step; None if it must be taken by the trainer itself, because nothing is recorded for it yet."""
-        trainer = self.trainer
+        trainer, sums = self.trainer, self.trainer.population.sums()
         if self._failed or self.capacity is None or trainer.fake_quantize is not None or trainer.zero_masks:
             return None
-        if trainer.max_screen_size is not None and trainer.step % trainer.max_screen_size.every == 0:
+        if not tasks or any(x is None for x in sums):
             return None
-        if len(self._flights) >= _IN_FLIGHT:
-            first = self._flights[0]
-            if first.event is not None:
-                first.event.synchronize()
-            if first.host[0] != 0:
-                trainer.settle()
-            else:
-                self._read(self._flights.popleft())
+        if any(x is not y for x, y in zip_longest(sums, self._sums)):
+            trainer.settle()
+            self.reset()
+            self._sums = sums
+        trainer.settle(_IN_FLIGHT - 1)
+        (task,) = tasks
         view, pixels = trainer.load_view(task)
-        program = self._program(view, pixels)
+        program = self._find_program(view, pixels, samples)
         if program is None:
             return None
-        values = [*view.camera.viewmat.double().reshape(-1).tolist(), *task.background.tolist()]
-        packed = torch.tensor([*values, *trainer.rates(progress).values()], dtype=torch.float64)
-        program.packed.copy_(packed.pin_memory() if self._on_gpu else packed, non_blocking=True)
-        for own, given in zip(_tensors(program.pixels), _tensors(pixels), strict=True):
-            own.copy_(given)
-        for name, value in program.conditions.items():
-            given = view.conditions[name]
-            value.copy_(given.pin_memory() if self._on_gpu and given.is_cpu else given, non_blocking=True)
+        given, found = memory = self._memory.pop() if self._memory else self._allocate()
+        scales = [] if samples is None else [samples.sigma_scale, samples.source_scale]
+        scales += [] if samples is None else [scale for _, scale in samples.components.values()]
+        rates = trainer.rates(progress).values()
+        values = [*view.camera.viewmat.double().reshape(-1).tolist(), *task.background.tolist(), *rates, *scales]
+        given.numpy()[: len(values)] = values
+        program.inputs.numbers.copy_(given[: len(values)], non_blocking=True)
+        for own, new in zip(program.inputs.tensors(), _Inputs(view, pixels, samples, given).tensors(), strict=True):
+            own.copy_(new.pin_memory() if self._on_gpu and new.is_cpu else new, non_blocking=True)
         program.run()
         if self._failed or program.numbers is None:
+            self._memory.append(memory)
             return None
-        host = self._hosts.pop() if self._hosts else torch.empty(16, dtype=torch.float64, pin_memory=self._on_gpu)
-        host[: len(program.numbers)].copy_(program.numbers, non_blocking=True)
+        found[: len(program.numbers)].copy_(program.numbers, non_blocking=True)
         event = torch.cuda.current_stream(trainer.device).record_event() if self._on_gpu else None
         report = trainer.pending_report(view.name)
-        self._flights.append(_Flight(trainer.step, progress, task, report, program.parts, host, event))
+        self._flights.append(_Flight(trainer.step, progress, task, samples, report, program.parts, memory, event))
         self.replayed += 1
         return report
 
-    def settle(self) -> list[_Flight]:
-        """Read the results of all replayed steps; return those that must be taken again, in order."""
-        while self._flights:
+    def settle(self, keep: int = 0) -> list[_Flight]:
+        """Read the results of replayed steps but the last ``keep``; return those that must be taken again, in order."""
+        while len(self._flights) > keep:
             first = self._flights[0]
             if first.event is not None:
                 first.event.synchronize()
-            if first.host[0] != 0:
+            _, found = first.memory
+            refused, *numbers = found.tolist()
+            if refused:
                 self._refused.zero_()
                 again = list(self._flights)
                 self._flights.clear()
-                self._hosts += [flight.host for flight in again]
+                self._memory += [flight.memory for flight in again]
                 self.repeated += len(again)
                 return again
-            self._read(self._flights.popleft())
+            self._flights.popleft()
+            self._memory.append(first.memory)
+            first.report.resolve(*summarize_numbers(numbers, first.parts))
         return []
 
-    def _read(self, flight: _Flight) -> None:
-        numbers = flight.host[1:].tolist()
-        self._hosts.append(flight.host)
-        flight.report.resolve(*summarize_numbers(numbers, flight.parts))
+    def _allocate(self) -> tuple[Tensor, Tensor]:
+        size = 64 + len(self.trainer.current_model.specs) + self.trainer.dataset.channels
+        given, found = (torch.zeros(size, dtype=torch.float64, pin_memory=self._on_gpu) for _ in range(2))
+        return given, found
 
     # ------------------------------------------------------------ recording
 
-    def _program(self, view: View, pixels: Pixels) -> _Program | None:
-        model, camera = self.trainer.current_model, view.camera
+    def _find_program(self, view: View, pixels: Pixels, samples: PointSamples | None) -> _Program | None:
+        model, camera, trainer = self.trainer.current_model, view.camera, self.trainer
+        shapes = [pixels.alpha is not None, pixels.mask is not None, *view.conditions]
+        if samples is not None:
+            shapes += [samples.points.shape, samples.source is not None, *samples.conditions, *samples.components]
         key = _Key(
             (camera.fx, camera.fy, camera.cx, camera.cy),
             (camera.width, camera.height),
-            pixels.alpha is not None,
-            pixels.mask is not None,
-            tuple(view.conditions),
-            (model.density.stage, model.colour.stage, self.trainer.loss_stage),
+            tuple(shapes),
+            (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size),
         )
         program = self._programs.get(key)
         if program is None:
@@ -212,44 +233,61 @@ class StepRecorder:
                 return None
             if len(self._programs) >= _MOST_PROGRAMS:
                 self._programs.pop(next(iter(self._programs)))
-            program = self._programs[key] = self._record(view, pixels)
+            program = self._programs[key] = self._make_program(view, pixels, samples)
         return program
 
-    def _record(self, view: View, pixels: Pixels) -> _Program:
+    def _make_program(self, view: View, pixels: Pixels, samples: PointSamples | None) -> _Program:
         """Return a program whose first run takes a step directly (once per training) or records it, and replays it."""
-        trainer = self.trainer
-        where, channels = trainer.device, trainer.dataset.channels
-        numbers = 16 + channels + len(trainer.current_model.specs)
-        own = Pixels(*(None if x is None else torch.empty_like(x, device=where) for x in _fields(pixels)))  # type: ignore[arg-type]
-        conditions = {name: torch.empty_like(value, device=where) for name, value in view.conditions.items()}
-        packed = torch.empty(numbers, dtype=torch.float64, device=where)
-        program = _Program(packed, own, conditions, lambda: None)
-        camera = replace(view.camera, viewmat=packed[:16].view(4, 4))
-        static = View(view.name, camera, conditions)
+        where, count = self.trainer.device, len(self.trainer.current_model.specs)
+        channels = self.trainer.dataset.channels
+
+        def like(value: Tensor | None) -> Tensor | None:
+            return None if value is None else torch.empty_like(value, device=where)
+
+        def like_all(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {name: torch.empty_like(value, device=where) for name, value in values.items()}
+
+        numbers = torch.empty(64 + count + channels, dtype=torch.float64, device=where)
+        scales = numbers[16 + channels + count :]
+        own_samples = None
+        if samples is not None:
+            components = {
+                name: (torch.empty_like(value, device=where), scales[2 + at])
+                for at, (name, (value, _)) in enumerate(samples.components.items())
+            }
+            own_samples = replace(
+                samples, conditions=like_all(samples.conditions), points=like(samples.points),
+                sigma=like(samples.sigma), source=like(samples.source), sigma_scale=scales[0],
+                source_scale=scales[1], components=components,
+            )  # fmt: skip
+            numbers = numbers[: 18 + channels + count + len(components)]
+        else:
+            numbers = numbers[: 16 + channels + count]
+        camera = replace(view.camera, viewmat=numbers[:16].view(4, 4))
+        own_pixels = Pixels(torch.empty_like(pixels.rgb, device=where), like(pixels.alpha), like(pixels.mask))
+        inputs = _Inputs(View(view.name, camera, like_all(view.conditions)), own_pixels, own_samples, numbers)
+        program = _Program(inputs)
 
         def take_step() -> None:
-            program.numbers, program.parts = self._take_step(static, own, packed[16:])
+            program.numbers, program.parts = self._take_step(inputs)
 
         def record() -> None:
-            assert self._stream is not None
             if not self._tried:  # loads kernels, and finds operations that wait
                 self._tried = True
-                if not self._take_directly(take_step):
-                    return
-            else:
-                graph = torch.cuda.CUDAGraph()
-                self._stream.wait_stream(torch.cuda.current_stream(where))
-                # "thread_local": another thread may be loading the next view
-                with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
-                    take_step()
-                program.run = graph.replay
-                graph.replay()
+                self._take_directly(take_step)
+                return
+            graph = torch.cuda.CUDAGraph()
+            # "thread_local": another thread may be loading the next view
+            with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
+                take_step()
+            program.run = graph.replay
+            graph.replay()
 
         program.run = record if self._on_gpu else take_step
         return program
 
-    def _take_directly(self, take_step: Callable[[], None]) -> bool:
-        """Take a step without recording it; return whether no operation in it waits for the device."""
+    def _take_directly(self, take_step: Callable[[], None]) -> None:
+        """Take a step without recording it, unless an operation in it waits for the device."""
         stream, current = self._stream, torch.cuda.current_stream(self.trainer.device)
         assert stream is not None
         stream.wait_stream(current)
@@ -266,17 +304,19 @@ class StepRecorder:
         finally:
             torch.cuda.set_sync_debug_mode(mode)
             current.wait_stream(stream)
-        return not self._failed
 
-    def _take_step(self, view: View, pixels: Pixels, rest: Tensor) -> tuple[Tensor, tuple[str, ...]]:
+    def _take_step(self, inputs: _Inputs) -> tuple[Tensor, tuple[str, ...]]:
         """Take a step on the device; return (refused, numbers...) and the names of the loss's parts."""
         trainer, model, params = self.trainer, self.trainer.current_model, self.trainer.current_model.params
-        background, rates = rest[: trainer.dataset.channels].float(), rest[trainer.dataset.channels :].float()
+        background, rates, _ = inputs.numbers[16:].float().tensor_split(
+            [trainer.dataset.channels, trainer.dataset.channels + len(model.specs)]
+        )
         # leaves of their own, as those of earlier steps may belong to another stream
         model.params = {name: value.detach().requires_grad_() for name, value in params.items()}
         try:
-            rendered = trainer.compare_view(view, pixels, background, 0.0, self._draw)
-            loss = trainer.total_loss(rendered.loss / 1)
+            rendered = trainer.compare_view(inputs.view, inputs.pixels, background, 0.0, self._draw)
+            points = None if inputs.samples is None else trainer.compare_points(inputs.samples)
+            loss = trainer.total_loss(rendered.loss / 1, points)
             torch.maximum(self._refused, (~loss.detach().isfinite()).int().reshape(1), out=self._refused)
             wanted = [value for value in model.params.values() if value.numel()]
             for value, grad in zip(wanted, torch.autograd.grad(loss, wanted, allow_unused=True), strict=True):
@@ -285,10 +325,12 @@ class StepRecorder:
             weight, error = (torch.where(accepted, x, 0.0) for x in rendered.contributions.of_all(model.count))
             trainer.population.observe(model, Contributions(weight, error))
             trainer.optimizer.step_recorded(model.params, rates, self._refused)
-            trainer.limit_model(self._refused == 0)
+            trainer.limit_model(trainer.limits_size, self._refused == 0)
         finally:
             model.params = params
-        return torch.cat([self._refused.double(), rendered.numbers(loss)]), tuple(rendered.parts)
+        more = {} if points is None else points.parts
+        numbers = rendered.numbers(loss, more.values())
+        return torch.cat([self._refused.double(), numbers]), (*rendered.parts, *more)
 
     def _draw(self, view: View, background: Tensor) -> RenderOutput:
         from neuprim.core.render.cuda.backend import render
@@ -296,11 +338,3 @@ class StepRecorder:
         lowered = self.trainer.current_model.lower(view.camera, view.conditions, self.trainer.renderer)
         assert isinstance(lowered.colour, Constant) and lowered.shade is None, "a field without stage"
         return render(lowered, view.camera, background, self.trainer.renderer, self.capacity)
-
-
-def _fields(pixels: Pixels) -> tuple[Tensor | None, ...]:
-    return pixels.rgb, pixels.alpha, pixels.mask
-
-
-def _tensors(pixels: Pixels) -> list[Tensor]:
-    return [x for x in _fields(pixels) if x is not None]

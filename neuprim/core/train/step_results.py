@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -66,7 +66,8 @@ class ViewResult(NamedTuple):
     """Results of one view of a step.
 
     Attributes:
-        loss: the view's part of the step's loss; the part of the last view includes points and regularisers.
+        loss: the view's part of the step's loss; that of the last view includes points and regularisers.
+        parts: named parts of the loss; those of the last view include points.
         gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
         correction: gradient of the view's corrections; None without them.
     """
@@ -76,7 +77,6 @@ class ViewResult(NamedTuple):
     loss: float
     psnr: float
     parts: dict[str, float]
-    point_parts: dict[str, float]
     gain: list[float] | None
     correction: list[float] | None
 
@@ -93,9 +93,9 @@ class RenderedView:
     truth: Tensor
     contributions: Contributions
 
-    def numbers(self, cost: Tensor) -> Tensor:
-        """Return ``cost``, ``squared``, ``counted`` and the parts as one float64 tensor, which takes one wait."""
-        values = (cost.detach(), self.squared, self.counted, *self.parts.values())
+    def numbers(self, cost: Tensor, more: Iterable[Tensor] = ()) -> Tensor:
+        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` as one float64 tensor, which takes one wait."""
+        values = (cost.detach(), self.squared, self.counted, *self.parts.values(), *more)
         like = self.squared
         return torch.stack(
             [x.detach().double() if isinstance(x, Tensor) else like.new_full((), x, dtype=torch.float64) for x in values]
@@ -114,7 +114,7 @@ def summarize_numbers(
 
 def summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
     """Return summed loss, mean parts, mean PSNR and name of a step, from the results of its views."""
-    last, count = views[-1], len(views)
-    parts = {part: sum(view.parts[part] for view in views) / count for part in last.parts}
+    first, last, count = views[0], views[-1], len(views)
+    means = {part: sum(view.parts[part] for view in views) / count for part in first.parts}
     name = last.name if count == 1 else f"{last.name} and {count - 1} more"
-    return sum(view.loss for view in views), parts | last.point_parts, sum(view.psnr for view in views) / count, name
+    return sum(view.loss for view in views), last.parts | means, sum(view.psnr for view in views) / count, name

@@ -18,8 +18,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset, Pixels, PointSamples, View
+from neuprim.core.data.dataset_check import check_point_samples
 from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -42,6 +44,7 @@ from neuprim.core.train.step_results import (
 )
 from neuprim.core.train.trainer_state import check_state, select_state_tensors
 from neuprim.core.train.training_views import (
+    GPU_LAUNCHES,
     Exposures,
     PixelLoader,
     ViewCorrections,
@@ -173,8 +176,8 @@ class Trainer:
             self._set_progress(progress)
             tasks, samples = self._draw_views(), self._draw_points()
             report = None
-            if self.recorder is not None and samples is None:
-                report = self.recorder.take(tasks[0], progress)
+            if self.recorder is not None:
+                report = self.recorder.take(tasks, samples, progress)
             if report is None:
                 self.settle()
                 report = self.pending_report("")
@@ -216,13 +219,12 @@ class Trainer:
             view = self._render_view(task, progress)
             loss = view.loss / (self.settings.views_per_step * self.ranks)
             if number == len(tasks) and self.rank == self.ranks - 1:
-                points = None if samples is None else self._compare_points(samples)
+                points = None if samples is None else self.compare_points(samples)
                 loss = self.total_loss(loss, points)
             cost, parts, psnr = self._backward(loss, view, points)
             gain = None if self.exposures is None else self.exposures.gradient(task.view)
             moved = None if self.corrections is None else self.corrections.gradient(task.view)
-            point_parts = {} if points is None else points.parts
-            results.append(ViewResult(task.view, view.name, cost, psnr, parts, point_parts, gain, moved))
+            results.append(ViewResult(task.view, view.name, cost, psnr, parts, gain, moved))
             each.append(self._exchange_gradients(view.contributions))
             del view, loss  # free what autograd saved before the next view is rendered
         if tasks:
@@ -230,14 +232,14 @@ class Trainer:
             cost, parts, psnr, name = summarize_views(results)
         else:
             assert samples is not None, "a step without views has points"
-            points = self._compare_points(samples)
-            cost, _, _ = self._backward(self.total_loss(None, points), None, points)
-            contributions, parts, psnr, name = points.contributions(), points.parts, points.psnr, points.name
+            points = self.compare_points(samples)
+            cost, parts, psnr = self._backward(self.total_loss(None, points), None, points)
+            contributions, name = points.contributions(), samples.name
 
         # Update the parameters, and the numbers of the views.
         self.population.observe(model, contributions)
         self.optimizer.step(model.params, self.rates(progress))
-        self.limit_model()
+        self.limit_model(self.limits_size)
         for parameter, mask in self.zero_masks.items():
             model.params[parameter].detach()[mask] = 0
         if self.exposures is not None:
@@ -245,21 +247,22 @@ class Trainer:
         if self.corrections is not None:
             factor = self.settings.final_rate**progress
             self.corrections.step({result.view: result.correction for result in results}, factor)
-        if self.max_screen_size is not None:
-            self.max_screen_size.apply(self.step, model.params["means"], model.params["log_scales"])
         report.resolve(cost, parts, psnr)
         return name
 
-    def settle(self) -> None:
-        """Wait for recorded steps, and repeat those that the device refused. Raises as :meth:`train_step`."""
-        again = [] if self.recorder is None else self.recorder.settle()
+    def settle(self, keep: int = 0) -> None:
+        """Wait for recorded steps, but for the last ``keep``, and repeat those that the device refused.
+
+        Raises as :meth:`train_step`.
+        """
+        again = [] if self.recorder is None else self.recorder.settle(keep)
         if not again:
             return
         step, progress = self.step, self._shown_progress
         for flight in again:
             self.step = flight.step
             self._set_progress(flight.progress)
-            self._take_step(flight.report, [flight.task], None, flight.progress, 0.0)
+            self._take_step(flight.report, [flight.task], flight.samples, flight.progress, 0.0)
         self.step = step
         self._set_progress(progress)
 
@@ -315,7 +318,8 @@ class Trainer:
             self.order = torch.randperm(len(train), generator=self.generator)
         index, self.order = int(self.order[0]), self.order[1:]
         background = self._draw_background()
-        stride = choose_stride(settings.stride, self.covered_pixels, self.current_model.count, self.progress)
+        primitives = self.current_model.count + (GPU_LAUNCHES if self.device.type == device.CUDA else 0)
+        stride = choose_stride(settings.stride, self.covered_pixels, primitives, self.progress)
         return index, background, draw_stride(stride, train.view(index), self.generator)
 
     def _draw_background(self) -> Tensor:
@@ -335,7 +339,9 @@ class Trainer:
         if source == "images" or (source == "both" and (self.step + 1) % self.settings.voxels_every):
             return None
         assert self.dataset.points is not None, "the constructor refuses data without points"
-        return self.dataset.points.draw(self.settings.voxels_per_step, self.generator)
+        samples = self.dataset.points.draw(self.settings.voxels_per_step, self.generator)
+        check_point_samples(samples, self.dataset)
+        return samples
 
     def _quantized_model(self) -> Primitives:
         """Return the model to render, with quantized parameters if :attr:`fake_quantize` is set."""
@@ -387,13 +393,19 @@ class Trainer:
             counted = flat.numel() if pixels.mask is None else pixels.mask.sum() * channels
         return RenderedView(loss, parts, torch.dot(flat, flat), counted, view.name, truth, contributions)
 
-    def _compare_points(self, samples: PointSamples) -> PointLossResult:
-        return point_loss(self._quantized_model(), self.dataset, samples, self.settings, self.renderer.threads)
+    def compare_points(self, samples: PointSamples) -> PointLossResult:
+        """Compare the model with known values at points."""
+        return point_loss(self._quantized_model(), samples, self.settings, self.renderer.threads)
 
     @property
-    def loss_stage(self) -> bool:
-        """Whether :meth:`total_loss` has the regulariser that begins at ``train.anisotropy_from``."""
+    def has_anisotropy_loss(self) -> bool:
+        """Whether this step has the regulariser that begins at ``train.anisotropy_from``."""
         return self.settings.anisotropy_weight > 0 and self.step >= self.settings.anisotropy_from
+
+    @property
+    def limits_size(self) -> bool:
+        """Whether this step limits the sizes of primitives on the screen."""
+        return self.max_screen_size is not None and self.max_screen_size.due(self.step)
 
     def total_loss(self, loss: Tensor | None, points: PointLossResult | None = None) -> Tensor:
         """Return the sum of the losses of views, points (None: none in this step) and regularisers."""
@@ -403,14 +415,20 @@ class Trainer:
         log_scales = self.current_model.params["log_scales"]
         if self.settings.size_weight > 0:
             loss = loss + self.settings.size_weight * log_scales.exp().mean() / self.extent
-        if self.loss_stage:
+        if self.has_anisotropy_loss:
             loss = loss + self.settings.anisotropy_weight * scale_anisotropy(log_scales)
         return loss
 
-    def limit_model(self, when: Tensor | None = None) -> None:
-        """Limit the extinction of the primitives to the largest of the data, if the data have one."""
+    def limit_model(self, sizes: bool, when: Tensor | None = None) -> None:
+        """Limit extinction to the largest of the data, and with ``sizes`` the sizes of primitives on the screen.
+
+        ``when``: (1,) bool on the device; False changes nothing.
+        """
+        model = self.current_model
         if self.dataset.largest is not None:
-            self.current_model.limit(self.dataset.largest, when)
+            model.limit(self.dataset.largest, when)
+        if sizes and self.max_screen_size is not None:
+            self.max_screen_size.apply(model.params["means"], model.params["log_scales"], when)
 
     def _backward(
         self, loss: Tensor, view: RenderedView | None, points: PointLossResult | None
@@ -422,13 +440,16 @@ class Trainer:
         Raises:
             NonFiniteError: the loss is NaN or infinite; names the view or points.
         """
+        more = {} if points is None else points.parts
         if view is None:
-            cost, parts, psnr = loss.item(), dict[str, float](), math.nan
+            assert points is not None, "a step without views has points"
+            cost, parts, psnr = loss.item(), {name: float(part) for name, part in more.items()}, points.psnr()
         else:
-            cost, parts, psnr = summarize_numbers(view.numbers(loss).tolist(), tuple(view.parts))
+            numbers = view.numbers(loss, more.values()).tolist()
+            cost, parts, psnr = summarize_numbers(numbers, (*view.parts, *more))
         if not math.isfinite(cost):
             self.current_model.check_finite()
-            where = f"points of {points.name}" if view is None and points is not None else ""
+            where = f"points of {points.samples.name}" if view is None and points is not None else ""
             if view is not None:
                 bad_pixels = not bool(torch.isfinite(view.truth).all())
                 where = f"view {view.name}{', whose pixels are NaN or infinite somewhere' if bad_pixels else ''}"
@@ -438,9 +459,13 @@ class Trainer:
 
     def _apply_change(self, change: PopulationChange) -> None:
         model = self.current_model
-        model.params = {spec.name: change.params[spec.name] for spec in model.specs}
-        self.optimizer.select(change.origin, change.fresh)
         self.zero_masks = {name: mask[change.origin] for name, mask in self.zero_masks.items()}
+        self.optimizer.select(change.origin, change.fresh)
+        if len(change.origin) == model.count:  # in the same memory, which recorded steps know
+            for name, value in model.params.items():
+                value.detach().copy_(change.params[name])
+            return
+        model.params = {spec.name: change.params[spec.name] for spec in model.specs}
         self._require_grad()
 
     def _require_grad(self) -> None:

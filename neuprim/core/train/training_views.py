@@ -25,6 +25,9 @@ _MIN_SIDE = 11
 _PIXELS_PER_PRIMITIVE = 1.5
 """Number of covered pixels that take as long in a step on the CPU as one primitive."""
 
+GPU_LAUNCHES = 70_000
+"""Number of primitives that take as long in a step on a GPU as its launches, which small views do not shorten."""
+
 _COUNTED_VIEWS = 16
 """Views whose covered pixels are counted, spread over the training set."""
 

@@ -3,7 +3,7 @@
 The extinction is sigma(x) = sum over primitives of (1 - |y|^2)^p max(0, f(x~)) / m inside their ellipsoids. The source
 radiance is q(x) = sum of sigma_i(x) c_i; the colour of a ray is the integral of T q. c_i is the part of a primitive's
 colour that does not depend on direction. A density that lowers to a :class:`~neuprim.core.model.fields.Cosine` runs in
-compiled code on the CPU. On a GPU, and for any other density, torch code evaluates each pair of point and primitive.
+compiled code. For any other density, torch code evaluates each pair of point and primitive.
 """
 
 from __future__ import annotations
@@ -75,9 +75,11 @@ def volume_values_at(
         threads: number of threads, 0 for all cores; the result does not depend on it.
 
     Raises:
-        NonFiniteError: a parameter is NaN or infinite, or so large that the values are NaN or infinite.
+        NonFiniteError: a parameter is NaN or infinite, or so large that the values are NaN or infinite. On a GPU, where
+            finding out would take a wait, the values are NaN instead.
     """
-    active = model.active(conditions)
+    compiled = device.on_warp(model.params["means"]) and model.density.stage is not None
+    active = model.active(conditions, everything=compiled)
     geometry, count = active.geometry, active.geometry.count
     colour_params = {spec.name: active.params[spec.name] for spec in model.colour.parameters()}
     isotropic = model.colour.isotropic(colour_params, conditions) if colour else None
@@ -87,6 +89,12 @@ def volume_values_at(
     weights = torch.cat(columns, 1) if columns else geometry.means.new_zeros(count, 0)
     form = model.density.lower(active.own, geometry, conditions)
     shares = PointShares(count, geometry.means.device)
+    width = colors[0].shape[1] if colors else 0
+    if compiled and isinstance(form, Cosine):
+        from neuprim.core.volumes.points_warp import cosine_point_values
+
+        values = cosine_point_values(geometry, form, points, weights, shares)
+        return _point_values(values, width, active.rows, shares, tuple(named))
     cells = sort_points_into_cells(points.detach().double().cpu().contiguous().numpy())
     try:
         if isinstance(form, Cosine) and device.on_numba(geometry.means):
@@ -98,12 +106,18 @@ def volume_values_at(
     except NonFiniteError:
         model.check_finite()  # names the parameter, if it is one
         raise
-    width = colors[0].shape[1] if colors else 0
+    return _point_values(values, width, active.rows, shares, tuple(named))
+
+
+def _point_values(
+    values: Tensor, width: int, rows: Tensor | None, shares: PointShares, named: tuple[str, ...]
+) -> PointValues:
+    """Return the columns of ``values``: extinction, ``width`` of the source, and the ``named`` components."""
     components = dict(zip(named, values[:, 1 + width :].unbind(1), strict=True))
-    return PointValues(values[:, 0], values[:, 1 : 1 + width] if width else None, active.rows, shares, components)
+    return PointValues(values[:, 0], values[:, 1 : 1 + width] if width else None, rows, shares, components)
 
 
-# ---------------------------------------------------------------- torch code: on a GPU, and for any other density
+# ---------------------------------------------------------------- torch code, for any other density
 
 
 def _torch_density_point_values(

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from neuprim.core import checkpoint
+from neuprim.core.compute import device
 from neuprim.core.data import Dataset, Pixels, View, ViewSet
 from neuprim.core.errors import CheckpointError, ConfigError
 from neuprim.core.train import training_views
@@ -108,15 +109,18 @@ def test_a_gain_moves_by_its_own_gradient_only() -> None:
     assert torch.equal(exposures.numbers, before), "no view, no step"
 
 
-def test_no_primitive_looks_larger_than_it_may(plain: Dataset) -> None:
+@pytest.mark.parametrize("on_cpu", [True, False], ids=["by a tree", "by all distances, as on a GPU"])
+def test_no_primitive_looks_larger_than_it_may(plain: Dataset, on_cpu: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device, "on_numba", lambda *tensors: on_cpu)
     limit = MaxScreenSize(plain.train, 0.25, every=5)
     eyes = torch.stack([plain.train.view(i).camera.position for i in range(len(plain.train))]).float()
     means = torch.cat([eyes[:1] + torch.tensor([0.4, 0.0, 0.0]), eyes[:1] * 50, eyes[:1]])
     log_scales = torch.tensor([[-1.0, -2.0, -3.0], [1.0, 0.5, 0.0], [0.0, 0.0, 0.0]])
     kept = log_scales.clone()
-    limit.apply(4, means, kept)
-    assert torch.equal(kept, log_scales), "not due"
-    limit.apply(5, means, kept)
+    assert limit.due(5) and not limit.due(4)
+    limit.apply(means, kept, torch.tensor([False]))
+    assert torch.equal(kept, log_scales), "a refused step changes nothing"
+    limit.apply(means, kept)
     distance = torch.cdist(means, eyes).min(1).values
     assert kept[0].max().exp() == pytest.approx(0.25 * distance[0].item(), rel=1e-5)
     assert torch.allclose(kept[0] - kept[0].max(), log_scales[0] - log_scales[0].max()), "shapes stay"

@@ -8,6 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
+from neuprim.core.compute import device
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.model.fields import Conditions
 from neuprim.core.model.gaussian import GaussianDensity
@@ -97,16 +98,26 @@ def cloud(count: int = 300, size: float = 2.0) -> Tensor:
     return size * (torch.rand(count, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64) - 0.5)
 
 
+@pytest.fixture(params=["compiled", "Warp"])
+def kernels(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> str:
+    """The kernels of the CPU, and those of a GPU on Warp's CPU blocks."""
+    if request.param == "Warp":
+        pytest.importorskip("warp", reason="the kernels of a GPU are written in Warp: pip install 'neuprim[cuda]'")
+        monkeypatch.setattr(device, "on_numba", lambda *tensors: False)
+        monkeypatch.setattr(device, "on_warp", lambda *tensors: True)
+    return str(request.param)
+
+
 @pytest.mark.parametrize("edge", [0, 1, 2])
 @pytest.mark.parametrize("neurons", [0, 1, 5, 16])
-def test_it_equals_all_pairs_forward_and_backward(neurons: int, edge: int) -> None:
+def test_it_equals_all_pairs_forward_and_backward(neurons: int, edge: int, kernels: str) -> None:
     model, x = static(neurons, edge), cloud()
     agree(model, {}, x)
     assert torch.allclose(volume_values_at(model, {}, x).sigma.double(), density_at(model, {}, x), rtol=1e-6, atol=1e-6)
 
 
 @pytest.mark.parametrize("time", [0.0, 0.37, 1.0])
-def test_in_a_frame_of_a_moving_model(time: float) -> None:
+def test_in_a_frame_of_a_moving_model(time: float, kernels: str) -> None:
     agree(moving(), {"time": torch.tensor(time)}, cloud(400, size=1.2))
 
 
@@ -141,7 +152,7 @@ def test_extremes(case: str) -> None:
     agree(model, {}, x.contiguous(), 1e-5)
 
 
-def test_nothing_is_active_or_no_point_is_given() -> None:
+def test_nothing_is_active_or_no_point_is_given(kernels: str) -> None:
     model = moving()
     with torch.no_grad():
         model.params["window_center"].fill_(0.1)
@@ -153,7 +164,7 @@ def test_nothing_is_active_or_no_point_is_given() -> None:
 
 
 @pytest.mark.parametrize("model", [static(3, 1, count=150), gaussians()], ids=["compiled", "torch"])
-def test_shares_are_sums_over_points(model: Primitives) -> None:
+def test_shares_are_sums_over_points(model: Primitives, kernels: str) -> None:
     x, error = cloud(), torch.rand(300, generator=torch.Generator().manual_seed(3))
     found = volume_values_at(model, {}, x)
     shares = found.request_shares(error)
@@ -177,7 +188,7 @@ def test_it_does_not_depend_on_the_number_of_threads() -> None:
         assert all(torch.equal(value, grads[name]) for name, value in made[0].items())
 
 
-def test_parameters_in_float32_lose_nothing_on_the_way() -> None:
+def test_parameters_in_float32_lose_nothing_on_the_way(kernels: str) -> None:
     """Turned needles, whose axes are a thousand apart: values of float32 parameters are right to the last rounding."""
     model = static(2, 2)
     generator = torch.Generator().manual_seed(6)
@@ -225,6 +236,15 @@ def test_what_is_not_finite_is_named(name: str, value: float, message: str) -> N
         model.params[name][7] = value
     with pytest.raises(NonFiniteError, match=message):
         volume_values_at(model, {}, cloud())
+
+
+def test_a_gpu_gives_nan_for_what_is_not_finite(kernels: str) -> None:
+    if kernels == "compiled":
+        return
+    model = static(2, 1)
+    with torch.no_grad():
+        model.params["log_scales"][7] = -800.0
+    assert bool(volume_values_at(model, {}, cloud()).sigma.isnan().all())
 
 
 def test_colour_is_left_out_where_it_is_not_requested_or_depends_on_direction(monkeypatch: pytest.MonkeyPatch) -> None:

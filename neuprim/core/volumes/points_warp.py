@@ -1,0 +1,174 @@
+# mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
+"""GPU path of :mod:`neuprim.core.volumes.points`: sums of cosine densities at points, by Warp kernels in float64.
+
+One thread per point adds up all primitives, and one thread per primitive all points in the backward pass, so reruns
+give the same bits. A few thousand points need no grid: comparing one with a box takes a few instructions.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from neuprim.core.compute.warp import OPTIONS, Doubles, Doubles2d, array, launch_kernel, wp
+from neuprim.core.model.forms import Cosine
+from neuprim.core.model.geometry import Geometry
+
+d = wp.float64
+_Vectors, _Vectors2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)
+_Matrices = wp.array(dtype=wp.mat33d)
+_MARGIN = 1 + 1e-12  # of the boxes around ellipsoids: rounding must not leave out a point
+
+
+def cosine_point_values(geometry: Geometry, form: Cosine, points: Tensor, weights: Tensor, shares: Any) -> Tensor:
+    """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3); NaN if a number is not finite.
+
+    Never waits for the GPU. Differentiable in all but the points; the backward pass fills ``shares``.
+
+    Args:
+        weights: (N, C) factors of the extinction of each primitive.
+    """
+    g = Geometry(*(x.double() for x in (geometry.means, geometry.log_scales, geometry.quats)))
+    means, scales, axes, m = g.means, g.scales, g.rotations, g.length_scale
+    A = axes.transpose(1, 2) / scales[:, :, None]  # y = A (x - mu)
+    rate = form.omega0 * form.W1.double() / m[:, None, None]
+    phase, amplitude = form.omega0 * form.b1.double(), form.w2.double() / m[:, None]
+    offset = form.b2.double().reshape(-1) / m
+    tensors = (means, A, rate, phase, amplitude, offset, weights.double())
+    reach = _MARGIN * (axes * scales[:, None, :]).norm(dim=2).detach()
+    found: Tensor = _PointSums.apply(points.detach().double().to(means.device), reach, form.edge, shares, *tensors)
+    not_finite = sum(x.detach().sum() * 0.0 for x in (reach, *tensors))  # comparisons with NaN leave a primitive out
+    return (found + not_finite).float()
+
+
+@wp.func
+def _is_in_box(offset: wp.vec3d, reach: wp.vec3d):
+    return wp.abs(offset[0]) <= reach[0] and wp.abs(offset[1]) <= reach[1] and wp.abs(offset[2]) <= reach[2]
+
+
+@wp.func
+def _network_at(offset: wp.vec3d, n: int, rate: _Vectors2d, phase: Doubles2d, amplitude: Doubles2d, constant: Doubles):
+    """Return f/m at an offset from the mean of primitive n."""
+    total = constant[n]
+    for k in range(phase.shape[1]):
+        total += amplitude[n, k] * wp.cos(phase[n, k] + wp.dot(rate[n, k], offset))
+    return total
+
+
+@wp.func
+def _fade(inner: wp.float64, edge: int):
+    """Return (1 - |y|^2)^p."""
+    value = d(1.0)
+    if edge > 0:
+        value = inner
+    if edge > 1:
+        value = inner * inner
+    return value
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+def _add_primitives(
+    points: _Vectors, reach: _Vectors, edge: int, means: _Vectors, A: _Matrices, rate: _Vectors2d, phase: Doubles2d,
+    amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, values: Doubles2d,
+):  # fmt: skip
+    """Add up sigma and sigma x weights of all primitives at point tid."""
+    p = wp.tid()
+    for n in range(means.shape[0]):
+        offset = points[p] - means[n]
+        if _is_in_box(offset, reach[n]):
+            y = A[n] * offset
+            inner = d(1.0) - wp.dot(y, y)
+            if inner > d(0.0):
+                f = _network_at(offset, n, rate, phase, amplitude, constant)
+                if f > d(0.0):
+                    sigma = f * _fade(inner, edge)
+                    values[p, 0] = values[p, 0] + sigma
+                    for q in range(weights.shape[1]):
+                        values[p, 1 + q] = values[p, 1 + q] + sigma * weights[n, q]
+
+
+@wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
+def _add_points(
+    points: _Vectors, reach: _Vectors, edge: int, means: _Vectors, A: _Matrices, rate: _Vectors2d, phase: Doubles2d,
+    amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, pulled: Doubles2d, error: Doubles,
+    g_means: _Vectors, g_A: _Matrices, g_rate: _Vectors2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
+    g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
+):  # fmt: skip
+    """Add up the gradients of primitive tid, given as zeros, and (sigma, sigma x error), over all points.
+
+    ``pulled``: gradient of the values.
+    """
+    n = wp.tid()
+    g_mean, gA = wp.vec3d(), wp.mat33d()
+    whole, weight, wrong = d(0.0), d(0.0), d(0.0)
+    for p in range(points.shape[0]):
+        offset = points[p] - means[n]
+        if _is_in_box(offset, reach[n]):
+            y = A[n] * offset
+            inner = d(1.0) - wp.dot(y, y)
+            if inner > d(0.0):
+                f = _network_at(offset, n, rate, phase, amplitude, constant)
+                if f > d(0.0):
+                    fade = _fade(inner, edge)
+                    sigma = f * fade
+                    weight += sigma
+                    wrong += sigma * error[p]
+                    g = pulled[p, 0]
+                    for q in range(weights.shape[1]):
+                        g += pulled[p, 1 + q] * weights[n, q]
+                        g_weights[n, q] = g_weights[n, q] + pulled[p, 1 + q] * sigma
+                    gf = g * fade
+                    whole += gf
+                    for k in range(phase.shape[1]):
+                        angle = phase[n, k] + wp.dot(rate[n, k], offset)
+                        g_amplitude[n, k] = g_amplitude[n, k] + gf * wp.cos(angle)
+                        turn = -gf * amplitude[n, k] * wp.sin(angle)
+                        g_phase[n, k] = g_phase[n, k] + turn
+                        g_rate[n, k] = g_rate[n, k] + turn * offset
+                        g_mean -= turn * rate[n, k]
+                    if edge > 0:
+                        by_y = d(-2.0) * g * f * y
+                        if edge > 1:
+                            by_y = d(2.0) * inner * by_y
+                        gA += wp.outer(by_y, offset)
+                        g_mean -= wp.transpose(A[n]) * by_y
+    g_means[n] = g_mean
+    g_A[n] = gA
+    g_constant[n] = whole
+    shares[n, 0] = weight
+    shares[n, 1] = wrong
+
+
+_TYPES = (wp.vec3d, wp.mat33d, wp.vec3d, d, d, d, d)
+
+
+def _primitive_arrays(tensors: tuple[Tensor, ...]) -> list[Any]:
+    """Return (means, A, rate, phase, amplitude, offset, weights), or their gradients, as arrays of the kernels."""
+    means, A, *rest = tensors
+    return [array(x, kind) for x, kind in zip((means, A.view(-1, 9), *rest), _TYPES, strict=True)]
+
+
+class _PointSums(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, points: Tensor, reach: Tensor, edge: int, shares: Any, *tensors: Tensor) -> Tensor:  # type: ignore[override]
+        own = tuple(x.detach().contiguous() for x in tensors)
+        values = torch.zeros(len(points), 1 + own[-1].shape[1], dtype=torch.float64, device=points.device)
+        ctx.given = (array(points, wp.vec3d), array(reach, wp.vec3d), edge)
+        ctx.own, ctx.shares, ctx.points = own, shares, points
+        inputs = (*ctx.given, *_primitive_arrays(own), array(values, d))
+        launch_kernel(_add_primitives, len(points), inputs, points.device, 32)
+        return values
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
+        own, shares, points = ctx.own, ctx.shares, ctx.points
+        found = tuple(torch.zeros_like(x) for x in own)
+        error = torch.zeros_like(points[:, 0]) if shares.error is None else shares.error.double()
+        sums = torch.zeros(len(own[0]), 2, dtype=torch.float64, device=points.device)
+        watched = (array(gradient.contiguous(), d), array(error.contiguous(), d))
+        inputs = (*ctx.given, *_primitive_arrays(own), *watched, *_primitive_arrays(found), array(sums, d))
+        launch_kernel(_add_points, len(sums), inputs, points.device, 32)
+        shares.weight, shares.error_weight = sums.float().unbind(1)
+        return (None,) * 4 + found

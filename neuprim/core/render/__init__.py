@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from contextlib import nullcontext
+from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
@@ -17,7 +18,13 @@ from neuprim.core.errors import ConfigError, NonFiniteError
 from neuprim.core.model.fields import Constant, Cosine, LoweredDensity
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
-from neuprim.core.render.backends import Backend, available_backends, choose_backend, find_backend
+from neuprim.core.render.backends import (
+    Backend,
+    available_backends,
+    candidate_backends,
+    choose_backend,
+    find_backend,
+)
 from neuprim.core.render.near_plane import resolve_near
 from neuprim.core.render.output import (
     Contributions,
@@ -28,6 +35,9 @@ from neuprim.core.render.output import (
     draw_shaded_view,
 )
 from neuprim.core.settings import RenderSettings
+
+if TYPE_CHECKING:
+    from neuprim.core.render.cuda.recorded_frames import FrameRecorder
 
 __all__ = [
     "Backend",
@@ -71,11 +81,30 @@ def render(
         ConfigError: no backend has this name.
     """
     settings = settings or RenderSettings(near="auto")
+    recorder = _frame_recorder(model, camera, settings)
+    if recorder is not None:
+        output = recorder.render(model, camera, conditions or {}, settings, background)
+        if output is not None:
+            return output
     # lowering uses as many threads as the pixels
     with limit_threads(settings.threads) if settings.threads else nullcontext():
         lowered = model.lower(camera, conditions or {}, settings)
         lowered.check_frame(camera.viewmat, background)
-        return _render_checked_view(lowered, camera, settings, background)
+        output = _render_checked_view(lowered, camera, settings, background)
+    if recorder is not None:
+        recorder.observe(output)
+    return output
+
+
+def _frame_recorder(model: Primitives, camera: AnyCamera, settings: RenderSettings) -> FrameRecorder | None:
+    """Return what replays frames of this model as CUDA graphs; None where they cannot be recorded."""
+    if model.device.type != device.CUDA or torch.is_grad_enabled():
+        return None
+    if [backend.name for backend in candidate_backends(settings, device.CUDA)][:1] != ["cuda"]:
+        return None
+    from neuprim.core.render.cuda.recorded_frames import can_record_frame, frame_recorder
+
+    return frame_recorder(model) if can_record_frame(model, camera, settings) else None
 
 
 def render_lowered(

@@ -77,7 +77,9 @@ class RenderStats:
 
     backend: str  # name of the backend
     count: int  # number of primitives of the frame
-    pairs: int = 0  # evaluated pairs of tile and primitive (cpu, cuda) or ray and primitive (reference)
+    # evaluated pairs of tile and primitive (cpu, cuda) or ray and primitive (reference); the room for them in a frame
+    # that is replayed as a CUDA graph
+    pairs: int = 0
     rows: Tensor | None = None  # rows of the model, if some primitives were left out of the frame
     samples: int = 1  # rays per pixel side
     drawn_on: torch.device | None = None  # device of the backend, if not that of the tensors

@@ -202,7 +202,9 @@ class RelocatePopulation(Population):
         return min(missing, max(int(_GROWTH * count), due, 1))
 
     def state(self) -> dict[str, Tensor]:
-        found = {} if self.weight is None or self.error is None else {"weight": self.weight, "error": self.error}
+        found = {}
+        if self.weight is not None and self.error is not None and bool(self.weight.any()):
+            found = {"weight": self.weight, "error": self.error}
         return found | ({"part": torch.tensor(self._part)} if self._part else {})
 
     def load_state(self, state: dict[str, Tensor]) -> None:

@@ -18,8 +18,8 @@ import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
+from neuprim.core.compute.graphs import GraphRecorder
 from neuprim.core.data import Pixels, PointSamples, View
-from neuprim.core.errors import warn_once
 from neuprim.core.model.fields import Constant
 from neuprim.core.render import backends
 from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
@@ -126,9 +126,7 @@ class StepRecorder:
         self._sums: tuple[Tensor | None, ...] = ()
         self._flights: deque[_Flight] = deque()
         self._memory: list[tuple[Tensor, Tensor]] = []
-        self._tried = self._failed = False
-        self._stream = torch.cuda.Stream(trainer.device) if self._on_gpu else None
-        self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
+        self._graphs = GraphRecorder(trainer.device, "training steps")
 
     # ------------------------------------------------------------ what the trainer calls
 
@@ -154,7 +152,7 @@ class StepRecorder:
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
         """Replay one step; None if it must be taken by the trainer itself, because nothing is recorded for it yet."""
         trainer, sums = self.trainer, self.trainer.population.sums()
-        if self._failed or self.capacity is None or trainer.fake_quantize is not None or trainer.zero_masks:
+        if self._graphs.failed or self.capacity is None or trainer.fake_quantize is not None or trainer.zero_masks:
             return None
         if not tasks or any(x is None for x in sums):
             return None
@@ -178,7 +176,7 @@ class StepRecorder:
         for own, new in zip(program.inputs.tensors(), _Inputs(view, pixels, samples, given).tensors(), strict=True):
             own.copy_(new.pin_memory() if self._on_gpu and new.is_cpu else new, non_blocking=True)
         program.run()
-        if self._failed or program.numbers is None:
+        if self._graphs.failed or program.numbers is None:
             self._memory.append(memory)
             return None
         found[: len(program.numbers)].copy_(program.numbers, non_blocking=True)
@@ -237,7 +235,7 @@ class StepRecorder:
         return program
 
     def _make_program(self, view: View, pixels: Pixels, samples: PointSamples | None) -> _Program:
-        """Return a program whose first run takes a step directly (once per training) or records it, and replays it."""
+        """Return a program with tensors of its own for the inputs of such a step."""
         where, count = self.trainer.device, len(self.trainer.current_model.specs)
         channels = self.trainer.dataset.channels
 
@@ -271,39 +269,8 @@ class StepRecorder:
         def take_step() -> None:
             program.numbers, program.parts = self._take_step(inputs)
 
-        def record() -> None:
-            if not self._tried:  # loads kernels, and finds operations that wait
-                self._tried = True
-                self._take_directly(take_step)
-                return
-            graph = torch.cuda.CUDAGraph()
-            # "thread_local": another thread may be loading the next view
-            with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
-                take_step()
-            program.run = graph.replay
-            graph.replay()
-
-        program.run = record if self._on_gpu else take_step
+        program.run = self._graphs.record(take_step)
         return program
-
-    def _take_directly(self, take_step: Callable[[], None]) -> None:
-        """Take a step without recording it, unless an operation in it waits for the device."""
-        stream, current = self._stream, torch.cuda.current_stream(self.trainer.device)
-        assert stream is not None
-        stream.wait_stream(current)
-        mode = torch.cuda.get_sync_debug_mode()
-        torch.cuda.set_sync_debug_mode("error")
-        try:
-            with torch.cuda.stream(stream):
-                take_step()
-        except RuntimeError as error:
-            if "synchronizing" not in str(error):
-                raise
-            self._failed = True
-            warn_once(f"training steps are not recorded as CUDA graphs, as one waits for the GPU: {error}")
-        finally:
-            torch.cuda.set_sync_debug_mode(mode)
-            current.wait_stream(stream)
 
     def _take_step(self, inputs: _Inputs) -> tuple[Tensor, tuple[str, ...]]:
         """Take a step on the device; return (refused, numbers...) and the names of the loss's parts."""

@@ -1,8 +1,9 @@
 # mypy: disable-error-code="valid-type, no-untyped-def, index, empty-body"
 """GPU path of :mod:`neuprim.core.volumes.points`: sums of cosine densities at points, by Warp kernels in float64.
 
-One thread per point adds up all primitives, and one thread per primitive all points in the backward pass, so reruns
-give the same bits. A few thousand points need no grid: comparing one with a box takes a few instructions.
+A thread adds up part of the primitives at one point or, in the backward pass, part of the points of one primitive. The
+parts are summed in a fixed order, so reruns give the same bits. A few thousand points need no grid: comparing one with
+a box takes a few instructions.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ from neuprim.core.model.geometry import Geometry
 d = wp.float64
 _Vectors, _Vectors2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)
 _Matrices = wp.array(dtype=wp.mat33d)
+_FORWARD_PARTS, _BACKWARD_PARTS = 32, 8  # threads per point, and per primitive
 _MARGIN = 1 + 1e-12  # of the boxes around ellipsoids: rounding must not leave out a point
 
 
@@ -73,10 +75,11 @@ def _add_primitives(
     points: _Vectors, reach: _Vectors, edge: int, means: _Vectors, A: _Matrices, rate: _Vectors2d, phase: Doubles2d,
     amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, values: Doubles2d,
 ):  # fmt: skip
-    """Add up sigma and sigma x weights of all primitives at point tid."""
-    p = wp.tid()
-    for n in range(means.shape[0]):
-        offset = points[p] - means[n]
+    """Add up sigma and sigma x weights of part ``part`` of the primitives at a point, in row part x points + point."""
+    part, at = wp.tid()
+    p = part * points.shape[0] + at
+    for n in range(part, means.shape[0], _FORWARD_PARTS):
+        offset = points[at] - means[n]
         if _is_in_box(offset, reach[n]):
             y = A[n] * offset
             inner = d(1.0) - wp.dot(y, y)
@@ -96,14 +99,15 @@ def _add_points(
     g_means: _Vectors, g_A: _Matrices, g_rate: _Vectors2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
     g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
 ):  # fmt: skip
-    """Add up the gradients of primitive tid, given as zeros, and (sigma, sigma x error), over all points.
+    """Add up gradients, given as zeros, and (sigma, sigma x error) of a primitive over part ``part`` of the points.
 
-    ``pulled``: gradient of the values.
+    Row part x primitives + primitive. ``pulled``: gradient of the values.
     """
-    n = wp.tid()
+    part, n = wp.tid()
+    row = part * means.shape[0] + n
     g_mean, gA = wp.vec3d(), wp.mat33d()
     whole, weight, wrong = d(0.0), d(0.0), d(0.0)
-    for p in range(points.shape[0]):
+    for p in range(part, points.shape[0], _BACKWARD_PARTS):
         offset = points[p] - means[n]
         if _is_in_box(offset, reach[n]):
             y = A[n] * offset
@@ -118,15 +122,15 @@ def _add_points(
                     g = pulled[p, 0]
                     for q in range(weights.shape[1]):
                         g += pulled[p, 1 + q] * weights[n, q]
-                        g_weights[n, q] = g_weights[n, q] + pulled[p, 1 + q] * sigma
+                        g_weights[row, q] = g_weights[row, q] + pulled[p, 1 + q] * sigma
                     gf = g * fade
                     whole += gf
                     for k in range(phase.shape[1]):
                         angle = phase[n, k] + wp.dot(rate[n, k], offset)
-                        g_amplitude[n, k] = g_amplitude[n, k] + gf * wp.cos(angle)
+                        g_amplitude[row, k] = g_amplitude[row, k] + gf * wp.cos(angle)
                         turn = -gf * amplitude[n, k] * wp.sin(angle)
-                        g_phase[n, k] = g_phase[n, k] + turn
-                        g_rate[n, k] = g_rate[n, k] + turn * offset
+                        g_phase[row, k] = g_phase[row, k] + turn
+                        g_rate[row, k] = g_rate[row, k] + turn * offset
                         g_mean -= turn * rate[n, k]
                     if edge > 0:
                         by_y = d(-2.0) * g * f * y
@@ -134,11 +138,11 @@ def _add_points(
                             by_y = d(2.0) * inner * by_y
                         gA += wp.outer(by_y, offset)
                         g_mean -= wp.transpose(A[n]) * by_y
-    g_means[n] = g_mean
-    g_A[n] = gA
-    g_constant[n] = whole
-    shares[n, 0] = weight
-    shares[n, 1] = wrong
+    g_means[row] = g_mean
+    g_A[row] = gA
+    g_constant[row] = whole
+    shares[row, 0] = weight
+    shares[row, 1] = wrong
 
 
 _TYPES = (wp.vec3d, wp.mat33d, wp.vec3d, d, d, d, d)
@@ -153,22 +157,24 @@ def _primitive_arrays(tensors: tuple[Tensor, ...]) -> list[Any]:
 class _PointSums(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, points: Tensor, reach: Tensor, edge: int, shares: Any, *tensors: Tensor) -> Tensor:  # type: ignore[override]
-        own = tuple(x.detach().contiguous() for x in tensors)
-        values = torch.zeros(len(points), 1 + own[-1].shape[1], dtype=torch.float64, device=points.device)
+        own, M = tuple(x.detach().contiguous() for x in tensors), len(points)
+        values = points.new_zeros(_FORWARD_PARTS * M, 1 + own[-1].shape[1])
         ctx.given = (array(points, wp.vec3d), array(reach, wp.vec3d), edge)
         ctx.own, ctx.shares, ctx.points = own, shares, points
         inputs = (*ctx.given, *_primitive_arrays(own), array(values, d))
-        launch_kernel(_add_primitives, len(points), inputs, points.device, 32)
-        return values
+        launch_kernel(_add_primitives, (_FORWARD_PARTS, M), inputs, points.device)
+        return values.view(_FORWARD_PARTS, M, values.shape[1]).sum(0)
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Any, ...]:  # type: ignore[override]
         own, shares, points = ctx.own, ctx.shares, ctx.points
-        found = tuple(torch.zeros_like(x) for x in own)
+        N = len(own[0])
+        found = tuple(x.new_zeros(_BACKWARD_PARTS * N, *x.shape[1:]) for x in own)
         error = torch.zeros_like(points[:, 0]) if shares.error is None else shares.error.double()
-        sums = torch.zeros(len(own[0]), 2, dtype=torch.float64, device=points.device)
+        sums = points.new_zeros(_BACKWARD_PARTS * N, 2)
         watched = (array(gradient.contiguous(), d), array(error.contiguous(), d))
         inputs = (*ctx.given, *_primitive_arrays(own), *watched, *_primitive_arrays(found), array(sums, d))
-        launch_kernel(_add_points, len(sums), inputs, points.device, 32)
-        shares.weight, shares.error_weight = sums.float().unbind(1)
-        return (None,) * 4 + found
+        launch_kernel(_add_points, (_BACKWARD_PARTS, N), inputs, points.device)
+        *grads, totals = (x.view(_BACKWARD_PARTS, N, *x.shape[1:]).sum(0) for x in (*found, sums))
+        shares.weight, shares.error_weight = totals.float().unbind(1)
+        return (None,) * 4 + tuple(grads)

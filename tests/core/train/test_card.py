@@ -39,7 +39,7 @@ TASKS = {
 
 def configured(task: str, tmp_path: Path, *more: str) -> list[str]:
     # a GPU strides less, as its launches take as long as many primitives
-    population = ["train.population.every=3", "train.population.start=0.0", "train.stride=1"]
+    population = ["train.population.every=3", "train.population.start=0.0", "train.stride=2"]
     if task == "static":
         scene = tiny.write_blender(tmp_path / "two")
         return words(scene, tmp_path / "run", 8, *population, "train.rates.quats=0", *more)
@@ -81,7 +81,7 @@ def test_a_card_trains_what_the_processor_trains(task: str, tmp_path: Path, monk
         **own.trainer.state()[1],
         "elapsed": 0,
     } and tensors.keys() == mine.keys() == theirs.keys()
-    assert all(torch.equal(value, theirs[name]) for name, value in tensors.items())
+    assert not [name for name, value in tensors.items() if not torch.equal(value, theirs[name])]
     assert [replace(r, seconds=0) for r in heard] == [replace(r, seconds=0) for r in twins] and any(
         r.change for r in heard
     )

@@ -86,16 +86,14 @@ class _Rasterize(torch.autograd.Function):
             rgb = torch.zeros(pixels, form.channels, device=device)
         else:
             rgb = g_rgb.reshape(pixels, -1).float().contiguous()
-        T = rgb @ ctx.background
-        if g_T is not None:
-            T = T + g_T.reshape(-1).float()
+        T = None if g_T is None else g_T.reshape(-1).float().contiguous()
         asked = ctx.request.stats.contributions
         if asked is None:
             error = torch.zeros(pixels, device=device)
         else:
             error = asked.error.to(device, torch.float32).reshape(-1).contiguous()
         z = g_z.reshape(-1).float().contiguous() if settings.depth and g_z is not None else None
-        gradient = ImageGradient(rgb, T.contiguous(), z, error)
+        gradient = ImageGradient(rgb, T, ctx.background, z, error)
         grads, net_grads = rasterizer_gradient_rows(frame, form, net, drawn, settings, gradient)
         base = L.G_NEURONS + L.PER_NEURON * form.neurons
         colours = grads[:, base : base + form.channels]

@@ -79,13 +79,12 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def backward_pixels(
         rows: Vec4s2d, starts: Ints, ids: Ints, spans: Shorts2d, offsets: Ints, limits: wp.vec4, size: wp.vec2i,
-        transmittance: Floats, reached: Ints, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats,
-        hues: Floats2d, hits: Vec2s,
+        transmittance: Floats, reached: Ints, background: Floats, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats,
+        depths: Floats, hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
         """Store dL/dI = (1 - alpha) T dL/dw - b, and the weight, in each slot.
 
-        b, the light behind the hit, is the sum of w dL/dw of later hits and T dL/dT. ``g_transmittance`` includes the
-        background's part.
+        b, the light behind the hit, is the sum of w dL/dw of later hits and T dL/dT.
         """
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE
@@ -94,10 +93,14 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
         Y = (tile // across) * L.TILE + at[1]
         if X < size[0] and Y < size[1]:
             n = Y * size[0] + X
-            behind = transmittance[n] * g_transmittance[n]
             own = vecC()
+            by_light = float(0.0)
+            if g_transmittance:
+                by_light = g_transmittance[n]
             for k in range(wp.static(C)):
                 own[k] = g_rgb[n, k]
+                by_light += own[k] * background[k]
+            behind = transmittance[n] * by_light
             first = starts[tile]
             count = reached[tile] - first
             for back in range(count):
@@ -153,13 +156,15 @@ def pairs_kernel(form: KernelForm, depth: bool) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False, launch_bounds=bounds)
     def backward_pairs(
         rows: Vec4s2d, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, lens: wp.vec4, depth_floor: float,
-        size: wp.vec2i, reached: Ints, hits: Vec2s, g_rgb: Floats, g_z: Floats, error: Floats, out: Floats,
+        size: wp.vec2i, starts: Ints, reached: Ints, hits: Vec2s, g_rgb: Floats, g_z: Floats, error: Floats,
+        out: Floats,
     ):  # fmt: skip
         n, lane = wp.tid()
         tile = tiles[n]
         across = (size[0] + L.TILE - 1) // L.TILE
         i = ids[n]
-        if rows[i, L.REST][3] == 0.0:  # a float64 kernel writes the rows of the others
+        # a float64 kernel writes the rows of the others; there may be room for more pairs
+        if rows[i, L.REST][3] == 0.0 and n < starts[starts.shape[0] - 1]:
             total = row_of()
             if n < reached[tile]:
                 which = wp.tile_load(ids, shape=1, offset=n, storage="shared")
@@ -299,10 +304,16 @@ def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
     @wp.kernel(enable_backward=False, module="unique", module_options=FAST, grid_stride=False)
     def uncomposite(
         rows: Vec4s2d, ids: Ints, order: Longs, begins: Ints, owners: Ints, limits: wp.vec4, transmittance: Floats,
-        g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats, hues: Floats2d, hits: Vec2s,
+        background: Floats, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats, depths: Floats, hues: Floats2d,
+        hits: Vec2s,
     ):  # fmt: skip
         n = wp.tid()
-        behind = transmittance[n] * g_transmittance[n]
+        by_light = float(0.0)
+        if g_transmittance:
+            by_light = g_transmittance[n]
+        for c in range(wp.static(C)):
+            by_light += g_rgb[n, c] * background[c]
+        behind = transmittance[n] * by_light
         first = begins[n]
         count = begins[n + 1] - first
         for back in range(count):
@@ -341,7 +352,8 @@ class ImageGradient:
     """The gradient dL/d(image), float32 and contiguous, and the error of each pixel, used for contributions."""
 
     rgb: Tensor  # (H W, C)
-    transmittance: Tensor  # (H W,), includes the background's share
+    transmittance: Tensor | None  # (H W,), without the background's share
+    background: Tensor  # (C,) colour behind everything
     z: Tensor | None  # (H W,)
     error: Tensor  # (H W,)
 
@@ -362,22 +374,24 @@ def rasterizer_gradient_rows(
     pairs, tiles = lists.pairs, lists.starts.shape[0] - 1
     a = KernelArrays(frame, net, settings, drawn.spans, drawn.offsets)
     g_z = warp_array(torch.empty(0, device=device) if gradient.z is None else gradient.z)
-    g_rgb, g_T, error = warp_array(gradient.rgb), warp_array(gradient.transmittance), warp_array(gradient.error)
+    g_rgb, error = warp_array(gradient.rgb), warp_array(gradient.error)
+    g_T = None if gradient.transmittance is None else warp_array(gradient.transmittance)
+    behind = warp_array(gradient.background)
     hits, reached, T = array(drawn.hits, wp.vec2), warp_array(drawn.reached), warp_array(drawn.transmittance)
     depths, hues, floor = warp_array(drawn.depths), warp_array(drawn.hues), settings.depth_floor
     if drawn.order is None or drawn.begins is None or drawn.owners is None:
         tile = (a.rows, a.starts, a.ids, a.spans, a.offsets, a.limits, a.size)
-        images = (T, reached, g_rgb, g_T, g_z, depths, hues, hits)
+        images = (T, reached, behind, g_rgb, g_T, g_z, depths, hues, hits)
         launch_kernel(pixels_kernel(form, depth), (tiles, L.PIXELS), (*tile, *images), device, L.PIXELS)
     else:
         sorted_hits = (warp_array(drawn.order), warp_array(drawn.begins), warp_array(drawn.owners))
-        inputs = (a.rows, a.ids, *sorted_hits, a.limits, T, g_rgb, g_T, g_z, depths, hues, hits)
+        inputs = (a.rows, a.ids, *sorted_hits, a.limits, T, behind, g_rgb, g_T, g_z, depths, hues, hits)
         launch_kernel(uncomposite_kernel(form, depth), len(drawn.transmittance), inputs, device)
     few, which = (len(drawn.in_float64), L.WARP), warp_array(drawn.in_float64)
     width = L.gradient_width(form.neurons, form.channels)
     pair_rows = torch.empty(pairs, width, dtype=torch.float32, device=device)
     out, flat_rgb = warp_array(pair_rows.view(-1)), warp_array(gradient.rgb.view(-1))
-    inputs = (a.rows, *a.covered, a.lens, floor, a.size, reached, hits, flat_rgb, g_z, error, out)
+    inputs = (a.rows, *a.covered, a.lens, floor, a.size, a.starts, reached, hits, flat_rgb, g_z, error, out)
     launch_kernel(pairs_kernel(form, depth), (pairs, L.WARP), inputs, device, L.WARP)
     if len(drawn.in_float64):
         view = (a.lens, floor, a.size, form.neurons)

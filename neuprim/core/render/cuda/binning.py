@@ -383,15 +383,16 @@ def bin_primitives(
     image_of, several = (None, 1) if images is None else (array(images[0], wp.int32), images[1])
     each = across * down
 
-    def integers(n: int) -> Tensor:  # zeros: there may be fewer pairs, and zero is an index
-        return torch.zeros(n, dtype=torch.int32, device=device)
+    # zeros: there may be fewer pairs, and zero is an index
+    sizes = [pairs, pairs, pairs, several * each + 1, N + 1, N, counted.in_float64]
+    ids, tile_of, slots_of, starts, first, slots, which = torch.zeros(
+        sum(sizes), dtype=torch.int32, device=device
+    ).split(sizes)
 
     dtype = torch.int32 if several * each * N < torch.iinfo(torch.int32).max else torch.int64
     emit, list_pairs = _binning_kernels(dtype == torch.int32)
     number = wp.int32 if dtype == torch.int32 else wp.int64
     order = torch.argsort(depth, stable=True)
-    first = integers(N + 1)
-    slots, which = integers(N), integers(counted.in_float64)
     keys = torch.full((pairs,), torch.iinfo(dtype).max, dtype=dtype, device=device)  # sorts behind all pairs
     reached = (
         array(rows, wp.vec4), array(spans.view(N, 2, 4), wp.vec4), array(boxes, wp.vec4i), array(order, wp.int64),
@@ -401,8 +402,6 @@ def bin_primitives(
     )  # fmt: skip
     launch_kernel(emit, N, reached, device, PER_BLOCK)
     keys, came_from = torch.sort(keys)
-    starts = integers(several * each + 1)
-    ids, tile_of, slots_of = integers(pairs), integers(pairs), integers(pairs)
     found = (
         array(keys, number), array(came_from, wp.int64), array(order, wp.int64), array(counted.ends, wp.int64),
         array(which, wp.int32), several * each, each,

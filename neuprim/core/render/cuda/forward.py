@@ -377,15 +377,21 @@ def _count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -
             )
     else:
         total, few = capacity.slots, capacity.float64_pairs
-        starts, sizes = frame.lists.starts, wp.vec4i(capacity.pairs, capacity.in_float64, total, few)
-        sums = (warp_array(frame.ends), warp_array(ends), warp_array(frame.bad))
-        inputs = (*sums, sizes, warp_array(starts), warp_array(capacity.refused))
-        launch_kernel(refuse_frame, len(starts), inputs, device)
+        _refuse_misfit(frame, ends, capacity)
     in_float64 = torch.full((few,), -1, dtype=torch.int32, device=device)
     if few:
         inputs = tuple(warp_array(x) for x in (frame.lists.starts, counts, ends, in_float64))
         launch_kernel(list_float64_pairs, pairs, inputs, device)
     return total, offsets, in_float64
+
+
+def _refuse_misfit(frame: Frame, slot_ends: Tensor, capacity: FrameCapacity) -> None:
+    """Empty the tiles of a frame that does not fit. ``slot_ends``: (2, P) running sums of slots and float64 pairs."""
+    starts = frame.lists.starts
+    sizes = wp.vec4i(capacity.pairs, capacity.in_float64, capacity.slots, capacity.float64_pairs)
+    sums = (warp_array(frame.ends), warp_array(slot_ends), warp_array(frame.bad))
+    inputs = (*sums, sizes, warp_array(starts), warp_array(capacity.refused))
+    launch_kernel(refuse_frame, len(starts), inputs, frame.device)
 
 
 def composite_frame(
@@ -415,11 +421,13 @@ def composite_frame(
     inputs = (a.rows, *silhouettes, a.starts, a.ids, a.tile_of, a.size, a.spans, warp_array(counts))
     launch_kernel(row_spans, pairs, inputs, device)
     sorts = settings.sort == "entry"
-    keep = differentiable or sorts or frame.wide.shape[0] > 0 or capacity is not None
+    keep = differentiable or sorts or frame.wide.shape[0] > 0
     total, in_float64 = 0, empty(0, dtype=torch.int32)
     if keep and pairs:
         total, offsets, in_float64 = _count_slots(frame, counts, capacity)
         a.offsets = warp_array(offsets)
+    elif capacity is not None:
+        _refuse_misfit(frame, torch.zeros(2, 1, dtype=torch.int64, device=device), capacity)
     hits, depths = empty(total, 2), empty(total if settings.depth else 0)
     hues = empty(total if net is not None else 0, form.channels)
     if len(in_float64):

@@ -1,0 +1,72 @@
+"""CUDA graphs: the launches of a function are recorded once and replayed, which takes the host a few microseconds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+
+from neuprim.core.compute import device
+from neuprim.core.errors import warn_once
+
+
+class GraphRecorder:
+    """Records functions that work on a GPU, on tensors whose memory never changes; elsewhere it just calls them.
+
+    The first function runs without being recorded: this loads its kernels, and finds an operation that waits for the
+    device, which a graph cannot hold. Then nothing is recorded.
+
+    Args:
+        where: device of the functions.
+        what: what they do, for the warning that they wait.
+
+    Attributes:
+        failed: whether an operation waited; the last function stopped there.
+    """
+
+    def __init__(self, where: torch.device, what: str) -> None:
+        self.failed, self._where, self._what = False, where, what
+        self._on_gpu = where.type == device.CUDA
+        self._tried = not self._on_gpu
+        self._stream = torch.cuda.Stream(where) if self._on_gpu else None
+        self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
+
+    def record(self, function: Callable[[], None]) -> Callable[[], None]:
+        """Return a function with the same effect as ``function``, which is replayed from its second call on."""
+        if not self._on_gpu:
+            return function
+        replay: list[Callable[[], None]] = []
+
+        def run() -> None:
+            if replay:
+                replay[0]()
+            elif self._tried:
+                graph = torch.cuda.CUDAGraph()
+                # "thread_local": other threads may use the GPU meanwhile
+                with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
+                    function()
+                replay.append(graph.replay)
+                graph.replay()
+            else:
+                self._tried = True
+                self._call(function)
+
+        return run
+
+    def _call(self, function: Callable[[], None]) -> None:
+        stream, current = self._stream, torch.cuda.current_stream(self._where)
+        assert stream is not None
+        stream.wait_stream(current)
+        mode = torch.cuda.get_sync_debug_mode()
+        torch.cuda.set_sync_debug_mode("error")
+        try:
+            with torch.cuda.stream(stream):
+                function()
+        except RuntimeError as error:
+            if "synchronizing" not in str(error):
+                raise
+            self.failed = True
+            warn_once(f"{self._what} are not recorded as CUDA graphs, as one waits for the GPU: {error}")
+        finally:
+            torch.cuda.set_sync_debug_mode(mode)
+            current.wait_stream(stream)

@@ -1,6 +1,6 @@
 """The CUDA backend on a GPU: parity with the float64 reference, times, frames per second, peak memory.
 
-    python benchmarks/gpu.py [--parts parity times steps kernels train runs] [--scenes 5000 20000 100000 300000 1000000]
+    python benchmarks/gpu.py [--parts parity times steps frames kernels train runs] [--scenes 5000 20000 100000 300000 1000000]
         [--sizes 800x800 1920x1080] [--chair DIR] [--fire DIR] [--mic DIR] [--trained chair fire lit_solids] [--record]
     python benchmarks/gpu.py --print [--docs]
 
@@ -11,6 +11,7 @@
               parameter), medians by CUDA events; frames per second, peak memory, primitive-pixel hits
     steps     training steps of the trainer on random scenes, L1 + SSIM, replayed as a CUDA graph and not: ms a step, and
               whether both end with the same bits
+    frames    frames of these scenes, replayed as a CUDA graph and not: ms until the image is complete
     kernels   where a training step's time goes, kernel by kernel, of the scene with the most primitives up to 100,000
     train     preset quick of each task with its usual steps on the GPU: ms a step of the second half, PSNR on the test
               views
@@ -22,6 +23,7 @@ has its own; --print makes them from what is recorded. Times are absolute, of th
 
 from __future__ import annotations
 
+import itertools
 import re
 import statistics
 import time
@@ -55,7 +57,7 @@ from neuprim.core.model.cosine import OMEGA0, CosineDensity
 from neuprim.core.model.fields import Constant, Cosine
 from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import LoweredPrimitives, Primitives
-from neuprim.core.render import RenderSettings, render_lowered
+from neuprim.core.render import RenderSettings, render, render_lowered
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.settings import PopulationSettings, TrainSettings
 from neuprim.core.train.trainer import Trainer
@@ -64,7 +66,7 @@ from neuprim.tasks.static import SphericalHarmonics
 
 FOLDER, PAGE = RESULTS / "gpu", RESULT_PAGES / "gpu.md"
 FORMS = {"K=8 p=0": (8, 0), "K=2 p=2": (2, 2), "K=0 p=2": (0, 2)}
-PARTS = ("parity", "times", "steps", "kernels", "train", "runs")
+PARTS = ("parity", "times", "steps", "frames", "kernels", "train", "runs")
 RUNS = ((60, 25_000), (140, 30_000))
 """Seconds and primitives."""
 STEPS = {"chair": 2500, "fire": 4000, "smoke_fire": 4000, "lit_solids": 2600}
@@ -226,6 +228,28 @@ def measure_steps(counts: Sequence[int], sizes: Sequence[tuple[int, int]], steps
                 yield {**row, "same": all(torch.equal(states[0][name], states[1][name]) for name in states[0])}
 
 
+def measure_frames(counts: Sequence[int], sizes: Sequence[tuple[int, int]]) -> Iterator[Record]:
+    """Frames of a model from places around it: until the image is complete, replayed and with every kernel launched."""
+    for name, form in FORMS.items():
+        for count in counts:
+            for width, height in sizes:
+                trainer = random_trainer(count, *form, make_camera(width, height))
+                model, views = trainer.model, trainer.dataset.train
+                cameras = itertools.cycle([views.view(i).camera for i in range(len(views))])
+
+                def replayed(cameras: Any = cameras, model: Any = model, settings: Any = trainer.renderer) -> None:
+                    with torch.no_grad():
+                        render(model, next(cameras), {}, settings)
+
+                def launched(cameras: Any = cameras, model: Any = model, settings: Any = trainer.renderer) -> None:
+                    with torch.no_grad():
+                        camera = next(cameras)
+                        render_lowered(model.lower(camera, {}), camera, settings)
+
+                row: Record = {"form": name, "primitives": count, "width": width, "height": height}
+                yield {**row, "frame_ms": median_ms(replayed, warm=12), "launched_ms": median_ms(launched)}
+
+
 def measure_kernels(count: int, width: int, height: int) -> dict[str, dict[str, float]]:
     """Milliseconds of each kernel in a training step, by form."""
     found = {}
@@ -316,6 +340,14 @@ COLUMNS: dict[str, Columns] = {
         "same bits": lambda row: "yes" if row["same"] else "**no**",
         "peak MB": lambda row: f"{row['peak_mb']:,.0f}",
     },
+    "frames": {
+        "form": lambda row: row["form"],
+        "primitives": lambda row: f"{row['primitives']:,}",
+        "size": lambda row: f"{row['width']}×{row['height']}",
+        "launched, ms": lambda row: f"{row['launched_ms']:.2f}",
+        "graph, ms": lambda row: f"{row['frame_ms']:.2f}",
+        "frames/s": lambda row: f"{1000 / row['frame_ms']:.0f}",
+    },
     "train": {
         "scene": lambda row: row["scene"].replace("_", " "),
         "primitives": lambda row: f"{row['primitives']:,}",
@@ -354,7 +386,7 @@ def make_tables(records: Sequence[Record]) -> dict[str, str]:
     texts = {part: tables(part, columns) for part, columns in COLUMNS.items()}
     if first := tables("times_before", COLUMNS["times"]):
         texts["times"] += f"\n\nThe first version that ran there, up to a million primitives:\n\n{first}"
-    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-steps": "steps", "gpu-training": "train", "gpu-runs": "runs"}
+    markers = {"gpu-parity": "parity", "gpu-times": "times", "gpu-steps": "steps", "gpu-frames": "frames", "gpu-training": "train", "gpu-runs": "runs"}
     return {marker: texts[part] for marker, part in markers.items() if texts[part]}
 
 
@@ -375,6 +407,7 @@ def main() -> None:
             "parity": lambda: list(measure_parity(args.device)),
             "times": lambda: list(measure_times(args.scenes, sizes)),
             "steps": lambda: list(measure_steps(args.scenes, sizes)),
+            "frames": lambda: list(measure_frames(args.scenes, sizes)),
             "kernels": lambda: measure_kernels(max((c for c in args.scenes if c <= 100_000), default=5000), *sizes[0]),
             "train": lambda: list(measure_training(args.trained, vars(args))),
             "runs": lambda: list(measure_runs(args.mic)),

@@ -18,6 +18,8 @@ from neuprim.core.render import RenderSettings, render_lowered
 
 KINDS = {"thin": (500, 1), "deep": (300, 2), "inside": (200, 3)}
 """Few hits a pixel; many and opaque; around and behind the camera, with fast neurons. Primitives and seed."""
+FORMS = ((8, 0), (8, 2), (2, 1), (2, 2), (0, 2), (16, 0))
+"""Neurons and edge."""
 NAMES = ("means", "log_scales", "quats", "W1", "b1", "w2", "b2", "colours", "view", "background")
 SIZE = 64
 
@@ -67,7 +69,7 @@ def render_with_gradients(
 def measure_parity(device: str) -> Iterator[dict[str, Any]]:
     """Errors of the CUDA backend: of images, absolute; of each gradient over its largest number; and whether a rerun is
     the same."""
-    for neurons, edge in ((8, 0), (8, 2), (2, 1), (2, 2), (0, 2), (16, 0)):
+    for neurons, edge in FORMS:
         for kind in KINDS:
             values, settings = small_scene(kind, neurons), RenderSettings(depth=kind == "deep")
             reference = replace(settings, backend="reference", device="cpu")

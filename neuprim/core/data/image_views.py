@@ -7,7 +7,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Container, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ from scipy import ndimage
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.compute import device
 from neuprim.core.compute.kernels import exact_kernel
 from neuprim.core.compute.threads import resolve_threads
 from neuprim.core.data import Pixels, View, ViewSet
@@ -171,7 +172,13 @@ def reduce_image_mask(mask: Tensor, factor: int) -> Tensor:
 
 _CACHE_BYTES = 2 * 2**30
 _GRIDS = 4
+_BYTE = 1.0 / 255.0
 _LINEAR = srgb_to_linear(torch.arange(256) / 255.0)
+
+
+@cache
+def _linear_table(where: torch.device) -> Tensor:
+    return _LINEAR.to(where)
 
 
 @dataclass(frozen=True)
@@ -207,6 +214,15 @@ class _StoredImage:
     to_linear: bool = False  # whether 8-bit colours are converted to linear light
     scale: float = 1.0  # factor on the colours, after to_linear
 
+    def to(self, where: torch.device) -> _StoredImage:
+        """Return a copy on another device; the copy may be asynchronous."""
+        mask = None if self.mask is None else device.copy_to_device(self.mask, where)
+        return replace(self, data=device.copy_to_device(self.data, where), mask=mask)
+
+    @property
+    def nbytes(self) -> int:
+        return self.data.nbytes + (0 if self.mask is None else self.mask.nbytes)
+
     def strided(self, step: int, column: int, row: int) -> _StoredImage:
         data, words = self.data, self.data.dtype == torch.uint8 and self.data.shape[-1] == 4
         few = Pixels(data.view(torch.int32) if words else data, None, self.mask).strided(step, column, row)
@@ -219,25 +235,28 @@ class _StoredImage:
             return None
         alpha = self.data[..., 3].float()
         if self.data.dtype == torch.uint8:
-            alpha = alpha * (1.0 / 255.0) if self._by_kernel else alpha / 255.0
+            alpha = alpha * _BYTE if self._multiplies_alpha else alpha / 255.0
         return alpha.contiguous()
 
     def planes(self) -> tuple[Tensor, Tensor | None]:
         """Return (H, W, 3) float32 premultiplied colours, and alpha."""
-        if self._by_kernel:  # in one pass, as every step needs them
-            rgb, whole = torch.empty(*self.data.shape[:2], 3), torch.empty(self.data.shape[:2])
-            outputs = rgb.reshape(-1, 3).numpy(), whole.reshape(-1).numpy()
-            _premultiply_dataset_kernel(self.data.reshape(-1, 4).numpy(), *outputs)
-            return rgb, whole
         rgb, eight_bit, alpha = self.data[..., :3], self.data.dtype == torch.uint8, self.alpha
+        if self._multiplies_alpha:
+            assert alpha is not None
+            if not device.on_numba(self.data):
+                return rgb.float() * _BYTE * alpha[..., None], alpha
+            made = torch.empty(*self.data.shape[:2], 3)  # in one pass, as every step needs them
+            outputs = made.reshape(-1, 3).numpy(), alpha.reshape(-1).numpy()
+            _premultiply_dataset_kernel(self.data.reshape(-1, 4).numpy(), *outputs)
+            return made, alpha
         if not self.to_linear:
             return (rgb / 255.0 if eight_bit else rgb.float()).contiguous(), alpha
-        rgb = _LINEAR[rgb.int()] if eight_bit else rgb.float()
+        rgb = _linear_table(rgb.device)[rgb.int()] if eight_bit else rgb.float()
         rgb = rgb if self.premultiplied or alpha is None else rgb * alpha[..., None]
         return (rgb * self.scale).contiguous(), alpha
 
     @property
-    def _by_kernel(self) -> bool:
+    def _multiplies_alpha(self) -> bool:
         """Whether these are 8-bit sRGB colours to be multiplied with alpha."""
         return not (self.premultiplied or self.to_linear or self.data.shape[-1] == 3)
 
@@ -245,7 +264,8 @@ class _StoredImage:
 class StoredPixels(Pixels):
     """Pixels of a stored image, converted to floats on first use.
 
-    Strided views convert only their own pixels. Alpha is converted alone if nothing reads the colours.
+    Strided views convert only their own pixels. Alpha is converted alone if nothing reads the colours. On a GPU the
+    stored image stays as it is, too, and takes a quarter of the memory of floats.
 
     Args:
         image: the image; None if ``fields`` has the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
@@ -255,6 +275,9 @@ class StoredPixels(Pixels):
 
     def __init__(self, image: _StoredImage | None = None, **fields: Any) -> None:
         self.__dict__.update(fields if image is None else {"mask": image.mask}, image=image)
+
+    def to(self, where: torch.device) -> Pixels:
+        return super().to(where) if self.image is None else StoredPixels(self.image.to(where))
 
     @cached_property
     def rgb(self) -> Tensor:  # type: ignore[override]

@@ -44,7 +44,8 @@ class PixelLoader:
     """Loads the pixels of training views.
 
     For a GPU, a thread loads the next view in advance, which does not change the order of the views. Views that fit in
-    a quarter of the free memory are cached, as loading a large view again takes longer than a step.
+    a quarter of the free memory are cached, as loading a large view again takes longer than a step. Stored images are
+    cached as they are, most of them in 8 bits.
     """
 
     def __init__(self, dataset: Dataset, where: torch.device) -> None:
@@ -69,13 +70,16 @@ class PixelLoader:
             pixels = self._cache[index]
         else:
             pixels = pending[1].result() if pending is not None and pending[0] == index else self._load(index)
-            size = sum(x.nbytes for x in (pixels.rgb, pixels.alpha, pixels.mask) if x is not None)
+            stored = pixels.image if isinstance(pixels, StoredPixels) else None
+            parts = [stored] if stored is not None else [pixels.rgb, pixels.alpha, pixels.mask]
+            size = sum(x.nbytes for x in parts if x is not None)
             if size <= self._capacity:
                 self._cache[index], self._capacity = pixels, self._capacity - size
         if upcoming is not None and upcoming not in self._cache:
             self._pool = self._pool or ThreadPoolExecutor(1, thread_name_prefix="neuprim-views")
             self._pending = upcoming, self._pool.submit(copy_context().run, self._load, upcoming)
-        return pixels
+        # a cached image must not keep its floats
+        return StoredPixels(pixels.image) if isinstance(pixels, StoredPixels) and pixels.image is not None else pixels
 
 
 class PixelStride(NamedTuple):

@@ -33,12 +33,12 @@ parity``), and small forms took a third less time. The CPU ignores it."""
 
 # ---- types of kernels' arrays, by what they hold
 _SCALARS = wp.bool, wp.uint8, wp.uint16, wp.int32, wp.int64, wp.float32, wp.float64
-_VECTORS = wp.vec2, wp.vec3, wp.vec4, wp.vec4i, wp.vec4d
+_VECTORS = wp.vec2, wp.vec3, wp.vec4, wp.vec4i, wp.vec3d, wp.vec4d
 Bools, Bytes, Shorts, Ints, Longs, Floats, Doubles = (wp.array(dtype=kind) for kind in _SCALARS)
 Bools2d, Bytes2d, Shorts2d, Ints2d, Longs2d, Floats2d, Doubles2d = (wp.array2d(dtype=kind) for kind in _SCALARS)
-Vec2s, Vec3s, Vec4s, Vec4is, Vec4ds = (wp.array(dtype=kind) for kind in _VECTORS)
-Vec2s2d, Vec3s2d, Vec4s2d, Vec4is2d, Vec4ds2d = (wp.array2d(dtype=kind) for kind in _VECTORS)
-Floats3d = wp.array3d(dtype=wp.float32)
+Vec2s, Vec3s, Vec4s, Vec4is, Vec3ds, Vec4ds = (wp.array(dtype=kind) for kind in _VECTORS)
+Vec2s2d, Vec3s2d, Vec4s2d, Vec4is2d, Vec3ds2d, Vec4ds2d = (wp.array2d(dtype=kind) for kind in _VECTORS)
+Mat33ds, Floats3d = wp.array(dtype=wp.mat33d), wp.array3d(dtype=wp.float32)
 
 
 def _start_warp() -> None:

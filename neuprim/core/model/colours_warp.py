@@ -273,7 +273,14 @@ class _LobeColors(torch.autograd.Function):
         means, dc, amplitude, axis, log_sharpness, origin = (x.detach().contiguous() for x in tensors)
         centre = device.to_device_like(origin.double(), means.double())
         color = torch.empty(dc.shape, dtype=torch.float32, device=dc.device)
-        ctx.tensors = (means, amplitude, axis, log_sharpness, centre, color.detach())  # the output itself would be a cycle
+        ctx.tensors = (
+            means,
+            amplitude,
+            axis,
+            log_sharpness,
+            centre,
+            color.detach(),
+        )  # the output itself would be a cycle
         ctx.origin = (tensors[-1].dtype, tensors[-1].device)
         launch_kernel(
             _lobe_forward, len(means),

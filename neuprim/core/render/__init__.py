@@ -82,7 +82,7 @@ def render(
     """
     settings = settings or RenderSettings(near="auto")
     recorder = _frame_recorder(model, camera, settings)
-    if recorder is not None:
+    if recorder is not None and isinstance(camera, Camera):
         output = recorder.render(model, camera, conditions or {}, settings, background)
         if output is not None:
             return output

@@ -22,9 +22,16 @@ from neuprim.core.compute.graphs import GraphRecorder
 from neuprim.core.data import Pixels, PointSamples, View
 from neuprim.core.model.fields import Constant
 from neuprim.core.render import backends
-from neuprim.core.render.output import Contributions, RenderOutput, RenderStats
-
-from neuprim.core.train.step_results import StepReport, ViewTask, summarize_numbers
+from neuprim.core.render.output import Contributions, RenderOutput, RenderStats, sum_contributions
+from neuprim.core.train.step_results import (
+    StepReport,
+    ViewResult,
+    ViewTask,
+    compare_view,
+    name_views,
+    summarize_numbers,
+    summarize_views,
+)
 
 if TYPE_CHECKING:
     from neuprim.core.render.cuda.binning import FrameCapacity
@@ -36,51 +43,56 @@ _IN_FLIGHT = 16
 _MARGIN, _SPARE = 1.5, 256
 """Factor and addend from the largest counts seen to the sizes of the arrays."""
 
+_NUMBERS = 64
+"""At most so many numbers go to the device and back for a view, besides channels, and for the points."""
+
 _MOST_PROGRAMS = 16
 """Most recordings kept; a recording is for one size of image and one set of intrinsics."""
 
 
 def recording_fault(trainer: Trainer) -> str | None:
     """Return why steps of a training cannot be recorded; None if they can."""
-    model, settings, renderer = trainer.current_model, trainer.settings, trainer.renderer
+    model, renderer = trainer.current_model, trainer.renderer
     if trainer.device.type != device.CUDA:
         return "the model is not on a GPU"
     if [b.name for b in backends.candidate_backends(renderer, trainer.device.type)][:1] != ["cuda"]:
         return "the renderer is not the cuda backend"
     if renderer.sort != "center" or renderer.samples != 1:
         return "renderer.sort and renderer.samples are not center and 1"
-    if settings.views_per_step != 1 or trainer.exposures is not None or trainer.corrections is not None:
-        return "a step has several views, exposures or corrections"
+    if trainer.exposures is not None or trainer.corrections is not None:
+        return "the views have exposures or corrections"
     if model.density.stage is None or model.colour.stage is None or not getattr(trainer.loss, "recordable", False):
         return "a field or the loss may compute something else in every step"
     return None
 
 
-class _Key(NamedTuple):
-    """What a recording depends on besides the numbers in its inputs."""
-
-    intrinsics: tuple[float, ...]
-    size: tuple[int, int]
-    shapes: tuple[Any, ...]  # of pixels, conditions and points
-    stages: tuple[Any, ...]
-
-
 @dataclass
 class _Inputs:
-    """The inputs of a step on the device: those of a recording are always in the same memory."""
+    """The tensors of a step's views and points on the device: those of a recording are always in the same memory."""
 
-    view: View
-    pixels: Pixels
+    views: list[tuple[View, Pixels]]
     samples: PointSamples | None
-    numbers: Tensor  # float64: view matrix, background, learning rates, scales of the points
 
     def tensors(self) -> list[Tensor]:
-        """Return all tensors but ``numbers``."""
-        found = [self.pixels.rgb, self.pixels.alpha, self.pixels.mask, *self.view.conditions.values()]
+        """Return all tensors but view matrices."""
+        found: list[Tensor | None] = []
+        for view, pixels in self.views:
+            found += [pixels.rgb, pixels.alpha, pixels.mask, *view.conditions.values()]
         if self.samples is not None:
             found += [*self.samples.conditions.values(), self.samples.points, self.samples.sigma, self.samples.source]
             found += [value for value, _ in self.samples.components.values()]
         return [x for x in found if x is not None]
+
+    def shapes(self) -> tuple[Any, ...]:
+        """Return what a recording depends on: intrinsics and sizes, and which tensors there are."""
+        found: list[Any] = [tuple(x.shape for x in self.tensors())]
+        for view, pixels in self.views:
+            camera = view.camera
+            found += [camera.fx, camera.fy, camera.cx, camera.cy, camera.width, camera.height, *view.conditions]
+            found += [pixels.alpha is not None, pixels.mask is not None]
+        if self.samples is not None:
+            found += [self.samples.source is not None, *self.samples.conditions, *self.samples.components]
+        return tuple(found)
 
 
 @dataclass
@@ -88,9 +100,10 @@ class _Program:
     """A recorded step: its inputs, its results and the function that runs it."""
 
     inputs: _Inputs
+    given: Tensor  # float64: for each view its matrix and background; learning rates; scales of the points
     run: Callable[[], None] = lambda: None
-    numbers: Tensor | None = None  # float64: refused, then those of RenderedView.numbers
-    parts: tuple[str, ...] = ()
+    found: Tensor | None = None  # float64: refused, then RenderedView.numbers of each view
+    parts: tuple[tuple[str, ...], ...] = ()  # of the loss of each view
 
 
 class _Flight(NamedTuple):
@@ -98,10 +111,10 @@ class _Flight(NamedTuple):
 
     step: int
     progress: float
-    task: ViewTask
+    tasks: list[ViewTask]
     samples: PointSamples | None
     report: StepReport
-    parts: tuple[str, ...]
+    parts: tuple[tuple[str, ...], ...]
     memory: tuple[Tensor, Tensor]  # of the host: numbers given, numbers found
     event: Any
 
@@ -121,8 +134,8 @@ class StepRecorder:
         self._on_gpu = trainer.device.type == device.CUDA
         self._refused = torch.zeros(1, dtype=torch.int32, device=trainer.device)
         self._counts = (0, 0, 0, 0)
-        self._programs: dict[_Key, _Program] = {}
-        self._seen: Counter[_Key] = Counter()
+        self._programs: dict[Any, _Program] = {}
+        self._seen: Counter[Any] = Counter()
         self._sums: tuple[Tensor | None, ...] = ()
         self._flights: deque[_Flight] = deque()
         self._memory: list[tuple[Tensor, Tensor]] = []
@@ -145,8 +158,8 @@ class StepRecorder:
         if self.capacity is not None and self.capacity.fits(counts):
             return
         self._counts = tuple(max(pair) for pair in zip(counts, self._counts, strict=True))  # type: ignore[assignment]
-        sizes = [int(_MARGIN * count) + _SPARE for count in self._counts]
-        self.capacity = FrameCapacity(*sizes, self._refused)
+        pairs, in_float64, slots, float64_pairs = (int(_MARGIN * count) + _SPARE for count in self._counts)
+        self.capacity = FrameCapacity(pairs, in_float64, slots, float64_pairs, self._refused)
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
@@ -161,28 +174,29 @@ class StepRecorder:
             self.reset()
             self._sums = sums
         trainer.settle(_IN_FLIGHT - 1)
-        (task,) = tasks
-        view, pixels = trainer.load_view(task)
-        program = self._find_program(view, pixels, samples)
+        inputs = _Inputs([trainer.load_view(task) for task in tasks], samples)
+        program = self._find_program(inputs)
         if program is None:
             return None
+        values = []
+        for (view, _), task in zip(inputs.views, tasks, strict=True):
+            values += [*view.camera.viewmat.double().reshape(-1).tolist(), *task.background.tolist()]
+        values += trainer.rates(progress).values()
+        if samples is not None:
+            values += [samples.sigma_scale, samples.source_scale, *(scale for _, scale in samples.components.values())]
         given, found = memory = self._memory.pop() if self._memory else self._allocate()
-        scales = [] if samples is None else [samples.sigma_scale, samples.source_scale]
-        scales += [] if samples is None else [scale for _, scale in samples.components.values()]
-        rates = trainer.rates(progress).values()
-        values = [*view.camera.viewmat.double().reshape(-1).tolist(), *task.background.tolist(), *rates, *scales]
         given.numpy()[: len(values)] = values
-        program.inputs.numbers.copy_(given[: len(values)], non_blocking=True)
-        for own, new in zip(program.inputs.tensors(), _Inputs(view, pixels, samples, given).tensors(), strict=True):
+        program.given.copy_(given[: len(values)], non_blocking=True)
+        for own, new in zip(program.inputs.tensors(), inputs.tensors(), strict=True):
             own.copy_(new.pin_memory() if self._on_gpu and new.is_cpu else new, non_blocking=True)
         program.run()
-        if self._graphs.failed or program.numbers is None:
+        if self._graphs.failed or program.found is None:
             self._memory.append(memory)
             return None
-        found[: len(program.numbers)].copy_(program.numbers, non_blocking=True)
+        found[: len(program.found)].copy_(program.found, non_blocking=True)
         event = torch.cuda.current_stream(trainer.device).record_event() if self._on_gpu else None
-        report = trainer.pending_report(view.name)
-        self._flights.append(_Flight(trainer.step, progress, task, samples, report, program.parts, memory, event))
+        report = trainer.pending_report(name_views([view.name for view, _ in inputs.views]))
+        self._flights.append(_Flight(trainer.step, progress, tasks, samples, report, program.parts, memory, event))
         self.replayed += 1
         return report
 
@@ -203,27 +217,26 @@ class StepRecorder:
                 return again
             self._flights.popleft()
             self._memory.append(first.memory)
-            first.report.resolve(*summarize_numbers(numbers, first.parts))
+            results = []
+            for task, parts in zip(first.tasks, first.parts, strict=True):
+                cost, named, psnr = summarize_numbers(numbers, parts)
+                results.append(ViewResult(task.view, "", cost, psnr, named, None, None))
+                numbers = numbers[3 + len(parts) :]
+            first.report.resolve(*summarize_views(results))
         return []
 
     def _allocate(self) -> tuple[Tensor, Tensor]:
-        size = 64 + len(self.trainer.current_model.specs) + self.trainer.dataset.channels
+        views, channels = self.trainer.settings.views_per_step, self.trainer.dataset.channels
+        size = views * (_NUMBERS + channels) + len(self.trainer.current_model.specs) + _NUMBERS
         given, found = (torch.zeros(size, dtype=torch.float64, pin_memory=self._on_gpu) for _ in range(2))
         return given, found
 
     # ------------------------------------------------------------ recording
 
-    def _find_program(self, view: View, pixels: Pixels, samples: PointSamples | None) -> _Program | None:
-        model, camera, trainer = self.trainer.current_model, view.camera, self.trainer
-        shapes = [pixels.alpha is not None, pixels.mask is not None, *view.conditions]
-        if samples is not None:
-            shapes += [samples.points.shape, samples.source is not None, *samples.conditions, *samples.components]
-        key = _Key(
-            (camera.fx, camera.fy, camera.cx, camera.cy),
-            (camera.width, camera.height),
-            tuple(shapes),
-            (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size),
-        )
+    def _find_program(self, inputs: _Inputs) -> _Program | None:
+        model, trainer = self.trainer.current_model, self.trainer
+        stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size)
+        key = (stages, inputs.shapes())
         program = self._programs.get(key)
         if program is None:
             self._seen[key] += 1
@@ -231,73 +244,82 @@ class StepRecorder:
                 return None
             if len(self._programs) >= _MOST_PROGRAMS:
                 self._programs.pop(next(iter(self._programs)))
-            program = self._programs[key] = self._make_program(view, pixels, samples)
+            program = self._programs[key] = self._make_program(inputs)
         return program
 
-    def _make_program(self, view: View, pixels: Pixels, samples: PointSamples | None) -> _Program:
-        """Return a program with tensors of its own for the inputs of such a step."""
-        where, count = self.trainer.device, len(self.trainer.current_model.specs)
-        channels = self.trainer.dataset.channels
+    def _make_program(self, inputs: _Inputs) -> _Program:
+        """Return a program with tensors of its own for such inputs."""
+        where, each = self.trainer.device, 16 + self.trainer.dataset.channels
+        rates = each * len(inputs.views)
+        scales = rates + len(self.trainer.current_model.specs)
+        samples, size = inputs.samples, scales
+        if samples is not None:
+            size += 2 + len(samples.components)
+        given = torch.empty(size, dtype=torch.float64, device=where)
 
-        def like(value: Tensor | None) -> Tensor | None:
+        def like(value: Any) -> Any:
             return None if value is None else torch.empty_like(value, device=where)
 
         def like_all(values: Mapping[str, Tensor]) -> dict[str, Tensor]:
-            return {name: torch.empty_like(value, device=where) for name, value in values.items()}
+            return {name: like(value) for name, value in values.items()}
 
-        numbers = torch.empty(64 + count + channels, dtype=torch.float64, device=where)
-        scales = numbers[16 + channels + count :]
-        own_samples = None
+        views = []
+        for at, (view, pixels) in enumerate(inputs.views):
+            camera = replace(view.camera, viewmat=given[at * each :][:16].view(4, 4))
+            own = Pixels(like(pixels.rgb), like(pixels.alpha), like(pixels.mask))
+            views.append((View(view.name, camera, like_all(view.conditions)), own))
         if samples is not None:
-            components = {
-                name: (torch.empty_like(value, device=where), scales[2 + at])
-                for at, (name, (value, _)) in enumerate(samples.components.items())
+            values = like_all({name: value for name, (value, _) in samples.components.items()})
+            # numbers on the device take the place of floats
+            own_scales: dict[str, Any] = {"sigma_scale": given[scales], "source_scale": given[scales + 1]}
+            own_scales["components"] = {
+                name: (value, given[scales + 2 + k]) for k, (name, value) in enumerate(values.items())
             }
-            own_samples = replace(
+            samples = replace(
                 samples, conditions=like_all(samples.conditions), points=like(samples.points),
-                sigma=like(samples.sigma), source=like(samples.source), sigma_scale=scales[0],
-                source_scale=scales[1], components=components,
+                sigma=like(samples.sigma), source=like(samples.source), **own_scales,
             )  # fmt: skip
-            numbers = numbers[: 18 + channels + count + len(components)]
-        else:
-            numbers = numbers[: 16 + channels + count]
-        camera = replace(view.camera, viewmat=numbers[:16].view(4, 4))
-        own_pixels = Pixels(torch.empty_like(pixels.rgb, device=where), like(pixels.alpha), like(pixels.mask))
-        inputs = _Inputs(View(view.name, camera, like_all(view.conditions)), own_pixels, own_samples, numbers)
-        program = _Program(inputs)
+        program = _Program(_Inputs(views, samples), given)
 
         def take_step() -> None:
-            program.numbers, program.parts = self._take_step(inputs)
+            backgrounds = [given[at * each + 16 :][: each - 16].float() for at in range(len(views))]
+            program.found, program.parts = self._take_step(program.inputs, backgrounds, given[rates:scales].float())
 
         program.run = self._graphs.record(take_step)
         return program
 
-    def _take_step(self, inputs: _Inputs) -> tuple[Tensor, tuple[str, ...]]:
-        """Take a step on the device; return (refused, numbers...) and the names of the loss's parts."""
+    def _take_step(
+        self, inputs: _Inputs, backgrounds: list[Tensor], rates: Tensor
+    ) -> tuple[Tensor, tuple[tuple[str, ...], ...]]:
+        """Take a step on the device; return (refused, numbers of each view) and the names of the parts of its loss."""
         trainer, model, params = self.trainer, self.trainer.current_model, self.trainer.current_model.params
-        background, rates, _ = inputs.numbers[16:].float().tensor_split(
-            [trainer.dataset.channels, trainer.dataset.channels + len(model.specs)]
-        )
         # leaves of their own, as those of earlier steps may belong to another stream
         model.params = {name: value.detach().requires_grad_() for name, value in params.items()}
+        wanted = [value for value in model.params.values() if value.numel()]
+        numbers, parts, each = list[Tensor](), list[tuple[str, ...]](), list[Contributions]()
         try:
-            rendered = trainer.compare_view(inputs.view, inputs.pixels, background, 0.0, self._draw)
-            points = None if inputs.samples is None else trainer.compare_points(inputs.samples)
-            loss = trainer.total_loss(rendered.loss / 1, points)
-            torch.maximum(self._refused, (~loss.detach().isfinite()).int().reshape(1), out=self._refused)
-            wanted = [value for value in model.params.values() if value.numel()]
-            for value, grad in zip(wanted, torch.autograd.grad(loss, wanted, allow_unused=True), strict=True):
-                value.grad = grad
+            for (view, pixels), background in zip(inputs.views, backgrounds, strict=True):
+                rendered = compare_view(self._draw(view, background), trainer.loss, view, pixels, background)
+                loss, points = rendered.loss / len(backgrounds), None
+                if len(each) + 1 == len(backgrounds):
+                    points = None if inputs.samples is None else trainer.compare_points(inputs.samples)
+                    loss = trainer.total_loss(loss, points)
+                torch.maximum(self._refused, (~loss.detach().isfinite()).int().reshape(1), out=self._refused)
+                for value, grad in zip(wanted, torch.autograd.grad(loss, wanted, allow_unused=True), strict=True):
+                    value.grad = grad if value.grad is None or grad is None else value.grad + grad
+                more = {} if points is None else points.parts
+                numbers.append(rendered.numbers(loss, more.values()))
+                parts.append((*rendered.parts, *more))
+                each.append(rendered.contributions)
+            contributions = each[0] if len(each) == 1 else sum_contributions(each, model.count)
             accepted = self._refused == 0
-            weight, error = (torch.where(accepted, x, 0.0) for x in rendered.contributions.of_all(model.count))
+            weight, error = (torch.where(accepted, x, 0.0) for x in contributions.of_all(model.count))
             trainer.population.observe(model, Contributions(weight, error))
             trainer.optimizer.step_recorded(model.params, rates, self._refused)
             trainer.limit_model(trainer.limits_size, self._refused == 0)
         finally:
             model.params = params
-        more = {} if points is None else points.parts
-        numbers = rendered.numbers(loss, more.values())
-        return torch.cat([self._refused.double(), numbers]), (*rendered.parts, *more)
+        return torch.cat([self._refused.double(), *numbers]), tuple(parts)
 
     def _draw(self, view: View, background: Tensor) -> RenderOutput:
         from neuprim.core.render.cuda.backend import render

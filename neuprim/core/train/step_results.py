@@ -10,7 +10,9 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from neuprim.core.render.output import Contributions
+from neuprim.core.data import Pixels, View
+from neuprim.core.render.output import Contributions, RenderOutput
+from neuprim.core.task import Loss, Supervision
 from neuprim.core.train.training_views import PixelStride
 
 
@@ -98,13 +100,31 @@ class RenderedView:
         values = (cost.detach(), self.squared, self.counted, *self.parts.values(), *more)
         like = self.squared
         return torch.stack(
-            [x.detach().double() if isinstance(x, Tensor) else like.new_full((), x, dtype=torch.float64) for x in values]
+            [
+                x.detach().double() if isinstance(x, Tensor) else like.new_full((), x, dtype=torch.float64)
+                for x in values
+            ]
         )
 
 
-def summarize_numbers(
-    numbers: Sequence[float], parts: Sequence[str]
-) -> tuple[float, dict[str, float], float]:
+def compare_view(
+    output: RenderOutput, loss: Loss, view: View, pixels: Pixels, background: Tensor, progress: float = 0.0
+) -> RenderedView:
+    """Compare a rendered view with its image over the same (C,) ``background``, without waiting for a GPU."""
+    truth = pixels.over(background)
+    rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
+    value, parts = loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
+    with torch.no_grad():
+        difference = rgb - truth
+        channels = difference.shape[-1]
+        mean = torch.full((channels,), 1.0 / channels, device=rgb.device)
+        contributions = output.request_contributions(difference.abs() @ mean)
+        flat = difference.reshape(-1)
+        counted = flat.numel() if pixels.mask is None else pixels.mask.sum() * channels
+    return RenderedView(value, dict(parts), torch.dot(flat, flat), counted, view.name, truth, contributions)
+
+
+def summarize_numbers(numbers: Sequence[float], parts: Sequence[str]) -> tuple[float, dict[str, float], float]:
     """Return loss, parts by name and PSNR from :meth:`RenderedView.numbers`."""
     cost, squared, counted, *values = numbers
     mse = squared / counted
@@ -112,9 +132,13 @@ def summarize_numbers(
     return cost, dict(zip(parts, values, strict=False)), psnr
 
 
-def summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float, str]:
-    """Return summed loss, mean parts, mean PSNR and name of a step, from the results of its views."""
+def summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], float]:
+    """Return summed loss, mean parts and mean PSNR of a step, from the results of its views."""
     first, last, count = views[0], views[-1], len(views)
     means = {part: sum(view.parts[part] for view in views) / count for part in first.parts}
-    name = last.name if count == 1 else f"{last.name} and {count - 1} more"
-    return sum(view.loss for view in views), last.parts | means, sum(view.psnr for view in views) / count, name
+    return sum(view.loss for view in views), last.parts | means, sum(view.psnr for view in views) / count
+
+
+def name_views(names: Sequence[str]) -> str:
+    """Return the name of a step for reports, from those of its views."""
+    return names[-1] if len(names) == 1 else f"{names[-1]} and {len(names) - 1} more"

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
@@ -22,13 +22,13 @@ from neuprim.core.compute import device
 from neuprim.core.compute.threads import limit_threads
 from neuprim.core.data import Dataset, Pixels, PointSamples, View
 from neuprim.core.data.dataset_check import check_point_samples
-from neuprim.core.errors import ConfigError, DataError, DeviceMemoryError, NonFiniteError, nearest
+from neuprim.core.errors import DeviceMemoryError, NonFiniteError
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
 from neuprim.core.render.backends import best_render_backend_device
 from neuprim.core.render.near_plane import near_plane_extent, resolve_near, typical_pixel_size
-from neuprim.core.render.output import Contributions, RenderOutput, sum_contributions
-from neuprim.core.task import Loss, Supervision
+from neuprim.core.render.output import Contributions, sum_contributions
+from neuprim.core.task import Loss
 from neuprim.core.train.losses import MaxScreenSize, PointLossResult, point_loss, scale_anisotropy
 from neuprim.core.train.optimizer import RowAdam
 from neuprim.core.train.population import PopulationChange, make_population
@@ -39,14 +39,17 @@ from neuprim.core.train.step_results import (
     StepReport,
     ViewResult,
     ViewTask,
+    compare_view,
+    name_views,
     summarize_numbers,
     summarize_views,
 )
-from neuprim.core.train.trainer_state import check_state, select_state_tensors
+from neuprim.core.train.trainer_state import check_state, check_training_settings, select_state_tensors
 from neuprim.core.train.training_views import (
     GPU_LAUNCHES,
     Exposures,
     PixelLoader,
+    PixelStride,
     ViewCorrections,
     choose_stride,
     count_covered_pixels,
@@ -90,7 +93,7 @@ class Trainer:
         seed: int,
     ) -> None:
         train = dataset.train
-        settings = _check_training_settings(settings, model, dataset)
+        settings = check_training_settings(settings, model, dataset)
         cameras = [train.view(i).camera for i in range(len(train))]
         self.current_model, self.dataset, self.loss, self.settings = model, dataset, loss, settings
         self.renderer = replace(resolve_near(renderer, model.params["means"], cameras), depth=False)
@@ -229,7 +232,8 @@ class Trainer:
             del view, loss  # free what autograd saved before the next view is rendered
         if tasks:
             results, contributions = self._combine_views(results, each, start)
-            cost, parts, psnr, name = summarize_views(results)
+            cost, parts, psnr = summarize_views(results)
+            name = name_views([result.name for result in results])
         else:
             assert samples is not None, "a step without views has points"
             points = self.compare_points(samples)
@@ -262,7 +266,7 @@ class Trainer:
         for flight in again:
             self.step = flight.step
             self._set_progress(flight.progress)
-            self._take_step(flight.report, [flight.task], flight.samples, flight.progress, 0.0)
+            self._take_step(flight.report, flight.tasks, flight.samples, flight.progress, 0.0)
         self.step = step
         self._set_progress(progress)
 
@@ -276,9 +280,9 @@ class Trainer:
             with limit_threads(self.renderer.threads):
                 yield
         except torch.OutOfMemoryError as error:
-            camera = self.dataset.train.view(0).camera
+            camera, count = self.dataset.train.view(0).camera, self.current_model.count
             raise DeviceMemoryError(
-                f"{self.device}: out of memory at step {self.step} with {self.current_model.count} primitives, images of "
+                f"{self.device}: out of memory at step {self.step} with {count} primitives, images of "
                 f"{camera.width} x {camera.height} pixels and train.views_per_step={self.settings.views_per_step}; "
                 "lower one of them. The last checkpoint is intact"
             ) from error
@@ -361,37 +365,13 @@ class Trainer:
         if self.corrections is not None:
             view = self.corrections.apply(task.view, view)
 
-        def draw(view: View, background: Tensor) -> RenderOutput:
-            output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
-            if self.recorder is not None:
-                self.recorder.observe_counts(output.stats)
-            return output if self.exposures is None else replace(
-                output, rgb=self.exposures.apply(task.view, output.rgb)
-            )
-
-        return self.compare_view(view, pixels, task.background.to(self.device, non_blocking=True), progress, draw)
-
-    def compare_view(
-        self,
-        view: View,
-        pixels: Pixels,
-        background: Tensor,
-        progress: float,
-        draw: Callable[[View, Tensor], RenderOutput],
-    ) -> RenderedView:
-        """Render a view by ``draw`` and compare it with its image, without waiting for a GPU."""
-        truth = pixels.over(background)
-        output = draw(view, background)
-        rgb = output.rgb if pixels.mask is None else torch.where(pixels.mask[..., None], output.rgb, truth)
-        loss, parts = self.loss(rgb, truth, Supervision(view, pixels.mask, pixels.alpha, progress))
-        with torch.no_grad():
-            difference = rgb - truth
-            channels = difference.shape[-1]
-            mean = torch.full((channels,), 1.0 / channels, device=self.device)
-            contributions = output.request_contributions(difference.abs() @ mean)
-            flat = difference.reshape(-1)
-            counted = flat.numel() if pixels.mask is None else pixels.mask.sum() * channels
-        return RenderedView(loss, parts, torch.dot(flat, flat), counted, view.name, truth, contributions)
+        background = task.background.to(self.device, non_blocking=True)
+        output = render(self._quantized_model(), view.camera, view.conditions, self.renderer, background)
+        if self.recorder is not None:
+            self.recorder.observe_counts(output.stats)
+        if self.exposures is not None:
+            output = replace(output, rgb=self.exposures.apply(task.view, output.rgb))
+        return compare_view(output, self.loss, view, pixels, background, progress)
 
     def compare_points(self, samples: PointSamples) -> PointLossResult:
         """Compare the model with known values at points."""
@@ -511,26 +491,3 @@ class Trainer:
         self.generator.set_state(tensors["generator"])
         self.step, self.elapsed = header["step"], float(header["elapsed"])
         self._require_grad()
-
-
-def _check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
-    """Check the settings against the model and the data; return them with ``supervision="auto"`` replaced."""
-    if len(dataset.train) == 0:
-        raise DataError(f"{dataset.name}: the training split is empty")
-    names = [spec.name for spec in model.specs]
-    for group, given in (("rates", settings.rates), ("rate_units", settings.rate_units)):
-        for key in given:
-            if key not in names:
-                raise ConfigError(f"train.{group}.{key}: no such parameter{nearest(key, names)}")
-    if settings.supervision == "auto":
-        settings = replace(settings, supervision="images" if dataset.points is None else "both")
-    if settings.supervision != "images" and dataset.points is None:
-        raise ConfigError(
-            f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images"
-        )
-    if settings.exposure_rate > 0 and dataset.train.pixels(0).alpha is not None:
-        raise ConfigError(
-            f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque "
-            "photographs, as a gain would change the background that is put behind them"
-        )
-    return settings

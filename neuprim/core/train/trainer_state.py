@@ -1,15 +1,19 @@
-"""Check the state of a training, which :meth:`~neuprim.core.train.trainer.Trainer.state` returned."""
+"""Check a training's settings, and its state, which :meth:`~neuprim.core.train.trainer.Trainer.state` returned."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from neuprim.core.errors import CheckpointError
+from neuprim.core.data import Dataset
+from neuprim.core.errors import CheckpointError, ConfigError, DataError, nearest
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.train.settings import TrainSettings
 
 _FIXED = ("params", "adam", "exposure", "correction")
 """Groups of tensors that every state of the same settings has."""
@@ -80,3 +84,26 @@ def _find_state_fault(tensors: Mapping[str, Tensor], own: Mapping[str, Tensor], 
     except RuntimeError as error:
         return str(error)
     return None
+
+
+def check_training_settings(settings: TrainSettings, model: Primitives, dataset: Dataset) -> TrainSettings:
+    """Check the settings against the model and the data; return them with ``supervision="auto"`` replaced."""
+    if len(dataset.train) == 0:
+        raise DataError(f"{dataset.name}: the training split is empty")
+    names = [spec.name for spec in model.specs]
+    for group, given in (("rates", settings.rates), ("rate_units", settings.rate_units)):
+        for key in given:
+            if key not in names:
+                raise ConfigError(f"train.{group}.{key}: no such parameter{nearest(key, names)}")
+    if settings.supervision == "auto":
+        settings = replace(settings, supervision="images" if dataset.points is None else "both")
+    if settings.supervision != "images" and dataset.points is None:
+        raise ConfigError(
+            f"train.supervision={settings.supervision}: {dataset.name} has no voxels to learn from; expected images"
+        )
+    if settings.exposure_rate > 0 and dataset.train.pixels(0).alpha is not None:
+        raise ConfigError(
+            f"train.exposure_rate={settings.exposure_rate:g}: images of {dataset.name} have alpha; expected opaque "
+            "photographs, as a gain would change the background that is put behind them"
+        )
+    return settings

@@ -13,21 +13,19 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from neuprim.core.compute.warp import OPTIONS, Doubles, Doubles2d, array, launch_kernel, wp
+from neuprim.core.compute.warp import OPTIONS, Doubles, Doubles2d, Mat33ds, Vec3ds, Vec3ds2d, array, launch_kernel, wp
 from neuprim.core.model.forms import Cosine
 from neuprim.core.model.geometry import Geometry
 
 d = wp.float64
-_Vectors, _Vectors2d = wp.array(dtype=wp.vec3d), wp.array2d(dtype=wp.vec3d)
-_Matrices = wp.array(dtype=wp.mat33d)
 _FORWARD_PARTS, _BACKWARD_PARTS = 32, 8  # threads per point, and per primitive
 _MARGIN = 1 + 1e-12  # of the boxes around ellipsoids: rounding must not leave out a point
 
 
 def cosine_point_values(geometry: Geometry, form: Cosine, points: Tensor, weights: Tensor, shares: Any) -> Tensor:
-    """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3); NaN if a number is not finite.
+    """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3), without a wait for the GPU.
 
-    Never waits for the GPU. Differentiable in all but the points; the backward pass fills ``shares``.
+    All are NaN if a number is not finite. Differentiable in all but the points; the backward pass fills ``shares``.
 
     Args:
         weights: (N, C) factors of the extinction of each primitive.
@@ -51,7 +49,7 @@ def _is_in_box(offset: wp.vec3d, reach: wp.vec3d):
 
 
 @wp.func
-def _network_at(offset: wp.vec3d, n: int, rate: _Vectors2d, phase: Doubles2d, amplitude: Doubles2d, constant: Doubles):
+def _network_at(offset: wp.vec3d, n: int, rate: Vec3ds2d, phase: Doubles2d, amplitude: Doubles2d, constant: Doubles):
     """Return f/m at an offset from the mean of primitive n."""
     total = constant[n]
     for k in range(phase.shape[1]):
@@ -72,7 +70,7 @@ def _fade(inner: wp.float64, edge: int):
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def _add_primitives(
-    points: _Vectors, reach: _Vectors, edge: int, means: _Vectors, A: _Matrices, rate: _Vectors2d, phase: Doubles2d,
+    points: Vec3ds, reach: Vec3ds, edge: int, means: Vec3ds, A: Mat33ds, rate: Vec3ds2d, phase: Doubles2d,
     amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, values: Doubles2d,
 ):  # fmt: skip
     """Add up sigma and sigma x weights of part ``part`` of the primitives at a point, in row part x points + point."""
@@ -94,9 +92,9 @@ def _add_primitives(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def _add_points(
-    points: _Vectors, reach: _Vectors, edge: int, means: _Vectors, A: _Matrices, rate: _Vectors2d, phase: Doubles2d,
+    points: Vec3ds, reach: Vec3ds, edge: int, means: Vec3ds, A: Mat33ds, rate: Vec3ds2d, phase: Doubles2d,
     amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, pulled: Doubles2d, error: Doubles,
-    g_means: _Vectors, g_A: _Matrices, g_rate: _Vectors2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
+    g_means: Vec3ds, g_A: Mat33ds, g_rate: Vec3ds2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
     g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
 ):  # fmt: skip
     """Add up gradients, given as zeros, and (sigma, sigma x error) of a primitive over part ``part`` of the points.

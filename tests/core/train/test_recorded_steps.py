@@ -80,6 +80,15 @@ def test_recorded_steps_are_the_steps_bit_for_bit(near: float) -> None:
     assert capacity is not None and (capacity.float64_pairs > 256) == (near > 1)
 
 
+@pytest.mark.parametrize("views", [2, 3])
+def test_a_step_may_have_several_views(views: int) -> None:
+    plain, fast = (trainer(recorded, views_per_step=views) for recorded in (False, True))
+    expected, found = reports(plain), reports(fast)
+    assert fast.recorder is not None and fast.recorder.replayed >= STEPS // 2
+    assert expected == found and found[-1].view.endswith(f"and {views - 1} more")
+    assert_same(plain, fast)
+
+
 def test_steps_of_volumes_are_recorded_between_looks_at_voxels(tmp_path: Path) -> None:
     """With windows in time, extinction limited to that of the files, and a time of each view."""
     folder = tmp_path / "ball"

@@ -12,8 +12,8 @@ from neuprim.core.cameras import Camera
 from neuprim.core.model.checks import check_primitive_colours_finite, non_finite_primitive_error
 from neuprim.core.model.primitives import LoweredPrimitives
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.binning import FrameCapacity
 from neuprim.core.render.cuda.backward import ImageGradient, rasterizer_gradient_rows
+from neuprim.core.render.cuda.binning import FrameCapacity
 from neuprim.core.render.cuda.colour_net import (
     FIRST_COLOUR,
     ColourNet,
@@ -61,9 +61,7 @@ class _Rasterize(torch.autograd.Function):
         settings, stats, camera = request.settings, request.stats, request.camera
         stats.pairs, stats.extra["float64"] = frame.lists.pairs, frame.wide.shape[0]
         behind = background.detach().to(frame.device, torch.float32).contiguous()
-        drawn = composite_frame(
-            frame, form, net, behind, settings, request.differentiable, capacity=request.capacity
-        )
+        drawn = composite_frame(frame, form, net, behind, settings, request.differentiable, capacity=request.capacity)
         stats.extra["hits"], stats.extra["float64_pairs"] = drawn.hits.shape[0], drawn.in_float64.shape[0]
         ctx.request, ctx.frame, ctx.form, ctx.net, ctx.drawn, ctx.background = request, frame, form, net, drawn, behind
         remember_rasterizer_inputs(ctx, (viewmat, background, palette, *tensors))

@@ -301,7 +301,7 @@ def _primitives_fit(ends: Longs2d, pairs: int, which: Ints):
 def _binning_kernels(short: bool) -> tuple[Any, Any]:
     """Return the kernels that write keys and read them; ``short``: keys are int32, which sort in half the time."""
     number = wp.int32 if short else wp.int64
-    Keys = wp.array(dtype=number)
+    Keys: Any = wp.array(dtype=number)
 
     @wp.kernel(enable_backward=False, module="unique", module_options=EXACT, grid_stride=False)
     def emit(

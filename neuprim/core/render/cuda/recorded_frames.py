@@ -101,8 +101,10 @@ class FrameRecorder:
             if self._capacity is not None and self._capacity.fits(counts):
                 return
             self._counts = tuple(max(pair) for pair in zip(counts, self._counts, strict=True))  # type: ignore[assignment]
-            sizes = [int(_MARGIN * count) + _SPARE if count else 0 for count in self._counts]
-            self._capacity = FrameCapacity(*sizes, self._refused)
+            pairs, in_float64, slots, float64_pairs = (
+                int(_MARGIN * count) + _SPARE if count else 0 for count in self._counts
+            )
+            self._capacity = FrameCapacity(pairs, in_float64, slots, float64_pairs, self._refused)
             self._programs.clear()
 
     def _make_program(

@@ -46,6 +46,7 @@ from neuprim.runs.fit import (
     train_run_steps,
     use_one_torch_thread_for_run,
 )
+from neuprim.runs.kernel_compiler import KernelCompiler
 from neuprim.runs.launch.jobs import interruptible_run
 from neuprim.runs.measure import render_image
 from neuprim.runs.open import discard_results
@@ -103,6 +104,7 @@ def train_in_directory(
             intact.
         RankError: another rank ended. The first rank, if it still runs, has saved a checkpoint of the last whole step.
     """
+    compiler = KernelCompiler(config) if group is None else None
     with nullcontext() if group is None else group.in_turn():
         fitted = prepare_training(config, events, dataset, hold_out, make, group)
         trainer = fitted.trainer
@@ -112,7 +114,11 @@ def train_in_directory(
             if config.resume and not trainer.finished:
                 discard_results(config.output_dir)
             write_text(config.output_dir / "config.yaml", fitted.config.to_yaml())
+        if compiler is not None:
+            compiler.wait(events)
         compile_run_kernels(trainer, events)
+        if compiler is not None:
+            compiler.finish()
     if isinstance(trainer, DistributedTrainer):
         trainer.check_same_start()
     return fitted, _train_and_save(fitted, events, between) if trainer.rank == 0 else _train_run_as_follower(trainer)

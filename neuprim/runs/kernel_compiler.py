@@ -1,0 +1,138 @@
+"""Compile the kernels of a run in a second process, while the first one makes or reads the images.
+
+Compiling takes about a minute on one core, once per installation and kind of model. The second process trains a few
+primitives on noise for one step; the compiled code reaches the first one through the cache of kernels.
+"""
+
+from __future__ import annotations
+
+import atexit
+import hashlib
+import pickle
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import torch
+
+from neuprim.config import Job, RunConfig
+from neuprim.core.cameras import Camera, look_at
+from neuprim.core.compute import device
+from neuprim.core.compute.kernels import cache_directory, sources_hash
+from neuprim.core.compute.threads import core_count
+from neuprim.core.data import Dataset, Pixels, PointCloud, PointSamples, View, ViewSet
+from neuprim.core.data.dataset import PointSupervision
+from neuprim.core.model.fields import ConditionSpec
+from neuprim.core.render.cpu import backend
+from neuprim.plugins.registry import TASKS
+from neuprim.runs.fit import Events, Preparing, compile_run_kernels, make_run_loss, make_run_trainer
+
+_SIZE, _PRIMITIVES, _POINTS = 32, 64, 64  # of the noise: pixels a side, primitives and points
+
+
+class KernelCompiler:
+    """The second process for one run, if its kernels may not be compiled yet.
+
+    Args:
+        config: configuration of the run.
+    """
+
+    def __init__(self, config: RunConfig) -> None:
+        self._marker = _marker(config)
+        self._process: subprocess.Popen[bytes] | None = None
+        own = TASKS.find(config.task).distribution == "neuprim"
+        if not own or self._marker.exists() or core_count() < 2 or device.cuda_unavailable() is None:
+            return
+        command = [sys.executable, "-m", "neuprim.runs.kernel_compiler"]
+        quiet = subprocess.DEVNULL
+        self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
+        atexit.register(self._process.terminate)
+        assert self._process.stdin is not None
+        with self._process.stdin as pipe:
+            pickle.dump(config, pipe)
+
+    def wait(self, events: Events) -> None:
+        """Wait for the second process, which the first would otherwise repeat."""
+        if self._process is not None and self._process.poll() is None:
+            events(Preparing("compiling kernels; once per installation this takes about a minute"))
+            self._process.wait()
+
+    def finish(self) -> None:
+        """Note that the kernels of this kind of model are compiled."""
+        self._marker.touch()
+
+
+def _marker(config: RunConfig) -> Path:
+    """Return the file that says that kernels of such a model were compiled by these sources."""
+    train = (config.train.supervision, config.train.ssim_weight > 0, config.train.loss)
+    model = replace(config.model, primitives=1, init={})
+    kind = repr((config.task, model, train, config.renderer, config.scene.get("lights")))
+    name = hashlib.sha256(kind.encode()).hexdigest()[:12]
+    return cache_directory() / f"compiled-{sources_hash(Path(backend.__file__))}-{name}"
+
+
+# ---------------------------------------------------------------- the second process
+
+
+class _NoiseViews(ViewSet):
+    """Two views of noise from a distance of 3."""
+
+    def __init__(self, channels: int, conditions: dict[str, torch.Tensor]) -> None:
+        eyes = [torch.tensor([3.0, 0.0, 0.5]), torch.tensor([0.0, 3.0, 0.5])]
+        up, middle = torch.tensor([0.0, 0.0, 1.0]), torch.zeros(3)
+        half = _SIZE / 2
+        cameras = [Camera(look_at(eye, middle, up), _SIZE, _SIZE, half, half, _SIZE, _SIZE) for eye in eyes]
+        self._views = [View(f"noise {i}", camera, conditions) for i, camera in enumerate(cameras)]
+        self._pixels = Pixels(torch.rand(_SIZE, _SIZE, channels), torch.ones(_SIZE, _SIZE))
+
+    def __len__(self) -> int:
+        return len(self._views)
+
+    def view(self, index: int) -> View:
+        return self._views[index]
+
+    def pixels(self, index: int) -> Pixels:
+        return self._pixels
+
+
+class _NoisePoints(PointSupervision):
+    """Points with random extinction."""
+
+    def __init__(self, channels: int, conditions: dict[str, torch.Tensor]) -> None:
+        self._channels, self._conditions = channels, conditions
+
+    def draw(self, count: int, generator: torch.Generator) -> PointSamples:
+        points, sigma = torch.rand(_POINTS, 3) - 0.5, torch.rand(_POINTS)
+        source = torch.rand(_POINTS, self._channels)
+        return PointSamples("noise", self._conditions, points, sigma, source, 1.0)
+
+
+def _noise_dataset(conditions: list[ConditionSpec], channels: int, voxels: bool) -> Dataset:
+    """Return data of noise with the conditions in the middle of their ranges."""
+    values = {spec.name: torch.full(spec.shape, 0.5 * sum(spec.range), dtype=torch.float64) for spec in conditions}
+    views = _NoiseViews(channels, values)
+
+    def start(views: ViewSet, count: int, generator: torch.Generator) -> PointCloud:
+        means = torch.rand(count, 3, generator=generator) - 0.5
+        scalars = {name: value.expand(count).clone() for name, value in values.items() if not value.dim()}
+        return PointCloud(means, torch.rand(count, channels, generator=generator), scalars)
+
+    return Dataset(
+        name="noise", train=views, test=views, start=start, extent=3.0, background=torch.zeros(channels),
+        channels=channels, data_source="generated", bounds=torch.tensor([[-0.5] * 3, [0.5] * 3]),
+        largest=10.0 if voxels else None, points=_NoisePoints(channels, values) if voxels else None,
+    )  # fmt: skip
+
+
+def _compile(config: RunConfig) -> None:
+    job = Job.of(config)
+    volume = job.scene.spec.volume is not None
+    conditions = [spec for spec in job.task.conditions if spec.of_scene(config.scene)]
+    dataset = _noise_dataset(conditions, len(job.task.channels) or 3, volume)
+    small = replace(config, model=replace(config.model, primitives=_PRIMITIVES))
+    compile_run_kernels(make_run_trainer(Job(small, job.task), dataset, make_run_loss(job)))
+
+
+if __name__ == "__main__":
+    _compile(pickle.load(sys.stdin.buffer))

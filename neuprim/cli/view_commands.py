@@ -55,7 +55,7 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--layers", metavar="NAME,...", help=layers)
     datatype = "precision of colour and alpha in an .exr (default: float); other layers are always float"
     parser.add_argument("--datatype", choices=("half", "float"), help=datatype)
-    rate = "frames per second of an animation (default: it lasts about four seconds)"
+    rate = "frames per second of an animation (default: it lasts about four seconds), and in headers of .exr files"
     parser.add_argument("--fps", type=parse_rate, metavar="F", help=rate)
     parser.add_argument("--out", type=Path, metavar="PATH", help="where to write (default: in RUN_DIR)")
     numbers = "frames of the .vdb files by number, instead of --time: 1001-1048x2,1060; images are named NAME.1001.exr"

@@ -14,6 +14,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -178,6 +179,7 @@ class RunExrLayers:
         background: (C,) in the model's colour space. Without an alpha layer, beauty is composited over it.
         lights: conditions of the lights of an environment map, whose images are summed; empty: the view's own light.
         world: coordinates and units of cameras, positions and depths in the file.
+        fps: frames per second of the sequence that the images belong to; None if unknown.
 
     Raises:
         ConfigError: a layer is unknown, or holds light although the model's colours are not linear light.
@@ -192,6 +194,7 @@ class RunExrLayers:
     half: bool = False
     lights: Sequence[Conditions] = ()
     world: World = field(default_factory=World)
+    fps: float | None = None
 
     def __post_init__(self) -> None:
         self._layer_specs()
@@ -296,6 +299,10 @@ class RunExrLayers:
         }
         if self.channels.is_rgb:
             found["chromaticities"] = _REC709
+        if self.fps is not None:
+            broadcast = Fraction(round(1.001 * self.fps) * 1000, 1001)  # 23.976 means 24000/1001
+            close = abs(broadcast - self.fps) < 0.002
+            found["framesPerSecond"] = broadcast if close else Fraction(self.fps).limit_denominator(1000)
         replaced = {name for light in self.lights for name in light}
         for name, value in self._condition_values(view.conditions):
             if name not in replaced:

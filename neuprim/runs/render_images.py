@@ -54,8 +54,8 @@ class RenderRequest:
         out: file or folder to write; None for a folder in the run's ``frames``.
         frames: number of views of an orbit.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: frames per second of an animation; None for the rate in the file of cameras, or 5 to 30 so that the
-            animation takes about four seconds.
+        fps: frames per second of an animation, and in the headers of OpenEXR files; None for the rate in the file of
+            cameras. Without any rate, an animation takes about four seconds, and headers have none.
         environment: environment map that replaces the task's light.
         overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`.
         layers: layers of an OpenEXR file, separated by commas; None for all layers except those of single lights.
@@ -149,7 +149,7 @@ class _RunRenderSession:
             if value is not None and self.format != "exr":
                 raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
         half, drawn = request.datatype == "half", (self.channels, self.render_config, self.background)
-        layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world)
+        layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world, self.fps)
         self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")

@@ -4,6 +4,7 @@ drawn, and a header that says what is what."""
 from __future__ import annotations
 
 from dataclasses import replace
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
@@ -118,6 +119,12 @@ def test_the_header_says_camera_conditions_and_meaning(tmp_path: Path) -> None:
     assert (header["neuprim:run"], header["neuprim:task"], header["neuprim:view"]) == ("fire", "dynamic", "a view")
     assert header["software"].startswith("neuprim ") and "camera z" in header["neuprim:layer:depth"]
     assert np.allclose(header["chromaticities"], (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329))
+
+
+@pytest.mark.parametrize(("fps", "expected"), [(24.0, "24"), (23.976, "24000/1001"), (None, None)])
+def test_the_header_says_the_frame_rate(tmp_path: Path, fps: float | None, expected: str | None) -> None:
+    _, header = written(tmp_path / "a.exr", replace(layers(), fps=fps), volume(), VIEW)
+    assert (None if expected is None else Fraction(expected)) == header.get("framesPerSecond")
 
 
 def test_lights_apart_add_up_to_the_beauty(tmp_path: Path) -> None:

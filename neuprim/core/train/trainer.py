@@ -9,6 +9,7 @@ uninterrupted one.
 from __future__ import annotations
 
 import math
+import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -116,6 +117,7 @@ class Trainer:
         self.stop_requested: Callable[[], bool] = lambda: False
         self.optimizer = RowAdam(model.specs, model.params, settings.adam_beta2)
         self._shown_progress = 0.0
+        self._turn = threading.RLock()  # the viewer of a training asks for the model on its own thread
         self.recorder: StepRecorder | None = None
         if recording_fault(self) is None:
             self.recorder = StepRecorder(self)
@@ -174,7 +176,7 @@ class Trainer:
             NonFiniteError: a loss, gradient or parameter is NaN or infinite; the step changes no parameter.
             DeviceMemoryError: the GPU has too little memory for a step; files are intact.
         """
-        with self._limit_resources():
+        with self._limit_resources(), self._turn:
             start, progress = time.perf_counter(), self.progress
             self._set_progress(progress)
             tasks, samples = self._draw_views(), self._draw_points()
@@ -259,16 +261,17 @@ class Trainer:
 
         Raises as :meth:`train_step`.
         """
-        again = [] if self.recorder is None else self.recorder.settle(keep)
-        if not again:
+        if self.recorder is None:
             return
-        step, progress = self.step, self._shown_progress
-        for flight in again:
-            self.step = flight.step
-            self._set_progress(flight.progress)
-            self._take_step(flight.report, flight.tasks, flight.samples, flight.progress, 0.0)
-        self.step = step
-        self._set_progress(progress)
+        with self._turn:
+            again, step, progress = self.recorder.settle(keep), self.step, self._shown_progress
+            for flight in again:
+                self.step = flight.step
+                self._set_progress(flight.progress)
+                self._take_step(flight.report, flight.tasks, flight.samples, flight.progress, 0.0)
+            if again:
+                self.step = step
+                self._set_progress(progress)
 
     def pending_report(self, view: str) -> StepReport:
         """Return a report on this step whose results are not known yet."""

@@ -34,7 +34,7 @@ from shared.tables import RESULT_PAGES, RESULTS, Table, between_markers, make_ta
 
 from neuprim.core.compute.warp import BLOCK
 from neuprim.core.model import colours_warp
-from neuprim.core.render.cuda import backward, binning, colour_net, float64, forward, prepare, prepare_backward
+from neuprim.core.render.cuda import backward, binning, colour_net, float64, forward, prepare, prepare_backward, slots
 from neuprim.core.render.cuda import layout as L
 from neuprim.core.render.cuda.layout import KernelForm
 from neuprim.core.render.cuda.projection import PER_BLOCK
@@ -63,7 +63,7 @@ def kernels(name: str) -> Iterator[tuple[str, Any, int]]:
         yield "network units", colour_net._colour_net_kernels(False)[0], PER_BLOCK
         yield "emit", binning._binning_kernels(True)[0], PER_BLOCK
         yield "list", binning._binning_kernels(True)[1], BLOCK
-        yield "spans", binning.row_spans, BLOCK
+        yield "spans", slots.row_spans, BLOCK
         yield "sums", backward.sum_pairs, BLOCK
         yield "float64 pairs", float64.float64_opacity_kernel(False), L.WARP
         return

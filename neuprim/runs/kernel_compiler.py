@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import atexit
 import hashlib
-import pickle
+import json
 import subprocess
 import sys
 from dataclasses import replace
@@ -50,7 +50,7 @@ class KernelCompiler:
         atexit.register(self._process.terminate)
         assert self._process.stdin is not None
         with self._process.stdin as pipe:
-            pickle.dump(config, pipe)
+            pipe.write(json.dumps(config.to_dict()).encode())
 
     def wait(self, events: Events) -> None:
         """Wait for the second process, which the first would otherwise repeat."""
@@ -135,4 +135,4 @@ def _compile(config: RunConfig) -> None:
 
 
 if __name__ == "__main__":
-    _compile(pickle.load(sys.stdin.buffer))
+    _compile(RunConfig.from_dict(json.load(sys.stdin)))

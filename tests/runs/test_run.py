@@ -493,8 +493,8 @@ def test_kernels_of_points_are_compiled_before_the_first_step(tmp_path: Path, mo
     scene = "task=dynamic scene=smoke_fire scene.size=16 scene.timesteps=4 scene.cameras=4 scene.resolution=16"
     fitted = prepare_training(compose([*scene.split(), "model.primitives=20", f"output_dir={tmp_path / 'out'}"]))
     assert fitted.trainer.settings.supervision == "both" and fitted.trainer.settings.voxels_every > 1
-    compared, compare = [], Trainer._compare_points
-    monkeypatch.setattr(Trainer, "_compare_points", lambda *own: compared.append(1) or compare(*own))  # type: ignore[func-returns-value]
+    compared, compare = [], Trainer.compare_points
+    monkeypatch.setattr(Trainer, "compare_points", lambda *own: compared.append(1) or compare(*own))  # type: ignore[func-returns-value]
     compile_run_kernels(fitted.trainer)
     assert compared == [1] and fitted.trainer.step == 0
 

@@ -12,17 +12,23 @@ from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from itertools import zip_longest
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import torch
 from torch import Tensor
 
 from neuprim.core.compute import device
 from neuprim.core.compute.graphs import GraphRecorder
-from neuprim.core.data import Pixels, PointSamples, View
+from neuprim.core.data import Dataset, Pixels, PointSamples, View
 from neuprim.core.model.fields import Constant
-from neuprim.core.render import backends
+from neuprim.core.model.primitives import Primitives
+from neuprim.core.render import RenderSettings, backends
 from neuprim.core.render.output import Contributions, RenderOutput, RenderStats, sum_contributions
+from neuprim.core.task import Loss
+from neuprim.core.train.losses import PointLossResult
+from neuprim.core.train.optimizer import RowAdam
+from neuprim.core.train.population import Population
+from neuprim.core.train.settings import TrainSettings
 from neuprim.core.train.step_results import (
     StepReport,
     ViewResult,
@@ -32,10 +38,10 @@ from neuprim.core.train.step_results import (
     summarize_numbers,
     summarize_views,
 )
+from neuprim.core.train.training_views import Exposures, ViewCorrections
 
 if TYPE_CHECKING:
     from neuprim.core.render.cuda.binning import FrameCapacity
-    from neuprim.core.train.trainer import Trainer
 
 _IN_FLIGHT = 16
 """Most recorded steps that the device has not finished when the host prepares another one."""
@@ -50,7 +56,36 @@ _MOST_PROGRAMS = 16
 """Most recordings kept; a recording is for one size of image and one set of intrinsics."""
 
 
-def recording_fault(trainer: Trainer) -> str | None:
+class RecordableTrainer(Protocol):
+    """What recording needs of a :class:`~neuprim.core.train.trainer.Trainer`, whose members these are."""
+
+    current_model: Primitives
+    dataset: Dataset
+    loss: Loss
+    settings: TrainSettings
+    renderer: RenderSettings
+    device: torch.device
+    population: Population
+    optimizer: RowAdam
+    exposures: Exposures | None
+    corrections: ViewCorrections | None
+    fake_quantize: Any
+    zero_masks: dict[str, Tensor]
+    step: int
+
+    @property
+    def limits_size(self) -> bool: ...
+    @property
+    def has_anisotropy_loss(self) -> bool: ...
+    def rates(self, progress: float | None = None) -> dict[str, float]: ...
+    def settle(self, keep: int = 0) -> None: ...
+    def load_view(self, task: ViewTask) -> tuple[View, Pixels]: ...
+    def compare_points(self, samples: PointSamples) -> PointLossResult: ...
+    def total_loss(self, loss: Tensor | None, points: PointLossResult | None = None) -> Tensor: ...
+    def limit_model(self, sizes: bool, when: Tensor | None = None) -> None: ...
+
+
+def recording_fault(trainer: RecordableTrainer) -> str | None:
     """Return why steps of a training cannot be recorded; None if they can."""
     model, renderer = trainer.current_model, trainer.renderer
     if trainer.device.type != device.CUDA:
@@ -128,7 +163,7 @@ class StepRecorder:
         repeated: number of replayed steps that were refused, or came after one, and were taken again.
     """
 
-    def __init__(self, trainer: Trainer) -> None:
+    def __init__(self, trainer: RecordableTrainer) -> None:
         self.trainer, self.replayed, self.repeated = trainer, 0, 0
         self.capacity: FrameCapacity | None = None
         self._on_gpu = trainer.device.type == device.CUDA
@@ -195,7 +230,7 @@ class StepRecorder:
             return None
         found[: len(program.found)].copy_(program.found, non_blocking=True)
         event = torch.cuda.current_stream(trainer.device).record_event() if self._on_gpu else None
-        report = trainer.pending_report(name_views([view.name for view, _ in inputs.views]))
+        report = StepReport.pending(trainer.settle, view=name_views([view.name for view, _ in inputs.views]))
         self._flights.append(_Flight(trainer.step, progress, tasks, samples, report, program.parts, memory, event))
         self.replayed += 1
         return report

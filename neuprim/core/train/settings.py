@@ -18,6 +18,7 @@ from neuprim.core.validation import Accepts, Range, nonempty_text, validate_fiel
 
 Share = Annotated[float, Range(0, 1, says="a fraction of the budget, 0 to 1")]
 NotNegative = Annotated[float, Range(at_least=0)]
+MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
 
 
 def _are_training_reductions(words: list[Any]) -> bool:
@@ -217,6 +218,13 @@ class TrainSettings:
             raise ConfigError(
                 "train.iterations and train.max_seconds are both null; expected a budget, in steps, in seconds or both"
             )
+
+    def rate_factor(self, step: int, progress: float) -> float:
+        """Return the factor of all learning rates: warm-up, exponential decay to ``final_rate``, cool-down."""
+        factor = self.final_rate**progress
+        if self.cooldown and progress > 1 - self.cooldown:
+            factor *= max((1 - progress) / self.cooldown, MIN_COOLDOWN)
+        return factor * (step + 1) / self.warmup_steps if step < self.warmup_steps else factor
 
 
 if TYPE_CHECKING:

@@ -60,8 +60,6 @@ from neuprim.core.train.training_views import (
 
 __all__ = ["StepReport", "Trainer"]
 
-MIN_COOLDOWN = 0.02  # smallest factor of the learning rates in a cool-down
-
 
 class Trainer:
     """Trains a model on the training views of a data set.
@@ -148,16 +146,9 @@ class Trainer:
         return self.stop_requested()
 
     def rates(self, progress: float | None = None) -> dict[str, float]:
-        """Return the learning rates by parameter: warm-up, exponential decay to ``final_rate``, cool-down.
-
-        ``progress``: used fraction of the budget; None for the current one.
-        """
-        s, model, progress = self.settings, self.current_model, self.progress if progress is None else progress
-        factor = s.final_rate**progress
-        if s.cooldown and progress > 1 - s.cooldown:
-            factor *= max((1 - progress) / s.cooldown, MIN_COOLDOWN)
-        if self.step < s.warmup_steps:
-            factor *= (self.step + 1) / s.warmup_steps
+        """Return the learning rates by parameter at ``progress``; None for the current one."""
+        s, model = self.settings, self.current_model
+        factor = s.rate_factor(self.step, self.progress if progress is None else progress)
         unit = {"absolute": 1.0, "extent": self.extent, "pixel": self.pixel}
         units = {spec.name: unit[s.rate_units.get(spec.name, spec.lr_unit)] for spec in model.specs}
         return {spec.name: s.rates.get(spec.name, spec.lr) * units[spec.name] * factor for spec in model.specs}
@@ -185,9 +176,8 @@ class Trainer:
                 report = self.recorder.take(tasks, samples, progress)
             if report is None:
                 self.settle()
-                report = self.pending_report("")
-                name = self._take_step(report, tasks, samples, progress, start)
-                report.__dict__["view"] = name
+                report = StepReport.pending(self.settle)
+                self._take_step(report, tasks, samples, progress, start)
             self.step += 1
 
             # Apply population control.
@@ -211,8 +201,8 @@ class Trainer:
 
     def _take_step(
         self, report: StepReport, tasks: list[ViewTask], samples: PointSamples | None, progress: float, start: float
-    ) -> str:
-        """Take a step that is not recorded, without population control; fill ``report`` and return its view."""
+    ) -> None:
+        """Take a step that is not recorded, without population control, and fill ``report``."""
         model = self.current_model
         for value in model.params.values():
             value.grad = None
@@ -253,8 +243,8 @@ class Trainer:
         if self.corrections is not None:
             factor = self.settings.final_rate**progress
             self.corrections.step({result.view: result.correction for result in results}, factor)
+        report.__dict__["view"] = name
         report.resolve(cost, parts, psnr)
-        return name
 
     def settle(self, keep: int = 0) -> None:
         """Wait for recorded steps, but for the last ``keep``, and repeat those that the device refused.
@@ -272,10 +262,6 @@ class Trainer:
             if again:
                 self.step = step
                 self._set_progress(progress)
-
-    def pending_report(self, view: str) -> StepReport:
-        """Return a report on this step whose results are not known yet."""
-        return StepReport.pending(self.settle, view=view)
 
     @contextmanager
     def _limit_resources(self) -> Iterator[None]:
@@ -464,8 +450,8 @@ class Trainer:
         tensors = {f"params.{k}": v.detach() for k, v in self.model.params.items()}
         tensors |= {f"adam.{k}": v for k, v in self.optimizer.state().items()}
         tensors |= {f"population.{k}": v for k, v in self.population.state().items()}
-        tensors |= {f"exposure.{k}": v for k, v in (self.exposures.state() if self.exposures else {}).items()}
-        tensors |= {f"correction.{k}": v for k, v in (self.corrections.state() if self.corrections else {}).items()}
+        for name, numbers in (("exposure", self.exposures), ("correction", self.corrections)):
+            tensors |= {f"{name}.{k}": v for k, v in (numbers.state() if numbers else {}).items()}
         tensors |= {f"zeros.{k}": v for k, v in self.zero_masks.items()}
         tensors |= {"generator": self.generator.get_state(), "order": self.order}
         tensors = {name: value.cpu() for name, value in tensors.items()}
@@ -485,10 +471,9 @@ class Trainer:
         self.model.params = {spec.name: moved[f"params.{spec.name}"] for spec in self.model.specs}
         self.optimizer.load_state(select_state_tensors(moved, "adam."))
         self.population.load_state(select_state_tensors(moved, "population."))
-        if self.exposures is not None:
-            self.exposures.load_state(select_state_tensors(moved, "exposure."))
-        if self.corrections is not None:
-            self.corrections.load_state(select_state_tensors(moved, "correction."))
+        for name, numbers in (("exposure.", self.exposures), ("correction.", self.corrections)):
+            if numbers is not None:
+                numbers.load_state(select_state_tensors(moved, name))
         self.zero_masks = select_state_tensors(moved, "zeros.")
         self.order = tensors["order"].clone()
         self.generator.set_state(tensors["generator"])

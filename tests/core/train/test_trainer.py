@@ -22,8 +22,8 @@ from neuprim.core.render import Contributions
 from neuprim.core.render.near_plane import typical_pixel_size
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.population import FixedPopulation
-from neuprim.core.train.settings import ModelSettings, PopulationSettings, TrainSettings
-from neuprim.core.train.trainer import MIN_COOLDOWN, StepReport, Trainer
+from neuprim.core.train.settings import MIN_COOLDOWN, ModelSettings, PopulationSettings, TrainSettings
+from neuprim.core.train.trainer import StepReport, Trainer
 from neuprim.runs.measure import render_image
 from tests.core import tiny
 

@@ -104,7 +104,7 @@ def pixel_row_float(numbers: Floats, row: int, width: int, column: int) -> float
 
 @wp.func_native(f"return spans.data[size_t(pair) * {TILE} + y];")
 def span_of(spans: Shorts2d, pair: int, y: int) -> int:
-    """Return the span of pair ``pair`` in tile row ``y``, see :func:`~neuprim.core.render.cuda.binning.row_spans`."""
+    """Return the span of pair ``pair`` in tile row ``y``, see :func:`~neuprim.core.render.cuda.slots.row_spans`."""
 
 
 @wp.func_native("return rows.data[size_t(row) * size_t(width) + column];")

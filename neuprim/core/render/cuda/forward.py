@@ -2,7 +2,7 @@
 """Forward pass of compositing: one block per tile, one thread per pixel; two passes for ``sort = "entry"``.
 
 Primitives' rows are loaded into shared memory in batches. A tile is finished when T < T_min in all of its pixels. A hit
-stores (alpha, transmittance before it) in its slot (:func:`~neuprim.core.render.cuda.binning.row_spans`). The slots of
+stores (alpha, transmittance before it) in its slot (:func:`~neuprim.core.render.cuda.slots.row_spans`). The slots of
 float64 pairs already contain opacities (:mod:`~neuprim.core.render.cuda.float64`).
 """
 
@@ -28,16 +28,9 @@ from neuprim.core.compute.warp import (
     launch_kernel,
     wp,
 )
-from neuprim.core.errors import BackendUnavailable
 from neuprim.core.model.edge import NORMS
 from neuprim.core.render.cuda import layout as L
-from neuprim.core.render.cuda.binning import (
-    FrameCapacity,
-    list_float64_pairs,
-    refuse_frame,
-    row_spans,
-    running_sums,
-)
+from neuprim.core.render.cuda.binning import FrameCapacity
 from neuprim.core.render.cuda.block_ops import any_tile_thread, int_at, pixel_hit_at, set_pixel_hit, span_of
 from neuprim.core.render.cuda.chord import (
     chord_edge_profiles,
@@ -54,6 +47,7 @@ from neuprim.core.render.cuda.colour_net import ColourNet, float64_hues_kernel
 from neuprim.core.render.cuda.float64 import float64_opacity_kernel
 from neuprim.core.render.cuda.layout import CUT_AT, KernelForm
 from neuprim.core.render.cuda.prepare import Frame
+from neuprim.core.render.cuda.slots import count_slots, refuse_misfit, row_spans
 from neuprim.core.settings import RenderSettings
 
 
@@ -300,8 +294,6 @@ def composite_kernel(form: KernelForm, depth: bool) -> Any:
 
 # ---------------------------------------------------------------- a frame
 
-_MAX_HITS = 2**31
-
 _NUMBERS = {
     torch.float32: wp.float32,
     torch.float64: wp.float64,
@@ -359,41 +351,6 @@ class KernelArrays:
         return self.ids, self.tile_of, self.spans, self.offsets
 
 
-def _count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -> tuple[int, Tensor, Tensor]:
-    """Return the number of slots, (pairs + 1,) first slots, and float64 pairs; -1 follows the latter.
-
-    Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many slots.
-    """
-    device, pairs = frame.device, counts.shape[1]
-    ends = running_sums(counts)
-    offsets = torch.zeros(pairs + 1, dtype=torch.int32, device=device)
-    offsets[1:] = ends[0]
-    if capacity is None:
-        total, few = ends[:, -1].tolist()
-        if total >= _MAX_HITS:
-            raise BackendUnavailable(
-                f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
-                f"image"
-            )
-    else:
-        total, few = capacity.slots, capacity.float64_pairs
-        _refuse_misfit(frame, ends, capacity)
-    in_float64 = torch.full((few,), -1, dtype=torch.int32, device=device)
-    if few:
-        inputs = tuple(warp_array(x) for x in (frame.lists.starts, counts, ends, in_float64))
-        launch_kernel(list_float64_pairs, pairs, inputs, device)
-    return total, offsets, in_float64
-
-
-def _refuse_misfit(frame: Frame, slot_ends: Tensor, capacity: FrameCapacity) -> None:
-    """Empty the tiles of a frame that does not fit. ``slot_ends``: (2, P) running sums of slots and float64 pairs."""
-    starts = frame.lists.starts
-    sizes = wp.vec4i(capacity.pairs, capacity.in_float64, capacity.slots, capacity.float64_pairs)
-    sums = (warp_array(frame.ends), warp_array(slot_ends), warp_array(frame.bad))
-    inputs = (*sums, sizes, warp_array(starts), warp_array(capacity.refused))
-    launch_kernel(refuse_frame, len(starts), inputs, frame.device)
-
-
 def composite_frame(
     frame: Frame,
     form: KernelForm,
@@ -424,10 +381,10 @@ def composite_frame(
     keep = differentiable or sorts or frame.wide.shape[0] > 0
     total, in_float64 = 0, empty(0, dtype=torch.int32)
     if keep and pairs:
-        total, offsets, in_float64 = _count_slots(frame, counts, capacity)
+        total, offsets, in_float64 = count_slots(frame, counts, capacity)
         a.offsets = warp_array(offsets)
     elif capacity is not None:
-        _refuse_misfit(frame, torch.zeros(2, 1, dtype=torch.int64, device=device), capacity)
+        refuse_misfit(frame, torch.zeros(2, 1, dtype=torch.int64, device=device), capacity)
     hits, depths = empty(total, 2), empty(total if settings.depth else 0)
     hues = empty(total if net is not None else 0, form.channels)
     if len(in_float64):

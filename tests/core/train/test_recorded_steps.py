@@ -28,6 +28,7 @@ from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import prepare_training
 from neuprim.tasks.static import SphericalHarmonics
 from tests.core import tiny
+from tests.core.render.cuda.waits import counted
 from tests.tasks.dynamic.sequences import blob
 
 pytestmark = pytest.mark.filterwarnings("ignore:renderer.backend=cuda is slow on the cpu")
@@ -78,6 +79,24 @@ def test_recorded_steps_are_the_steps_bit_for_bit(near: float) -> None:
     assert_same(plain, fast)
     capacity = fast.recorder.capacity
     assert capacity is not None and (capacity.float64_pairs > 256) == (near > 1)
+
+
+def test_a_recorded_step_never_waits(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing between two interventions of the population makes a Python number, or a shape, of a tensor."""
+    made = trainer(True)
+    assert made.recorder is not None
+    waits: list[str] = []
+    take = made.recorder._take_step
+
+    def counting(*inputs: Any) -> Any:
+        with counted(monkeypatch) as found:
+            result = take(*inputs)
+        waits.extend(found)
+        return result
+
+    monkeypatch.setattr(made.recorder, "_take_step", counting)
+    replayed = [made.train_step() for _ in range(9)]
+    assert made.recorder.replayed >= 6 and waits == [] and replayed[-1].psnr > 0
 
 
 @pytest.mark.parametrize("views", [2, 3])

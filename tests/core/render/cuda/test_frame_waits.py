@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 
 import pytest
 import torch
-from torch import Tensor
-from torch.utils._python_dispatch import TorchDispatchMode
 
 pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip install 'neuprim[cuda]'")
 
@@ -17,29 +13,9 @@ from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda import backend
 from neuprim.core.render.cuda.backend import render, render_slabs
 from tests import scenes
+from tests.core.render.cuda.waits import counted
 
 SETTINGS = RenderSettings(backend="cuda", device="cpu", depth=True)
-SHAPES = ("aten::nonzero", "aten::masked_select", "aten::equal", "aten::_local_scalar_dense")
-
-
-@contextmanager
-def counted(monkeypatch: pytest.MonkeyPatch) -> Iterator[list[str]]:
-    """What waited, by name."""
-    waits: list[str] = []
-
-    class Operations(TorchDispatchMode):
-        def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
-            name = func._schema.name
-            mask = name == "aten::index" and any(x is not None and x.dtype == torch.bool for x in args[1])
-            sized = name == "aten::repeat_interleave" and "output_size" not in (kwargs or {})
-            if name in SHAPES or mask or sized:
-                waits.append(name)
-            return func(*args, **(kwargs or {}))
-
-    genuine = Tensor.tolist
-    with monkeypatch.context() as patch, Operations():
-        patch.setattr(Tensor, "tolist", lambda self: waits.append("tolist") or genuine(self))
-        yield waits
 
 
 @pytest.mark.parametrize(

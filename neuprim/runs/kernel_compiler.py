@@ -1,13 +1,12 @@
 """Compile the kernels of a run in a second process, while the first one makes or reads the images.
 
-Compiling takes about a minute on one core, once per installation and kind of model. The second process trains a few
-primitives on noise for one step; the compiled code reaches the first one through the cache of kernels.
+Compiling takes about a minute on one core, once per installation and task. The second process trains a few primitives
+on noise for one step; the compiled code reaches the first one through the cache of kernels.
 """
 
 from __future__ import annotations
 
 import atexit
-import hashlib
 import json
 import subprocess
 import sys
@@ -32,14 +31,14 @@ _SIZE, _PRIMITIVES, _POINTS = 32, 64, 64  # of the noise: pixels a side, primiti
 
 
 class KernelCompiler:
-    """The second process for one run, if its kernels may not be compiled yet.
+    """The second process for one run, if no run of its task has compiled kernels yet.
 
     Args:
         config: configuration of the run.
     """
 
     def __init__(self, config: RunConfig) -> None:
-        self._marker = _marker(config)
+        self._marker = _marker(config.task)
         self._process: subprocess.Popen[bytes] | None = None
         own = TASKS.find(config.task).distribution == "neuprim"
         if not own or self._marker.exists() or core_count() < 2 or device.cuda_unavailable() is None:
@@ -59,17 +58,13 @@ class KernelCompiler:
             self._process.wait()
 
     def finish(self) -> None:
-        """Note that the kernels of this kind of model are compiled."""
+        """Note that kernels of this task are compiled."""
         self._marker.touch()
 
 
-def _marker(config: RunConfig) -> Path:
-    """Return the file that says that kernels of such a model were compiled by these sources."""
-    train = (config.train.supervision, config.train.ssim_weight > 0, config.train.loss)
-    model = replace(config.model, primitives=1, init={})
-    kind = repr((config.task, model, train, config.renderer, config.scene.get("lights")))
-    name = hashlib.sha256(kind.encode()).hexdigest()[:12]
-    return cache_directory() / f"compiled-{sources_hash(Path(backend.__file__))}-{name}"
+def _marker(task: str) -> Path:
+    """Return the file that says that these sources were compiled for a task; most kernels serve all its models."""
+    return cache_directory() / f"compiled-{sources_hash(Path(backend.__file__))}-{task}"
 
 
 # ---------------------------------------------------------------- the second process

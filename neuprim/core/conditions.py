@@ -37,17 +37,17 @@ def _ignore_condition_warning(text: str) -> None:
 
 
 def condition_flag(name: str) -> str:
-    """Return the flag of a condition, ``"--light-intensity"`` for ``light_intensity``, as every command accepts it."""
+    """Return the command-line flag of a condition, such as ``"--light-intensity"`` for ``light_intensity``."""
     return "--" + name.replace("_", "-")
 
 
 def named(word: str, specs: Sequence[ConditionSpec]) -> str | None:
-    """Return the name of the condition that ``word`` spells, with ``-`` or ``_``; None if no condition matches."""
+    """Return the name of the condition that ``word`` names, written with ``-`` or ``_``; None if there is none."""
     return next((spec.name for spec in specs if spec.name.replace("-", "_") == word.replace("-", "_")), None)
 
 
 def split_conditions(words: Sequence[str], specs: Sequence[ConditionSpec]) -> tuple[dict[str, str], list[str]]:
-    """Split command-line arguments into condition name -> text and the other arguments, in their order."""
+    """Split command-line arguments into condition name -> text, and a list of the other arguments."""
     found: dict[str, str] = {}
     rest: list[str] = []
     queue = list(words)
@@ -97,11 +97,11 @@ def read_conditions(
 ) -> dict[str, list[Tensor]]:
     """Parse the texts of conditions; return condition name -> values, one per frame, in the task's order.
 
-    An animation without a number of frames, ``0:1`` or ``orbit``, takes the number of the other conditions.
+    An animation that states no number of frames (``0:1``, ``orbit``) gets as many frames as the other conditions.
 
     Args:
         texts: condition name -> text, for the conditions that the user gave.
-        warn: called with one line for each condition outside its range; strict conditions raise ConfigError instead.
+        warn: called with a message for each condition outside its range. Strict conditions raise ConfigError instead.
     """
     given = [spec for spec in specs if spec.name in texts]
     said = {}
@@ -134,7 +134,7 @@ def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequenc
 
 
 def _condition_with_frame_count(spec: ConditionSpec, text: str, count: int) -> str | None:
-    """Return the text of an animation with ``count`` frames; None if the text has a count, or is no animation."""
+    """Return the animation ``text`` with a count of frames added; None if it has a count, or is no animation."""
     if spec.shape:
         return spec.in_frames(text, count)
     found = _RANGE.fullmatch(text.strip())
@@ -229,8 +229,8 @@ def _first_where(value: Tensor, where: Tensor) -> float:
 def conditions_per_frame(
     specs: Sequence[ConditionSpec], texts: Mapping[str, str], several: bool = False
 ) -> list[dict[str, Tensor]]:
-    """Return condition name -> value for each frame; raises ConfigError if a condition of ``specs`` has no text, or if
-    there are several frames and ``several`` is False."""
+    """Return condition name -> value for each frame. Raises ConfigError if a condition of ``specs`` has no text, or for
+    several frames unless ``several``."""
     for spec in specs:
         if spec.name not in texts:
             what = f"{condition_flag(spec.name)}: required, as the model depends on it ({spec.unit})"
@@ -245,7 +245,7 @@ def conditions_per_frame(
 
 
 def _example_condition_text(spec: ConditionSpec) -> str:
-    """Return an example of a text for a condition, within its range, for messages."""
+    """Return an example text of a condition for messages; the value is within the condition's range."""
     low, high = spec.range
     usual = 1.0 if spec.shape else 0.5
     value = usual if low <= usual <= high else (low + high) / 2

@@ -122,8 +122,8 @@ class Environment:
         return DirectionalLights(*map(torch.from_numpy, arrays))
 
     def share_beyond(self, directions: Tensor, degrees: float) -> float:
-        """Return the fraction 0..1 of the luminance from directions more than ``degrees`` off all unit vectors
-        ``directions`` (D, 3)."""
+        """Return the fraction 0..1 of the luminance whose direction is more than ``degrees`` away from each of the unit
+        vectors ``directions`` (D, 3)."""
         weight = self._flux @ _LUMINANCE
         total = float(weight.sum())
         if total == 0.0:
@@ -173,7 +173,7 @@ def _environment_axes(up: Tensor) -> Array:
 
 
 def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) -> tuple[Array, Array]:
-    """Return two (R, C, 3) sums over blocks of texels: radiance times solid angle; its luminance times direction."""
+    """Return two (R, C, 3) sums over texel blocks: flux (radiance x solid angle), and its luminance x direction."""
     height, width = radiance.shape[:2]
     block = -(-height // _ROWS)
     starts = np.arange(0, width, block)
@@ -201,7 +201,7 @@ def _sum_texel_blocks(radiance: Tensor, axes: Array, turn: float, where: str) ->
 
 
 def _cut_environment_into_rectangles(moment: Array, weight: Array, count: int) -> list[tuple[int, int, int, int]]:
-    """Return at most ``count`` non-black rectangles (first row, end, first column, end) that hold all the energy."""
+    """Return at most ``count`` rectangles (first row, end, first column, end) that contain all cells with energy."""
     rows, columns = weight.shape
     table = np.zeros((rows + 1, columns + 1, 4))
     table[1:, 1:] = np.concatenate([moment, weight[..., None]], -1).cumsum(0).cumsum(1)

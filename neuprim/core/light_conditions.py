@@ -25,7 +25,7 @@ _ORBIT = (4.5, 40.0, 60)  # distance in scene units, polar angle in degrees, fra
 def typical_light(dataset: Dataset, falloff: bool) -> float:
     """Return the median light intensity of the training views; 1 if the median is 0 or infinite.
 
-    ``falloff`` divides each intensity by the squared distance of the light to the scene's centre.
+    With ``falloff``, each intensity is first divided by the squared distance of the light to the scene's centre.
     """
     values = []
     for i in range(len(dataset.train)):
@@ -131,13 +131,12 @@ def summarize_lights(lights: Tensor, center: Tensor, falloff: str, exposure: flo
 
 
 def lights_from_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
-    """Approximate an environment by at most ``count`` point lights like those of the training.
+    """Approximate an environment by at most ``count`` point lights like the lights of the training views.
 
-    Each direction becomes a light at the training lights' mean distance r. Its intensity gives the scene's centre the
-    environment's irradiance E: exposure E r^2 with falloff inverse_square (the model draws I/distance^2 over the
-    exposure), exposure E with falloff irradiance (intensities are then irradiances), else exposure E / pi. At an offset
-    from the centre, the light differs from parallel light by about 2 offset/r. A black environment gives one light of
-    intensity 0.
+    Each direction becomes a light at the training lights' mean distance r. Its intensity I gives the scene's centre the
+    environment's irradiance E. With falloff inverse_square, the model renders I / (distance^2 x exposure), so I =
+    exposure x E r^2. With falloff irradiance, I = exposure x E; else, I = exposure x E / pi. At an offset from the
+    centre, the light differs from parallel light by about 2 offset/r. A black environment gives one black light.
     ``facts``: entry "data" of the model's header; raises DataError if the entry is damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")

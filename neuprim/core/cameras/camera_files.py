@@ -81,7 +81,7 @@ def read_camera_file(path: Path, size: tuple[int, int] | None = None) -> CameraV
 
 
 def read_cameras(path: Path, size: tuple[int, int] | None = None) -> list[tuple[str, Camera]]:
-    """Return (name, camera) pairs of a file that :func:`read_camera_file` reads."""
+    """Return (name, camera) pairs of a file in any format that :func:`read_camera_file` reads."""
     return list(read_camera_file(path, size).named)
 
 
@@ -103,7 +103,7 @@ def _read_camera_image_size(record: JsonReader, keys: tuple[str, str], size: tup
 
 
 def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float, ...] | None:
-    """Return the times of all cameras of a file; None unless every camera has a time."""
+    """Return one time per camera, read from field ``key`` of each record; None unless all cameras have a time."""
     return tuple(r.number(key, "a time") for r in records) if all(r.has(key) for r in records) else None
 
 
@@ -147,7 +147,7 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
 
 
 def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read a path of nerfstudio's viewer, whose ``fov`` is vertical, in degrees; axes are OpenGL's."""
+    """Read a camera path of nerfstudio's viewer: ``fov`` is vertical and in degrees, camera axes are OpenGL's."""
     if document.values.get("camera_type", "perspective") != "perspective":
         raise document.fail("camera_type", "perspective; others are not drawn")
     records = _camera_records(document, "camera_path")
@@ -168,7 +168,7 @@ def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> Cam
 
 
 def _read_camera_matrix(record: JsonReader, key: str) -> Tensor:
-    """Read a (4, 4) matrix from 16 numbers row by row, or from four rows."""
+    """Read a (4, 4) matrix from field ``key``, given as 16 numbers row by row or as four rows."""
     value = record.values.get(key)
     if isinstance(value, list) and len(value) == 16:
         return JsonReader({key: [value[i : i + 4] for i in (0, 4, 8, 12)]}, record.where).matrix(key)
@@ -184,7 +184,7 @@ _UNEQUAL_SCALES = 1e-3  # largest relative deviation of a pose's axis scales fro
 
 
 def is_usd(path: Path) -> bool:
-    """Return whether a file begins as one of USD's three formats does."""
+    """Return whether the first bytes of a file are those of one of the three USD formats."""
     try:
         with open(path, "rb") as file:
             return file.read(8).startswith(_USD_MAGIC)
@@ -195,10 +195,10 @@ def is_usd(path: Path) -> bool:
 def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = None) -> CameraViews:
     """Read one camera of a USD stage; a moving camera is read at every whole time code.
 
-    ``prim`` is the path of the camera, required if the stage has several. Axes and units are those of the stage.
-    ``size`` is (width, height) in pixels, None for that of the stage. The image shows the whole aperture
-    ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic or sheared cameras, or if no
-    size is known.
+    ``prim`` is the path of the camera, required if the stage has several cameras. Axes and units are those of the
+    stage. ``size`` is (width, height) in pixels; None uses the size in the stage's render settings. The image shows the
+    whole aperture ("expandAperture" of UsdRender). Raises DataError for unreadable stages, orthographic or sheared
+    cameras, or if no size is known.
     """
     if importlib.util.find_spec("pxr") is None:
         raise BackendUnavailable(f"{path}: USD files need the package usd-core: pip install 'neuprim[usd]'")
@@ -221,7 +221,7 @@ def read_usd_cameras(path: Path, prim: str = "", size: tuple[int, int] | None = 
 
 
 def _read_usd_stage(path: Path, prim: str) -> JsonReader:
-    """Run the USD reader in its own process and return the JSON that it printed."""
+    """Run the USD reader in a separate process and return the JSON that it printed."""
     if path.stat().st_size > _MAX_USD_BYTES:
         raise DataError(f"{path}: {path.stat().st_size} bytes; expected at most {_MAX_USD_BYTES}")
     # -P: pxr must not import modules from the script's folder

@@ -102,7 +102,7 @@ def colmap_viewmat(image: Any) -> Tensor:
 
 
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
-    """Return the folder of the model with most images in a project's ``sparse``, or None, and a line for the user."""
+    """Return the folder of the model with the most images in ``sparse``, or None, and a message ("" for none)."""
     place = project / "sparse"
     models = sorted(
         (p for p in place.glob("*") if _colmap_model_suffix(p) is not None), key=lambda p: (len(p.name), p.name)
@@ -118,7 +118,7 @@ def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
 
 
 def _count_colmap_images(model: Path) -> int:
-    """Return the number of images in a model, from its file alone; 0 if damaged or missing."""
+    """Return the number of images in a model's images file without reading them; 0 if it is missing."""
     try:
         if (model / "images.bin").is_file():
             with open(model / "images.bin", "rb") as file:
@@ -138,7 +138,7 @@ def find_colmap_model(path: Path) -> Path | None:
 
 
 def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[str]]:
-    """Return (image name without suffix, camera) for all posed images, sorted by name, and lines for the user."""
+    """Return (image name without suffix, camera) pairs of all posed images, by name, and messages for the user."""
     reconstruction = _read_colmap_cameras_only(folder)
     images = sorted((i for i in reconstruction.images.values() if i.has_pose), key=lambda i: i.name)
     if not images:
@@ -164,7 +164,7 @@ def read_colmap_cameras(folder: Path) -> tuple[list[tuple[str, Camera]], list[st
 
 
 def _read_colmap_cameras_only(folder: Path) -> Any:
-    """Read a model whose points may be missing."""
+    """Read a COLMAP model, also if the file of its 3D points is missing."""
     kind = _colmap_model_suffix(folder)
     if kind is None or (folder / f"points3D{kind}").is_file() or not (folder / f"images{kind}").is_file():
         return read_colmap_model(folder)
@@ -184,7 +184,7 @@ _MAX_PARAMS = 64  # most parameters of a camera model
 
 
 class _ColmapRecordReader:
-    """Reader of a binary file that keeps the position; running past the end of the file raises DataError."""
+    """Sequential reader of a binary file; reading past the end of the file raises DataError."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

@@ -54,7 +54,7 @@ class CameraTarget:
 
 @dataclass(frozen=True)
 class _IntrinsicsSource:
-    """Fields of a frame or file, and the image size that its lengths in pixels refer to."""
+    """JSON fields of a frame or of the whole file, and the image size to which their pixel lengths refer."""
 
     record: JsonReader
     size: tuple[int, int]
@@ -63,7 +63,7 @@ class _IntrinsicsSource:
         return any(self.record.has(key) for key in group)
 
     def scales(self, keys: str, target: CameraTarget) -> tuple[float, float]:
-        """Return target pixels per pixel of this size, horizontally and vertically."""
+        """Return how many target pixels correspond to one pixel of this image size: (horizontally, vertically)."""
         if not is_resized_camera_size(self.size, target.size):
             own, other = _format_camera_image_size(self.size), _format_camera_image_size(target.size)
             found = f"{keys} belong to w, h {own}, and the image is {other}"
@@ -77,13 +77,13 @@ def _format_camera_image_size(size: tuple[int, int]) -> str:
 
 
 def is_resized_camera_size(size: tuple[int, int], other: tuple[int, int]) -> bool:
-    """Return whether one size is a resized copy of the other, up to rounding to whole pixels."""
+    """Return whether one image size is the other one scaled, up to rounding to whole pixels."""
     scale = max(other[0] / size[0], other[1] / size[1])
     return abs(size[0] * scale - other[0]) <= 1.0 and abs(size[1] * scale - other[1]) <= 1.0
 
 
 def _record_with_camera_keys(group: tuple[str, ...], frame: JsonReader, file: JsonReader) -> JsonReader:
-    """Return the record that provides a whole group of keys: the frame if it has any of them, else the file."""
+    """Return the JSON object from which to read a group of keys: the frame if it has any of them, else the file."""
     return frame if any(frame.has(key) for key in group) else file
 
 
@@ -96,8 +96,8 @@ def read_camera(
 ) -> Camera:
     """Read the pinhole camera of a frame; keys that the frame lacks are read from ``file``.
 
-    ``viewmat`` (4, 4) is world to camera, OpenCV axes; None reads ``transform_matrix``. ``say`` receives lines for the
-    user. Raises DataError for missing or wrong fields, or fields that contradict each other or the image.
+    ``viewmat`` (4, 4) is world to camera, OpenCV axes; None reads ``transform_matrix``. ``say`` is called with messages
+    for the user. Raises DataError for missing or wrong fields, or fields that contradict each other or the image.
     """
     of_file = _IntrinsicsSource(file, _stated_image_size(file, target.size))
     of_frame = _IntrinsicsSource(frame, _stated_image_size(frame, of_file.size))
@@ -119,7 +119,7 @@ def read_camera(
 
 
 def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[int, int]:
-    """Return the image size that a record states; a missing width or height comes from ``default``."""
+    """Return the image size in the keys w and h of a JSON object; a missing one comes from ``default``."""
     return record.count("w") if record.has("w") else default[0], record.count("h") if record.has("h") else default[1]
 
 
@@ -129,7 +129,7 @@ def _stated_image_size(record: JsonReader, default: tuple[int, int]) -> tuple[in
 def _read_focal_lengths(
     frame: JsonReader, level: _IntrinsicsSource, target: CameraTarget, say: Say
 ) -> tuple[float, float]:
-    """Return fx, fy in pixels of the target; raises DataError if keys contradict each other."""
+    """Return fx, fy in pixels of the target image; raise DataError if keys contradict each other."""
     x, y = _stated_camera_focal_lengths(level, 0, target), _stated_camera_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
@@ -173,7 +173,7 @@ def _read_focal_lengths(
 
 
 def _stated_camera_focal_lengths(level: _IntrinsicsSource, axis: int, target: CameraTarget) -> dict[str, float]:
-    """Return every focal length along an axis that a record states, by key, in target pixels; pixel keys come first."""
+    """Return key -> focal length in target pixels, for each key that states it along ``axis``; pixel keys first."""
     record, name, side = level.record, "xy"[axis], target.size[axis]
     found = {}
     if record.has(key := f"fl_{name}"):
@@ -237,7 +237,7 @@ def _read_principal_point(
 def _check_principal_point(
     where: str, keys: str, point: tuple[float, float], stated: bool, target: CameraTarget
 ) -> None:
-    """Refuse a principal point outside of the image, or in the middle of an image of another size."""
+    """Raise DataError for a principal point outside the image, or in the middle of an image of another size."""
     (cx, cy), image = point, f"{target.image or 'the picture'} ({target.width}x{target.height})"
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
     if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
@@ -257,7 +257,7 @@ def _check_principal_point(
 
 
 def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: CameraTarget) -> None:
-    """Refuse a frame with its own focal length that takes principal point or distortion from the file."""
+    """Raise DataError for a frame with its own focal length but principal point or distortion from the file."""
     if file.record.has("camera_intrinsics") or not file.has(FOCAL):
         return
     left = []
@@ -289,7 +289,7 @@ def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, flo
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Return whether the lens is OpenCV's fisheye; raise DataError for a lens model that is neither that nor a pinhole.
 
-    ``others``: further models that the message offers.
+    ``others``: further lens models that the error message lists as valid.
     """
     record = _record_with_camera_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"
@@ -352,7 +352,7 @@ _LISTED = 8
 
 
 def refuse_unsupported_camera_keys(record: JsonReader) -> None:
-    """Raise DataError for a key that changes the picture and is not supported."""
+    """Raise DataError for a key that changes the image and that neuprim does not support."""
     for key, states in _REFUSED.items():
         if key in record.values and _is_camera_key_set(record.values[key]):
             raise DataError(f"{record.where}: {key} states {states}")
@@ -366,12 +366,12 @@ def refuse_unsupported_camera_keys(record: JsonReader) -> None:
 
 
 def _is_camera_key_set(value: Any) -> bool:
-    """Return whether a value is more than zeros, false or nothing."""
+    """Return whether a JSON value is set: not null, false, empty, zero, or a list of such values."""
     return any(map(_is_camera_key_set, value)) if isinstance(value, list) else bool(value)
 
 
 def describe_unknown_camera_keys(file: JsonReader, frames: Iterable[JsonReader], read: Iterable[str]) -> str:
-    """Return a line that names keys that are neither read nor known to be harmless; "" for none."""
+    """Return a message that names the keys neither read nor known to be harmless; "" if there are none."""
     known = _READ | _HARMLESS | _REFUSED.keys() | {*_KINDS, *read}
     found = dict.fromkeys(k for k in file.values if k not in known)
     found.update(dict.fromkeys(f"frames[].{k}" for r in frames for k in r.values if k not in known))

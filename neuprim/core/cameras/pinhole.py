@@ -44,7 +44,7 @@ class Camera:
         return Camera(self.viewmat, self.fx * sx, self.fy * sy, self.cx * sx, self.cy * sy, width, height)
 
     def reduced(self, factor: int) -> Camera:
-        """Return the camera with pixels ``factor`` times as large; remaining columns and rows are cut off."""
+        """Return the camera for pixels ``factor`` times as large; columns and rows left over are cut off."""
         fx, fy, cx, cy = (value / factor for value in (self.fx, self.fy, self.cx, self.cy))
         return Camera(self.viewmat, fx, fy, cx, cy, self.width // factor, self.height // factor)
 
@@ -78,7 +78,7 @@ class Camera:
 
 
 def check_viewmat(viewmat: Tensor, where: str) -> None:
-    """Raise DataError naming ``where`` unless ``viewmat`` is finite (4, 4) with a rotation in its upper left."""
+    """Raise DataError naming ``where`` unless ``viewmat`` is finite, (4, 4), and has a rotation in its upper left."""
     view = viewmat.detach().double().cpu()
     if view.shape != (4, 4) or not torch.isfinite(view).all():
         found = f"camera matrix has shape {tuple(view.shape)} or non-finite entries"
@@ -104,7 +104,7 @@ def opengl_to_viewmat(c2w: Tensor) -> Tensor:
 
 
 def look_at(eye: Tensor, target: Tensor, up: Tensor) -> Tensor:
-    """Return the (4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target``, ``up`` up."""
+    """Return the (4, 4) world-to-camera OpenCV matrix of a camera at ``eye`` looking at ``target``, ``up`` upwards."""
     eye, target, up = eye.double(), target.double(), up.double()
     z = target - eye
     z = z / z.norm()
@@ -127,7 +127,7 @@ def horizontal_axes(up: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def orbit(template: Camera, center: Tensor, up: Tensor, radius: float, elevation: float, count: int) -> list[Camera]:
-    """Return ``count`` cameras on a circle around ``center``, ``elevation`` radians above its horizontal plane."""
+    """Return ``count`` copies of ``template`` around ``center``, at distance ``radius``, ``elevation`` radians up."""
     up = (up / up.norm()).double()
     a, b = horizontal_axes(up)
     views = []
@@ -196,8 +196,8 @@ class RayCamera:
     """A camera with one direction per pixel, such as a fisheye or a panorama; only the reference backend renders it.
 
     All rays start at one point; they may point backwards (z < 0). Distances along the rays replace depths: for
-    ``near``, depth images and the order of primitives. Images therefore differ from those of a pinhole where a near
-    plane cuts chords. Raises DataError if ``viewmat`` is not rigid, or directions are not of unit length.
+    ``near``, depth images and the order of primitives. So where the near plane cuts a primitive, the image differs from
+    that of a pinhole. Raises DataError if ``viewmat`` is not rigid, or directions are not of unit length.
     """
 
     viewmat: Tensor  # (4, 4) world to camera, OpenCV axes

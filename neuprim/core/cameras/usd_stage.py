@@ -1,6 +1,6 @@
 """Script that prints the camera of a USD stage as JSON; runs in a separate process, without any import of neuprim.
 
-Arguments: file, the camera's prim or nothing, and the largest number of frames. Errors are one line on standard error.
+Arguments: file, the camera's prim or nothing, limit on the number of frames. Errors are one line on standard error.
 """
 
 from __future__ import annotations
@@ -46,8 +46,7 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
 
 
 def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
-    """Return every whole time code from the stage's start to its end if the camera moves; else one time, the start or
-    the earliest."""
+    """Return every whole time code of the stage if the camera moves, else only its start, or the earliest time."""
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
         moves, prim = (
@@ -67,7 +66,7 @@ def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any)
 
 
 def usd_camera_frame(camera: Any, moment: Any) -> dict[str, Any]:
-    """Return pose (camera to world, column vectors), focal length, aperture and its offset, in one unit, at a time."""
+    """Return the camera at time ``moment``: pose (camera to world, column vectors), focal length and aperture."""
     found = camera.GetCamera(moment)
     matrix = found.transform
     return {

@@ -24,7 +24,7 @@ _Camera = TypeVar("_Camera", Camera, RayCamera)
 
 @dataclass(frozen=True, eq=False)
 class World:
-    """Transform between world coordinates, those of the user's files, and scene coordinates, those of the model.
+    """Transform between world coordinates (of the user's files) and scene coordinates (of the model).
 
     The transform is a rotation, one scale and an offset. Models are in scene units, mostly float32. Coordinates that
     users give or get (cameras, lights, boxes, exported positions) are world coordinates in float64.
@@ -58,7 +58,7 @@ class World:
 
     @cached_property
     def inverse(self) -> World:
-        """The inverse transform: its scene coordinates are the world coordinates of this one, and vice versa."""
+        """The inverse transform, which exchanges world coordinates and scene coordinates."""
         back = torch.eye(4, dtype=torch.float64)
         back[:3, :3] = torch.linalg.inv(self.scene_from_world[:3, :3])
         back[:3, 3] = -back[:3, :3] @ self.scene_from_world[:3, 3]
@@ -111,7 +111,7 @@ class World:
 
     @staticmethod
     def of(header: Mapping[str, Any], where: str) -> World:
-        """Return the transform in a model's header, by default the identity, +z up; raise DataError if damaged."""
+        """Return the transform in a model's header, else the identity with +z up; raise DataError if it is damaged."""
         record, facts = header.get("world"), header.get("data")
         world = World()
         if isinstance(facts, dict) and "up" in facts:

@@ -83,7 +83,7 @@ class Pixels:
 
 
 class ViewSet(ABC):
-    """The posed images of one split; base class for your own views. ``len(views)`` is their number."""
+    """The posed images of one split; base class for your own views. ``len(views)`` is the number of views."""
 
     @abstractmethod
     def __len__(self) -> int: ...
@@ -98,7 +98,7 @@ class ViewSet(ABC):
 
 
 class ViewSubset(ViewSet):
-    """The views of another set at ``indices``, in that order. The other set caches their pixels."""
+    """The views of another view set at ``indices``, in that order. The other set caches the pixels."""
 
     def __init__(self, views: ViewSet, indices: Sequence[int]) -> None:
         self._views, self._indices = views, list(indices)
@@ -113,7 +113,7 @@ class ViewSubset(ViewSet):
         return self._views.pixels(self._indices[index])
 
     def source(self, index: int) -> tuple[ViewSet, int]:
-        """Return the view set that contains the view ``index``, and the index of the view in that set."""
+        """Return the view set that this subset selects from, and the index of the view in that set."""
         return self._views, self._indices[index]
 
 
@@ -137,7 +137,7 @@ class PointCloud:
         return replace(self, **chosen, conditions={n: value[index] for n, value in self.conditions.items()})
 
     def within(self, world: World) -> PointCloud:
-        """Return the points converted from ``world`` to scene coordinates, in float64."""
+        """Return the points converted from ``world`` coordinates to scene coordinates, in float64."""
         means = world.scene_points(self.means).float()
         scale, quats = world.scale, self.quats
         axes, deviations = (x if x is None or scale == 1.0 else x * scale for x in (self.axes, self.deviations))
@@ -271,11 +271,11 @@ class PointSupervision(ABC):
 
 
 def hold_out_views(dataset: Dataset, every: int) -> Dataset:
-    """Return the data set with one of every ``every`` training views moved to the test split, which is replaced.
+    """Return the data set with one of every ``every`` training views moved to a new test split.
 
-    The position of the moved view advances by one from each group of ``every`` views to the next. So no time step of a
-    multi-camera sequence is missing from all cameras. Raises ConfigError: ``every`` < 2, or fewer than two training
-    views.
+    The position of the moved view advances by one from each group of ``every`` views to the next. So every time step of
+    a multi-camera sequence keeps some training cameras. The old test split is dropped. Raises ConfigError: ``every`` <
+    2, or fewer than two training views.
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
@@ -344,14 +344,14 @@ _OUTLYING_SHARE = 0.05
 
 
 def find_outliers(positions: Tensor) -> Tensor:
-    """Mark at most one or 5 % of (N, 3) camera centres that lie beyond 100 median distances from the median."""
+    """Return (N,) bool: centres beyond 100 median distances from the median; none if more than max(1, N/20) are."""
     distance = (positions - positions.median(0).values).norm(dim=-1)
     far = (distance > _OUTLYING * distance.median()) & (distance.median() > 0)
     return far if int(far.sum()) <= max(1, _OUTLYING_SHARE * len(far)) else torch.zeros_like(far)
 
 
 def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """Return the (3,) float64 point nearest to all optical axes (least squares), pulled weakly one extent forward."""
+    """Return the (3,) float64 point nearest to all optical axes; a weak pull draws it to one extent ahead."""
     positions, forward = _dataset_optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]
@@ -364,8 +364,8 @@ def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
 def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
     """Return whether the optical axes determine a point in front of the cameras.
 
-    The axes must pass the point closer than half the spread of the centres, and 9 of 10 cameras must look towards it.
-    Parallel axes, outward rings and tripods determine no point.
+    The axes must pass the point within half the spread of the camera centres. Also, 9 of 10 cameras must look towards
+    it. Parallel axes, outward rings and tripods determine no point.
     """
     positions, forward = _dataset_optical_axes(cameras)
     offsets = dataset_focus_point(cameras) - positions
@@ -377,7 +377,7 @@ def dataset_axes_meet(cameras: Sequence[Camera]) -> bool:
 
 
 def _dataset_optical_axes(cameras: Sequence[Camera]) -> tuple[Tensor, Tensor]:
-    """Return (N, 3) centres and (N, 3) viewing directions, float64, of all cameras but outliers."""
+    """Return (N, 3) centres and (N, 3) viewing directions of all cameras except outliers; float64."""
     positions = torch.stack([c.position.detach().double() for c in cameras])
     forward = torch.stack([c.viewmat[2, :3].detach().double() for c in cameras])
     usual = ~find_outliers(positions)
@@ -388,11 +388,11 @@ FAR = 100.0  # camera extents from the origin, beyond which a scene is moved: fl
 
 
 def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> World:
-    """Choose the transform between a scene and the world of its file: an offset if the scene is far from the origin.
+    """Choose the transform between the coordinates of a file (world) and of the scene: identity, or an offset.
 
-    If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin. It is
-    first rounded to multiples of a power of ten between one and ten extents. Other scenes keep their coordinates bit
-    for bit. ``where`` names the file in warnings.
+    If the mean camera centre is farther than :data:`FAR` extents from the origin, it becomes the scene's origin,
+    rounded to multiples of a power of ten between one and ten extents. Other scenes keep their coordinates bit for bit.
+    ``where`` names the file in warnings.
     """
     views = [c.viewmat.detach().double() for c in cameras]
     # solved, not transposed: far from the origin a transpose turns the rounding of a file's rotations into metres

@@ -61,7 +61,7 @@ def check_mask(split: str, view: View, mask: Tensor) -> None:
 
 
 def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
-    """Check starting points, of which at most ``count`` were requested; raise DatasetError."""
+    """Raise DatasetError unless starting points are valid and at most ``count``, the requested number."""
     where = f"{dataset.name}: starting points"
     _check_dataset_instance(where, cloud, PointCloud)
     found = len(cloud.means) if isinstance(cloud.means, Tensor) and cloud.means.dim() else 0
@@ -77,7 +77,7 @@ def check_points(cloud: PointCloud, count: int, dataset: Dataset) -> None:
 
 
 def check_point_samples(samples: PointSamples, dataset: Dataset) -> None:
-    """Check shapes and dtypes of ground-truth points, in every training step; raise DatasetError."""
+    """Raise DatasetError unless ground-truth points have valid shapes and dtypes; called in every training step."""
     _check_dataset_instance(f"{dataset.name}: points", samples, PointSamples)
     where = f"{dataset.name}: points of {samples.name}"
     count = len(samples.sigma) if isinstance(samples.sigma, Tensor) and samples.sigma.dim() else 0

@@ -94,7 +94,7 @@ def undistortion_grid(camera: Camera, distortion: Distortion) -> tuple[Tensor, T
 
 
 def _unfolded_pixels(camera: Camera, source: np.ndarray) -> np.ndarray:
-    """Return (H, W) bool: pixels connected to the principal point by pixels where the map keeps its orientation."""
+    """Return (H, W) bool: pixels connected to the principal point without crossing a fold of the lens map."""
     # polynomial lens models turn back beyond some radius and would mirror the middle of the photograph into the corners
     if min(source.shape[:2]) < 2:
         return np.isfinite(source).all(axis=-1)
@@ -123,7 +123,7 @@ class Mask:
 
 
 def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) -> list[Mask | None]:
-    """Return the mask of every image file, None for images without a mask; warns how many masks there are.
+    """Return a mask or None for each image file; warn how many masks there are.
 
     The mask of ``images/a/b.jpg`` is ``masks/a/b.png``, ``masks/a/b.jpg.png`` or ``masks/a/b.jpg`` (COLMAP,
     nerfstudio). For ``images_4``, ``masks_4`` is tried first. ``dynamic_mask_b.png`` next to the image (instant-ngp) is
@@ -239,7 +239,7 @@ class _StoredImage:
         return alpha.contiguous()
 
     def planes(self) -> tuple[Tensor, Tensor | None]:
-        """Return (H, W, 3) float32 premultiplied colours, and alpha."""
+        """Return premultiplied colours (H, W, 3) and alpha (H, W) or None, both float32."""
         rgb, eight_bit, alpha = self.data[..., :3], self.data.dtype == torch.uint8, self.alpha
         if self._multiplies_alpha:
             assert alpha is not None
@@ -257,15 +257,15 @@ class _StoredImage:
 
     @property
     def _multiplies_alpha(self) -> bool:
-        """Whether these are 8-bit sRGB colours to be multiplied with alpha."""
+        """Whether the colours are 8-bit sRGB values that must be multiplied with alpha."""
         return not (self.premultiplied or self.to_linear or self.data.shape[-1] == 3)
 
 
 class StoredPixels(Pixels):
     """Pixels of a stored image, converted to floats on first use.
 
-    Strided views convert only their own pixels. Alpha is converted alone if nothing reads the colours. On a GPU the
-    stored image stays as it is, too, and takes a quarter of the memory of floats.
+    Strided views convert only their own pixels. Reading only alpha converts only alpha. On a GPU, the stored image is
+    not converted in advance either, and takes a quarter of the memory of floats.
 
     Args:
         image: the image; None if ``fields`` has the fields of ``Pixels``, as :func:`dataclasses.replace` passes them.
@@ -340,7 +340,7 @@ class ImageViews(ViewSet):
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode and cache all images; return view index -> error of bad ones. ``empty`` allows transparent images."""
+        """Decode and cache all images; return view index -> error of bad ones. ``empty``: accept transparent images."""
 
         def fault(index: int) -> DataError | None:
             try:
@@ -399,7 +399,7 @@ class ImageViews(ViewSet):
         return _StoredImage(image, premultiplied, mask, self._to_linear)
 
     def _resample_frame(self, frame: ImageFrame, image: Tensor, mask: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Undistort and reduce; colours become premultiplied, the number type stays."""
+        """Undistort and down-sample an image and its mask; colours become premultiplied, the dtype stays."""
         eight_bit = image.dtype == torch.uint8
         if eight_bit and self._to_linear:
             values = _LINEAR[image[..., :3].int()]

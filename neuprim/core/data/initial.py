@@ -25,9 +25,9 @@ _ROUNDS = 8  # times that points are drawn in the box, until enough of them are 
 def initial_points(views: ViewSet, points: PointCloud | None, count: int, generator: torch.Generator) -> PointCloud:
     """Return at most ``count`` distinct starting points of a static scene.
 
-    If ``points`` are given, the starting points are drawn from them. Otherwise they are inferred, each in the image of
-    at least two cameras: along the rays if the cameras do not look at one point, else on the visual hull for images
-    with alpha, else in a box around the focus.
+    If ``points`` are given, the starting points are drawn from them. Otherwise they are inferred from the images: along
+    rays if the cameras do not look at one point, else on the visual hull for images with alpha, else in a box around
+    the focus. If the cameras have different positions, at least two see each inferred point.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -105,7 +105,7 @@ def _distinct_point_rows(points: PointCloud) -> Tensor:
 
 
 def farthest_points(points: Tensor, count: int, generator: torch.Generator) -> Tensor:
-    """Choose (count,) rows of ``points`` (M, 3) far from each other; approximately for large sets."""
+    """Choose ``count`` rows of ``points`` (M, 3) that are far from each other; approximate for large sets."""
     if count * len(points) > _FPS_WORK:
         return _thin_points_by_grid(points, count, generator)
     start = int(torch.randint(len(points), (1,), generator=generator))
@@ -142,7 +142,7 @@ def _thin_points_by_grid(points: Tensor, count: int, generator: torch.Generator)
 
 
 def median_colors(views: ViewSet, means: Tensor, matter: float = 0.5) -> Tensor:
-    """Return (N, C) colours of the points (N, 3): per-channel medians, over the views, of the pixels they project to.
+    """Return (N, C) colours of points (N, 3): the median over the views of the pixels that show them, per channel.
 
     A view counts if the point falls on a valid pixel with alpha above ``matter``. Colours are not premultiplied. Points
     in no view get the median colour of the other points, or mid-grey.
@@ -182,10 +182,10 @@ _SHELL = 0.1  # share of the points that surround everything
 
 
 def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator: torch.Generator) -> PointCloud:
-    """Return at most ``count`` points for surroundings that the views show but ``points`` do not contain.
+    """Return at most ``count`` points on surroundings that the views show and that ``points`` do not cover.
 
     Pixels without a point nearby become points, with their colours, at the depth of their neighbours, unless other
-    views already cover the position. A tenth of the points form a shell around the scene, where some view looks.
+    views already cover the position. A tenth of the points lie on a sphere around the scene, where some view looks.
     """
     if count <= 0 or not len(points.means):
         return points.rows(torch.zeros(0, dtype=torch.int64))
@@ -199,7 +199,7 @@ def surrounding_points(views: ViewSet, points: PointCloud, count: int, generator
 
 
 def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Lift pixels without nearby points, coarse grids first, so that the largest gaps are filled first."""
+    """Turn pixels without nearby points into points; coarse pixel grids first, to fill the largest gaps first."""
     order = torch.randperm(len(views), generator=generator)[:_VIEWS].tolist()
     known = given.double().numpy()
     means = np.zeros((0, 3))
@@ -218,7 +218,7 @@ def _lift_starting_points(views: ViewSet, given: Tensor, count: int, generator: 
 def _find_starting_pixels(
     views: ViewSet, index: int, known: NDArray[np.float64], cell: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """Return positions and colours of pixels ``cell`` apart that have no known point that near, in image and space."""
+    """Return positions and colours of grid pixels, ``cell`` apart, that have no known point within ``cell``."""
     camera, image = views.view(index).camera, views.pixels(index)
     rotation, shift = camera.viewmat[:3, :3].double().numpy(), camera.viewmat[:3, 3].double().numpy()
     spots = _starting_pixel_grid(camera.width, camera.height, cell)
@@ -251,7 +251,7 @@ def _starting_pixel_grid(width: int, height: int, cell: float) -> NDArray[np.flo
 
 
 def _surrounding_shell(views: ViewSet, given: Tensor, count: int, generator: torch.Generator) -> PointCloud:
-    """Return at most ``count`` points on a sphere around cameras and points, where some view looks."""
+    """Return at most ``count`` points on a sphere around cameras and points, each in the image of some view."""
     cameras = [views.view(i).camera for i in range(len(views))]
     center = dataset_focus_point(cameras)
     eyes = torch.stack([c.position.double() for c in cameras]) - center

@@ -33,9 +33,9 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     """Read the vertices of a PLY file as starting points, in the file's own coordinates, ``means`` in float64.
 
     Colours (``f_dc_0..2``, or ``red green blue``) are taken for sRGB, and become ``channels`` in ``color_space``.
-    ``scale_0..2`` with ``rot_0..3`` (wxyz) and ``opacity`` (a logit) make Gaussians; two scales are discs, one a ball.
-    Vertices that are no valid points are left out with a warning. Raises DataError for a damaged or compressed file,
-    or a file without usable points.
+    ``scale_0..2`` with ``rot_0..3`` (wxyz) and ``opacity`` (a logit) make Gaussians; two scales make a disc, one scale
+    a ball. Vertices that are no valid points are left out with a warning. Raises DataError for a damaged or compressed
+    file, or a file without usable points.
     """
     if path.suffix.lower() in COMPRESSED:
         raise _compressed_start_points_error(path, f"{path.suffix} is a compressed format of Gaussians")

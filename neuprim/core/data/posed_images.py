@@ -65,7 +65,7 @@ _T = TypeVar("_T")
 
 
 class BadImageViews:
-    """Collect the errors of damaged views, which are left out with a warning each; if ``strict``, raise the first."""
+    """Collector of errors of damaged views, which are left out with a warning. If ``strict``, the first is raised."""
 
     def __init__(self, where: str, strict: bool) -> None:
         self._where, self._strict = where, strict
@@ -88,7 +88,7 @@ class BadImageViews:
             self._first = error
 
     def settle(self, count: int) -> None:
-        """Warn of the recorded bad views, out of ``count`` views; raise DataError if most views are bad."""
+        """Warn of all recorded bad views; raise DataError if they are more than half of ``count`` views."""
         bad = len(self._faults)
         if 2 * bad > count:
             more = "" if count == 1 else f"; {bad} of {count} views of {self._where} are like this"
@@ -119,7 +119,7 @@ def find_image(folder: Path, text: str) -> Path | None:
 
 
 def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path]) -> None:
-    """Warn once of images outside of the data set; they are read, as other tools write such paths."""
+    """Warn once of images outside of the data set's folder. They are read, because other tools write such paths."""
     own = home.resolve()
     own = own if own.is_dir() else own.parent
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
@@ -141,7 +141,7 @@ def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
 
 
 def exif_hint(info: ImageInfo) -> str:
-    """Return the end of a message about an image size if EXIF asks to rotate the image by 90 degrees, else ""."""
+    """Return a hint to append to a message about an image size if EXIF turns the image by 90 degrees, else ""."""
     if info.orientation < 5:
         return ""
     return (
@@ -283,7 +283,7 @@ def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
 def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
-    """Decode all images of a split and leave out the damaged ones; ``empty`` allows images that show nothing."""
+    """Decode all images of a split and leave out damaged ones. ``empty``: accept fully transparent images."""
     bad = BadImageViews(f"{where} ({split})", strict)
     faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
     for index, error in faults.items():
@@ -293,7 +293,7 @@ def _preload_split(
 
 
 def image_frame_in_scene(frame: ImageFrame, world: World, positions: Sequence[str]) -> ImageFrame:
-    """Convert a frame's camera and its conditions in ``positions`` from world to scene coordinates, in float64."""
+    """Convert a frame's camera, and those conditions that are ``positions``, from world to scene coordinates."""
     moved = {name: world.scene_points(frame.conditions[name]).float() for name in positions}
     return replace(frame, camera=world.scene_camera(frame.camera), conditions={**frame.conditions, **moved})
 

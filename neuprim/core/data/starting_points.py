@@ -27,7 +27,7 @@ class EmptyHull(DataError):
 
 @dataclass(frozen=True)
 class _Silhouette:
-    """Camera of a mask and the (H+1, W+1) int32 summed-area table of pixels that may show matter."""
+    """A mask's camera, and the (H+1, W+1) int32 summed-area table of pixels that may show matter."""
 
     camera: Camera
     table: Tensor
@@ -50,9 +50,9 @@ def hull_surface(
 ) -> tuple[Tensor, float]:
     """Return centres (M, 3) float32 of the visual hull's surface voxels, and the side of a voxel, in scene units.
 
-    ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull if at least the fraction
-    ``seen_views`` of the views contains it, and alpha is at most ``matter`` there in at most the fraction
-    ``wrong_views``. Raises EmptyHull if the hull has no voxel.
+    ``resolution`` is in voxels along the hull's longest side. A voxel belongs to the hull under two conditions. At
+    least the fraction ``seen_views`` of the views contains it. At most the fraction ``wrong_views`` of the views has an
+    alpha there of at most ``matter``. Raises EmptyHull if the hull has no voxel.
     """
     silhouettes = _read_silhouettes(views, matter)
     cameras = [s.camera for s in silhouettes]
@@ -89,7 +89,7 @@ def _read_silhouettes(views: ViewSet, threshold: float) -> list[_Silhouette]:
 
 
 def _refine_voxels(grid: _VoxelGrid, resolution: int) -> _VoxelGrid:
-    """Refine to ``resolution`` voxels along the longest side of the box of full cells."""
+    """Subdivide the box of the remaining voxels to ``resolution`` voxels along its longest side."""
     cells = grid.full.nonzero()
     low, high = cells.min(0).values, cells.max(0).values + 1
     voxel = grid.voxel * float((high - low).max()) / resolution
@@ -105,7 +105,7 @@ def _refine_voxels(grid: _VoxelGrid, resolution: int) -> _VoxelGrid:
 def _carve_voxels(
     grid: _VoxelGrid, silhouettes: list[_Silhouette], reach: float, seen_views: float, wrong_views: float
 ) -> _VoxelGrid:
-    """Remove voxels that the masks rule out; ``reach`` is half the side of the tested box, in voxels."""
+    """Remove voxels that the masks rule out. Each test covers a cube of half side ``reach``, in voxels."""
     cells = grid.full.nonzero()
     poses = torch.stack([s.camera.viewmat[:3].double() for s in silhouettes]).numpy()
     cameras = [s.camera for s in silhouettes]
@@ -131,7 +131,7 @@ def _carve_voxels(
 def _carve_hull_points(
     points: Any, poses: Any, lenses: Any, offsets: Any, tables: Any, reach: float, allowed: int, needed: float
 ) -> Any:
-    """Return (M,) bool of the points in the images of ``needed`` or more views, with no matter in at most ``allowed``.
+    """Return (M,) bool: points inside ``needed`` or more images, and without matter in at most ``allowed`` of them.
 
     ``points`` (M, 3), ``poses`` (V, 3, 4) world to camera, ``lenses`` (V, 6) fx fy cx cy width height, all float64. The
     summed-area table (height+1, width+1) of view j begins at ``tables[offsets[j]]``. ``reach`` is half the side of the
@@ -190,9 +190,9 @@ def ray_starting_points(
     """Place at most ``count`` points on rays through random pixels, uniform in 1/z, with the colours of the pixels.
 
     Returns the points, and the (N,) indices of the views that they come from. Depths range over those at which other
-    views show the same colours. If no depth fits better than infinity, the cameras count as one, and the unit of depth
-    is arbitrary. Otherwise every point must be in the images of two cameras. Only pixels with alpha above ``matter``
-    are used. Raises DataError: no two cameras see the same position, or no pixel has enough alpha.
+    views show the same colours. If no depth fits better than infinity, all cameras are taken to be at one position, and
+    the unit of depth is arbitrary. Otherwise at least two cameras must see each point. Only pixels with alpha above
+    ``matter`` are used. Raises DataError: no two cameras see the same position, or no pixel has enough alpha.
     """
     depths, mean, needed = _find_starting_depths(views, generator, matter)
     found: list[tuple[Tensor, Tensor, Tensor]] = []
@@ -227,7 +227,7 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 def _draw_starting_pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw pixels that show matter: eyes and rays with camera z = 1, (N, 3) float64, colours (N, C), views (N,)."""
+    """Draw pixels that show matter: ray origins and directions (N, 3) float64, colours (N, C), view indices (N,)."""
     drawn = torch.randint(len(views), (count,), generator=generator)
     spots = torch.rand((count, 2), generator=generator).double()
     found = []
@@ -249,7 +249,7 @@ def _draw_starting_pixels(
 
 
 def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: float) -> tuple[Tensor, Tensor, int]:
-    """Return depths that fit, the mean colour difference at each, and how many cameras must see a point."""
+    """Return plausible depths, the mean colour difference at each, and the number of cameras that must see a point."""
     cameras = [views.view(i).camera for i in range(len(views))]
     same = all(torch.equal(c.position, cameras[0].position) for c in cameras)
     unit = camera_extent(cameras)
@@ -273,7 +273,7 @@ def _find_starting_depths(views: ViewSet, generator: torch.Generator, matter: fl
 
 
 def _starting_color_difference(views: ViewSet, points: Tensor, colors: Tensor, owner: Tensor) -> Tensor:
-    """Return the (N,) median colour difference to other views at the points; NaN where no view shows them."""
+    """Return (N,) median differences between ``colors`` and other views at the points; NaN if no view shows a point."""
     found = []
     for index in evenly_spaced(len(views), _OTHERS):
         camera, pixels = views.view(index).camera, views.pixels(index)

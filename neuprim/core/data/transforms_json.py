@@ -51,7 +51,7 @@ def _image_frame_viewmat(record: JsonReader) -> Tensor:
 
 @dataclass(frozen=True)
 class TransformsLayout:
-    """How to read one format of ``transforms.json``: the points in which the formats differ."""
+    """Description of one format of ``transforms.json``: how it differs from the other formats."""
 
     keys: tuple[str, ...] = ()  # further keys that the loader reads
     name: Callable[[JsonReader], str] = _image_frame_path  # path of a frame's image, as the file states it
@@ -70,12 +70,12 @@ def read_image_frames(
     layout: TransformsLayout,
     skip_missing: bool = False,
 ) -> tuple[list[JsonReader], list[ImageFrame]]:
-    """Read the good frames whose images exist, with their records, in the order of ``records``.
+    """Read frames; return the JSON objects and the image frames of all good ones, in the order of ``records``.
 
-    ``document`` is the whole file; its fields apply to frames that lack them. Paths are relative to ``folder``.
-    ``skip_missing`` leaves out frames whose image is missing, unless no frame would remain. Raises DataError for
-    missing images or masks, wrong, contradictory or unsupported fields, most views bad, or, with ``settings.strict``,
-    any bad view.
+    ``document`` is the whole file; its fields apply to ``records`` (frames) that lack them. Paths are relative to
+    ``folder``. ``skip_missing`` leaves out frames whose image is missing, unless no frame would remain. Raises
+    DataError for missing images or masks, wrong, contradictory or unsupported fields, most views bad, or, with
+    ``settings.strict``, any bad view.
     """
     for record in (document, *records):
         refuse_unsupported_camera_keys(record)
@@ -122,7 +122,7 @@ def _read_image_pose(record: JsonReader, layout: TransformsLayout) -> Tensor:
 
 
 def _is_image_pose_damaged(record: JsonReader) -> bool:
-    """Return whether a pose has numbers that are not finite, or only zeros."""
+    """Return whether the pose of a frame contains NaN or infinity, or consists of zeros."""
     poses = [_image_pose_numbers(record.values.get(key)) for key in _POSES]
     return any(not all(map(math.isfinite, numbers)) for numbers in poses) or bool(poses[0] and not any(poses[0]))
 
@@ -139,7 +139,7 @@ def _image_pose_numbers(value: object) -> list[float]:
 def _find_frame_masks(
     folder: Path, document: JsonReader, present: Sequence[tuple[JsonReader, Path]], layout: TransformsLayout
 ) -> list[Mask | None]:
-    """Return the mask of every frame, or None: ``mask_path`` of the frame or file, else a mask next to the images."""
+    """Return the mask or None of every frame: ``mask_path`` of the frame or file, else a mask next to the images."""
     if layout.masks and not any(r.has("mask_path") for r in (document, *(r for r, _ in present))):
         return find_masks(folder, [file for _, file in present])
     masks, lost = [], []

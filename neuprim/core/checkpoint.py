@@ -45,7 +45,7 @@ _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitiv
 
 
 def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors and a JSON header atomically; a full disk or a kill leaves the previous file untouched."""
+    """Write tensors and a JSON header atomically: a failed write leaves the previous file unchanged."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
     compact = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     try:
@@ -60,7 +60,7 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
     """Return the JSON header of a file of this kind, "model" or "checkpoint"; reads no tensor.
 
     Raises:
-        CheckpointError: the file is missing, truncated, of another program or of another format version.
+        CheckpointError: the file is missing, truncated, written by another program, or of another format version.
     """
     if is_compressed(path):
         return _check_model_header(path, read_model_header(path), kind)
@@ -112,10 +112,10 @@ def shapes(path: Path, kind: str) -> dict[str, tuple[int, ...]]:
 def read_tensors(
     path: Path, kind: str, rows: Callable[[str, tuple[int, ...]], slice | None] = lambda name, shape: None
 ) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return the JSON header and the tensors of a file; refuses headers that claim more data than the file has.
+    """Return the JSON header and the tensors of a file; refuse a header that claims more data than the file has.
 
     Args:
-        rows: (tensor name, shape) -> rows to read, None for all. Compressed files are read whole.
+        rows: function (tensor name, shape) -> rows to read, or None for all rows. Compressed files are read whole.
     """
     if is_compressed(path):
         header, tensors, _ = read_compressed(path)

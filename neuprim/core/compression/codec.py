@@ -146,7 +146,7 @@ def fit_quantizers_to_error(model: Primitives, effects: Mapping[str, Tensor], er
 
 
 def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
-    """Return a quantizer of positions by :func:`columns_of_step`, with equal bits for all axes."""
+    """Return a quantizer of positions as :func:`columns_of_step` does, but with the same bits for all three axes."""
     own = columns_of_step(x, steps, x.double().mean(0) if len(x) else 0.0)
     bits = int(own.bits.max())
     low = own.low.double()
@@ -155,7 +155,7 @@ def _even_position_quantizer(x: Tensor, steps: Tensor) -> ColumnQuantizer:
 
 
 def _sparse_quantized_parameters(model: Primitives) -> set[str]:
-    """Return the parameters of prunable units that are zero in some primitives; these zeros must stay exact."""
+    """Return the names of parameters in which pruning set units of some primitives to zero; zeros must stay exact."""
     pieces = prunable_units_of_model(model.density, model.colour).values()
     return {
         name for piece in pieces if not bool(primitives_with_unit(piece, model.params).all()) for name in piece.places
@@ -163,7 +163,7 @@ def _sparse_quantized_parameters(model: Primitives) -> set[str]:
 
 
 def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
-    """Return a quantizer of positions that clips none; distant primitives raise the number of bits for all."""
+    """Return a quantizer that clips no position. Distant primitives raise the bits of all, unless ``exact``."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
@@ -173,7 +173,7 @@ def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool
 
 
 def storage_order(model: Primitives, made: Quantizers) -> Tensor:
-    """Return the (N,) int64 order in which a file stores primitives: along a Z curve through the positions' codes."""
+    """Return the (N,) int64 order of the primitives in a file: along a Z curve through the quantized positions."""
     places = made["means"]
     assert isinstance(places, ColumnQuantizer)
     return torch.from_numpy(
@@ -182,7 +182,7 @@ def storage_order(model: Primitives, made: Quantizers) -> Tensor:
 
 
 def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSection]:
-    """Encode a canonical model into sections, in file order."""
+    """Encode a canonical model with the quantizers ``made``; return the sections in file order."""
     order = storage_order(model, made)
     codes = {
         spec.name: made[spec.name].codes(model.params[spec.name].reshape(model.count, spec.size)[order])
@@ -204,7 +204,7 @@ def encode_sections(model: Primitives, made: Quantizers) -> list[CompressedSecti
 def _sparse_column_masks(
     model: Primitives, made: Quantizers, codes: Mapping[str, Tensor]
 ) -> tuple[list[np.ndarray], dict[str, list[int]]]:
-    """Return masks of units that are zero in some primitives, and parameter -> mask number per column (0: none)."""
+    """Return masks of units that are zero in some primitives, and parameter -> mask number of each column (0: none)."""
     shapes = {spec.name: spec.shape for spec in model.specs}
     zero = {
         n: (s.values(codes[n]) == 0).reshape(model.count, *shapes[n])

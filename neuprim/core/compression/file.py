@@ -55,7 +55,7 @@ _MAX_SECTIONS, _MAX_DIMENSIONS, _MAX_COLUMNS, _MAX_PRIMITIVES = 4096, 4, 2**20, 
 
 @dataclass(frozen=True)
 class _TableEntry:
-    """Table row: a section without content, bytes of its planes, packing, number of stored bytes, their checksum."""
+    """Row of a file's table: section without its content, size of the content, packing, stored size, checksum."""
 
     section: CompressedSection
     content: int
@@ -77,7 +77,7 @@ class _FileHead:
 def write_compressed(
     path: Path, header: Mapping[str, Any], count: int, sections: Sequence[CompressedSection]
 ) -> dict[str, int]:
-    """Write a ``.neuprim`` file atomically; return the bytes of each section by name. Names must be unique.
+    """Write a ``.neuprim`` file atomically; return section name -> bytes in the file. Names must be unique.
 
     Raises CheckpointError if the file cannot be written.
     """
@@ -144,7 +144,7 @@ def read_model_header(path: Path) -> dict[str, Any]:
 
 
 def read_compressed(path: Path) -> tuple[dict[str, Any], dict[str, Tensor], str | None]:
-    """Return header, float32 tensors by name and configuration (or None) of a file; raises CheckpointError."""
+    """Return header, tensors by name (float32) and configuration (None if absent); raise CheckpointError."""
     with _open_compressed_file(path) as file:
         head = _read_compressed_head(path, file)
         tensors: dict[str, Tensor] = {}
@@ -291,7 +291,7 @@ def _checked_codec_section(name: str, coding: int, shape: tuple[int, ...]) -> Co
 
 
 def _check_entry_sizes(entry: _TableEntry, count: int) -> None:
-    """Check the sizes that a table row claims for ``count`` primitives."""
+    """Raise CorruptSection if a table row claims sizes that ``count`` primitives cannot have."""
     section, head = entry.section, entry.section.head_size
     most = MAX_TEXT if section.coding == TEXT else _MAX_PLANES * count * section.columns
     if entry.content > most:

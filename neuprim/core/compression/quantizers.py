@@ -69,7 +69,7 @@ class ColumnQuantizer:
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
     """Fit ``low`` and ``high`` of each column to x (N, C), which must be finite and on the CPU.
 
-    ``clips``: candidate fractions of the values to clip at each end; the least error wins, the first of a tie.
+    ``clips``: candidate fractions of the values to clip at each end; each column takes the one with the least error.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
     best = ColumnQuantizer(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))
@@ -90,7 +90,8 @@ def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) 
 def columns_of_step(x: Tensor, steps: Tensor, through: Tensor | float) -> ColumnQuantizer:
     """Return a quantizer with step lengths ``steps`` (C,) that covers all of x (N, C), finite, on the CPU.
 
-    A step that needs more than :data:`MAX_BITS` grows. ``through``: (C,) or a number; becomes one of the values.
+    Steps that would need more than :data:`MAX_BITS` bits are enlarged. ``through`` (C,) or a number: a value to
+    represent.
     """
     if not x.numel():
         return fit_columns(x, [1] * x.shape[1])
@@ -131,7 +132,7 @@ def _column_quantile(ordered: np.ndarray, q: float) -> np.ndarray:
 
 
 def relative_quantizer_error(x: Tensor, columns: ColumnQuantizer) -> Tensor:
-    """Return (C,) root mean squared errors, divided by those of even steps from -1 to 1 standard deviation."""
+    """Return (C,) RMS errors, relative to those of as many even steps from -1 to 1 standard deviation."""
     y = x.detach().double()
     error = (columns.values(columns.codes(x)).double() - y).square().mean(0).sqrt()
     usual = (y - y.mean(0)).square().mean(0).sqrt() * 2 / columns.last / 12**0.5
@@ -151,7 +152,7 @@ class RotationQuantizer:
 
     @property
     def half(self) -> int:
-        """The h of the formulas above: codes are u + h, from 0 to 2 h."""
+        """The integer h in the formulas of this class: codes are u + h, from 0 to 2 h."""
         return (1 << (self.bits - 1)) - 1
 
     def codes(self, quats: Tensor) -> Tensor:
@@ -192,7 +193,7 @@ class RotationQuantizer:
         return back + (quats - q)
 
     def to(self, device: torch.device) -> RotationQuantizer:
-        """Return this quantizer, which has no tensors to move."""
+        """Return this quantizer itself, because it has no tensors to move."""
         return self
 
     def _left(self, u: Tensor) -> Tensor:
@@ -200,7 +201,7 @@ class RotationQuantizer:
 
     @staticmethod
     def _others(largest: Tensor) -> Tensor:
-        """Return the (N, 3) indices of the three smaller components, ascending."""
+        """Return the (N, 3) indices of the components other than ``largest``, ascending."""
         first = torch.arange(3, device=largest.device).expand(len(largest), 3)
         return first + (first >= largest[:, None])
 
@@ -220,7 +221,7 @@ class BitTable:
     exact: frozenset[str] = frozenset()
 
     def of(self, name: str, shape: tuple[int, ...]) -> list[int]:
-        """Return the bits of each column of the parameter ``name``; ``shape``: of one primitive."""
+        """Return the bits of each column of a parameter; ``shape`` is its shape for one primitive."""
         bits = self.named.get(name, (self.others,))
         if len(bits) == 1 or len(shape) < 2:
             return [bits[0]] * math.prod(shape)
@@ -249,7 +250,7 @@ DEFAULT_LEVEL = 3
 
 
 def bit_table(level: int, words: Iterable[str], specs: Iterable[ParameterSpec]) -> BitTable:
-    """Return the table of a level with overrides ``NAME=BITS``, NAME a parameter or ``others``; raises ConfigError."""
+    """Return a level's bit table with overrides ``NAME=BITS``, NAME a parameter or ``others``; raise ConfigError."""
     if level not in LEVELS:
         raise ConfigError(f"--level {level}: expected one of {', '.join(map(str, LEVELS))}")
     table, names = LEVELS[level], [spec.name for spec in specs]

@@ -35,7 +35,7 @@ _MASK_NUMBER = struct.Struct("<H")
 
 
 class CorruptSection(Exception):
-    """A section has invalid content; the message does not name file and section."""
+    """A section has invalid content. The caller adds the name of the file to the message."""
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class CompressedSection:
 
     @property
     def head_size(self) -> int:
-        """Number of bytes of ``head``, from coding and shape."""
+        """Number of bytes in ``head``; it follows from coding and shape."""
         record = _RECORD.size + (_MASK_NUMBER.size if self.coding == SPARSE else 0)
         return {TEXT: 0, MASKS: 0, ROTATIONS: 1}.get(self.coding, record * self.columns)
 
@@ -63,7 +63,7 @@ class CompressedSection:
 def pack_section(
     name: str, shape: tuple[int, ...], scheme: ColumnQuantizer | RotationQuantizer, codes: np.ndarray, coding: int
 ) -> CompressedSection:
-    """Return a section that holds codes (N, C). Codes of positions must be in file order."""
+    """Return a section that holds codes (N, C) of the quantizer ``scheme``. Position codes must be in file order."""
     if isinstance(scheme, RotationQuantizer):
         planes = [
             *_byte_planes(codes[:, 0], 2),
@@ -93,7 +93,7 @@ def pack_sparse_columns(
     mask_of: Sequence[int],
     masks: Sequence[np.ndarray],
 ) -> CompressedSection:
-    """Return a section of codes (N, C); column i stores only the rows in mask ``mask_of[i] - 1``, or all for 0."""
+    """Return a section of codes (N, C). Column i stores the rows in mask number ``mask_of[i]``; number 0: all rows."""
     own = [codes[:, i] if of == 0 else codes[masks[of - 1], i] for i, of in enumerate(mask_of)]
     planes = [plane for column, b in zip(own, scheme.bits.tolist(), strict=True) for plane in _byte_planes(column, b)]
     return CompressedSection(
@@ -120,7 +120,7 @@ def _code_byte_count(bits: int) -> int:
 
 
 def section_content_size(section: CompressedSection, count: int, masks: Sequence[np.ndarray] = ()) -> int:
-    """Return how many bytes the planes of a section have, from its head; raises CorruptSection."""
+    """Return the size of a section's planes in bytes, computed from its ``head``; raise CorruptSection."""
     if section.coding == MASKS:
         return section.columns * ((count + 7) // 8)
     if section.coding == ROTATIONS:
@@ -212,7 +212,7 @@ def _position_cells(planes: _PlaneReader, count: int, bits: int) -> np.ndarray:
 
 
 class _PlaneReader:
-    """Reads the codes of successive columns from byte planes."""
+    """Reader of byte planes that decodes the codes of one column after the other."""
 
     def __init__(self, content: bytes) -> None:
         self._bytes, self._at = np.frombuffer(content, np.uint8), 0
@@ -259,7 +259,7 @@ def compress_code_planes(planes: Sequence[bytes]) -> bytes:
 
 
 def _plane_runs(planes: Sequence[bytes]) -> list[bytes]:
-    """Join neighbouring planes whose codes have the same number of bits."""
+    """Join neighbouring planes whose largest codes have the same number of bits."""
     made: list[list[bytes]] = []
     last = -1
     for plane in planes:

@@ -72,7 +72,7 @@ def exr_channel_name_error(names: Sequence[Any]) -> str | None:
 
 
 def is_exr(path: Path, required: bool = False) -> bool:
-    """Return whether a file starts as OpenEXR; DataError if it does not and ``required``, or is unreadable."""
+    """Return whether a file starts as OpenEXR. Raises DataError if it is unreadable, or ``required`` to be OpenEXR."""
     try:
         with open(path, "rb") as file:
             head = file.read(8)
@@ -94,7 +94,7 @@ def exr_channels(path: Path) -> tuple[str, ...]:
 
 
 def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[list[str], int, int]:
-    """Return channel names (``wanted``, or the only R, G, B(, A)), width and height of a file; raises DataError."""
+    """Return channel names, width and height of ``wanted``, or of the only RGB(A) layer; raise DataError."""
     channels, width, height = _read_exr_header(path)
     names, expected = list(wanted or ()), ", ".join(wanted or ())
     if wanted is None:

@@ -84,7 +84,8 @@ def write_text(path: Path, text: str) -> None:
 def read_json(path: Path, what: str, instead: str) -> Any:
     """Return the content of a JSON file that neuprim wrote; None if the file does not exist.
 
-    Raises DataError for another content; the message says ``what`` the file should be and what to do ``instead``.
+    Raises DataError if the content is not JSON, or is null. The message says what the file should be (``what``) and
+    what the user can do (``instead``).
     """
     try:
         data = load_json(path.read_text(encoding="utf-8"))
@@ -98,7 +99,7 @@ def read_json(path: Path, what: str, instead: str) -> Any:
 
 
 def read_json_record(path: Path, what: str, instead: str, version: int, parse: Callable[[Any], T]) -> T | None:
-    """Return ``parse(content)`` of a JSON file with ``"format": version``; None and errors as :func:`read_json`."""
+    """Return ``parse(content)`` of a JSON file with ``"format": version``; None if missing, DataError if wrong."""
     data = read_json(path, what, instead)
     if data is None:
         return None
@@ -174,8 +175,8 @@ def _is_file_writer_running(number: str | None) -> bool:
 def publish_folder(final: Path, write: Callable[[Path], None], complete: Callable[[Path], bool]) -> None:
     """Let ``write`` fill a temporary folder, then rename it to ``final``; does nothing if ``complete(final)``.
 
-    An incomplete folder at ``final`` is deleted. If several processes do this, the first wins: all must write the same
-    files.
+    An incomplete folder at ``final`` is deleted. If several processes do this, the files of the first remain, so all
+    must write the same files.
     """
     if complete(final):
         return
@@ -253,7 +254,7 @@ class StagedOutput:
 
 @contextmanager
 def staged_output(final: Path, overwrite: bool) -> Iterator[StagedOutput]:
-    """Yield a :class:`StagedOutput` that is deleted after the block; error messages get final paths."""
+    """Yield a :class:`StagedOutput`, deleted after the block. Error messages show final, not temporary paths."""
     existing = final if final.is_dir() else next(p for p in (*final.parents, Path(".")) if p.exists())
     try:
         folder = Path(tempfile.mkdtemp(prefix=f".neuprim.{os.getpid()}.", dir=existing))

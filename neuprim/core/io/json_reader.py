@@ -39,7 +39,7 @@ def _describe_json(value: Any) -> str:
 
 @dataclass(frozen=True)
 class JsonReader:
-    """Reads the fields of one JSON object and checks their types and ranges."""
+    """Reads the fields of one JSON object; the methods raise DataError for a wrong type or range."""
 
     values: dict[str, Any]
     where: str  # prefix of messages, e.g. "/data/transforms.json: frames[3]"
@@ -66,7 +66,7 @@ class JsonReader:
         return self.values.get(key) is not None
 
     def fail(self, key: str, expected: str) -> DataError:
-        """Return, not raise, the DataError for a field that is missing or wrong."""
+        """Return (do not raise) the DataError for a field that is missing or wrong."""
         value = self.values.get(key, _MISSING)
         actual = "is missing" if value is _MISSING else f"is {_describe_json(value)}"
         return DataError(f"{self.where}: {key} {actual}; expected {expected}")
@@ -74,7 +74,7 @@ class JsonReader:
     def number(
         self, key: str, expected: str = "a finite number", low: float = -math.inf, high: float = math.inf
     ) -> float:
-        """Return a field that is a finite number in (``low``, ``high``). All these methods raise DataError."""
+        """Return the finite number in field ``key``, above ``low`` and below ``high``; else raise DataError."""
         value = finite_json_number(self.values.get(key))
         if value is None or not low < value < high:
             raise self.fail(key, expected)
@@ -85,7 +85,7 @@ class JsonReader:
         return self.number(key, expected, low) if self.has(key) else default
 
     def count(self, key: str) -> int:
-        """Return a field that is a positive integer; 800.0 counts, as some exporters write it."""
+        """Return a field that is a positive integer. A float such as 800.0 is accepted, as some exporters write it."""
         value = self.number(key, "a positive whole number", 0.0)
         if value != int(value):
             raise self.fail(key, "a positive whole number")

@@ -89,7 +89,7 @@ def read_ply(path: Path) -> PlyVertices:
 
 
 def read_ply_elements(file: BinaryIO, size: int, path: Path, wanted: Sequence[str]) -> dict[str, PlyElement]:
-    """Read those of the ``wanted`` elements that an open PLY file of ``size`` bytes has; raises DataError."""
+    """Read the ``wanted`` elements of an open PLY file of ``size`` bytes, as far as it has them; raise DataError."""
     order, elements, comments = _read_ply_header(file, path)
     result: dict[str, PlyElement] = {}
     missing = set(wanted) & {element.name for element in elements}

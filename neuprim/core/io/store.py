@@ -62,7 +62,7 @@ def open_store(address: str, copies: Path) -> Store:
 
 
 class Store:
-    """Shared folders of files, in ``path`` or in fsspec's ``system`` under ``root``. A written file never changes."""
+    """A shared folder: ``path``, or ``root`` in fsspec's file system ``system``. A written file never changes."""
 
     def __init__(self, address: str, path: Path, system: Any = None, root: str = "") -> None:
         self.address, self.path, self._system, self._root = address, path, system, root
@@ -113,7 +113,7 @@ class Store:
             return bool(self._system.exists(f"{self._root}/{name}"))
 
     def fetch_file(self, name: str, max_bytes: int) -> Path:
-        """Return a local path of the file ``name``, where nothing exists if the store has no such file.
+        """Return a local path of the file ``name``. If the store has no such file, nothing exists at the path.
 
         Files of an object store are copied first. Raises DataError, also for more than ``max_bytes``.
         """
@@ -136,7 +136,7 @@ class Store:
         return file
 
     def write_folder(self, name: str, write: Callable[[Path], None], last: str) -> None:
-        """Let ``write`` fill an empty folder, then store it as ``name`` unless a complete one exists."""
+        """Let ``write`` fill a folder, and store it as ``name`` unless a folder with the file ``last`` exists."""
         if self.is_local:  # the store's folder must exist: creating a lost mount would hide it
             fill_folder(self.path / name, write, lambda folder: (folder / last).is_file())
             for draft in self.path.glob(f".{name}-*"):  # of killed or slower processes
@@ -163,7 +163,7 @@ class Store:
     def retry(self, call: Callable[[], T], notify: Callable[[str], None]) -> T:
         """Return what ``call`` returns. If a local store disappears during the call, wait for the store and call again.
 
-        Raises DataError if the store stays away for :data:`MAX_WAIT` seconds, and what ``call`` raises otherwise.
+        Raises DataError if the store is unavailable for :data:`MAX_WAIT` seconds. Other errors are raised again.
         """
         second_try = True
         while True:
@@ -180,7 +180,7 @@ class Store:
             self._wait(notify)
 
     def _is_gone(self) -> bool:
-        """Return whether the folder is missing or does not answer; looks inside, as a lost mount looks empty."""
+        """Return whether the store's folder is missing (as in a lost mount) or does not answer."""
         try:
             return not self.path.is_dir()
         except OSError:

@@ -48,7 +48,7 @@ def vdb_scale_transform(
     """Return a (4, 4) index-to-world transform that puts the centre of voxel (0, 0, 0) at ``translation``.
 
     Args:
-        voxel_size: edge length of a voxel, one or one per axis, in world units.
+        voxel_size: edge length of a voxel in world units, one number or one per axis.
     """
     matrix = np.eye(4)
     matrix[range(3), range(3)] = voxel_size
@@ -160,7 +160,7 @@ class VdbGrid:
         return (low[0], low[1], low[2]), (high[0], high[1], high[2])
 
     def world_bounds(self) -> np.ndarray | None:
-        """Return the (2, 3) float64 box around all active voxels, edges included, in world units; None without any."""
+        """Return the (2, 3) float64 box of all active voxels with their edges, in world units; None for no voxels."""
         if self.bounds is None:
             return None
         corners = np.stack(np.meshgrid(*np.array(self.bounds, float).T - 0.5, indexing="ij"), -1).reshape(-1, 3)

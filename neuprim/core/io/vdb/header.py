@@ -33,7 +33,7 @@ class VdbCursor:
         return DataError(f"{self.path}: {text}")
 
     def need(self, count: int, what: str) -> None:
-        """Raise DataError, naming ``what``, unless ``count`` more bytes follow."""
+        """Raise DataError unless ``count`` more bytes follow; ``what`` names these bytes in the message."""
         if not 0 <= count <= self.end - self.at:
             found = f"{what} at byte {self.at} needs {count} bytes, but {self.end - self.at} are left there"
             raise self.fail(f"{found}; truncated or damaged OpenVDB file")
@@ -93,7 +93,7 @@ def blosc_module() -> Any:
 
 
 def vdb_decompressor(flags: int) -> Callable[[bytes, int], bytes]:
-    """Return the function (chunk, size) -> bytes that decompresses a grid's data, or raises ValueError."""
+    """Return a function (chunk, size) -> bytes, which decompresses data of a grid or raises ValueError."""
     if not flags & BLOSC:
         return _unzip_vdb_chunk
     blosc = blosc_module()

@@ -103,7 +103,7 @@ UPPER, LOWER = NodeSlots(5, 128), NodeSlots(4, 8)
 
 
 class _TreeReader:
-    """Decodes the tree of grid ``what`` at ``source`` into the arrays of a VdbGrid of at most ``max_bytes``."""
+    """Decoder of a grid's tree into arrays of a VdbGrid, limited to ``max_bytes``; errors call the grid ``what``."""
 
     def __init__(self, file: VdbCursor, source: GridHeader, what: str, max_bytes: int) -> None:
         self._buffers = VdbCursor(file.path, file.data, source.block, source.end)
@@ -218,7 +218,7 @@ class _TreeReader:
         return values
 
     def _inactive(self, cursor: VdbCursor, count: int, what: str) -> tuple[int, np.ndarray, np.ndarray, bytes | None]:
-        """Read the code of a node, its two inactive values, and the mask that chooses the second one, or None."""
+        """Read a node's value code, its two inactive values, and the mask of voxels with the second one, or None."""
         code = cursor.take(1, f"value code of {what}")[0]
         if code > ALL_VALUES:
             raise cursor.fail(f"{what} has the value code {code} at byte {cursor.at - 1}; expected 0 to {ALL_VALUES}")
@@ -282,7 +282,7 @@ class _TreeReader:
     ) -> tuple[bytes, list[tuple[int, Any, Any, bytes | None]], list[int], bytes]:
         """Read the bytes of leaves.
 
-        Returns masks, leaves whose inactive values are not the background, leaves that store all values, and values.
+        Returns (masks, leaves with inactive values other than the background, leaves that store all values, values).
         """
         cursor, what = self._buffers, f"a leaf of {self._what}"
         data, unpack, size_at = cursor.data, self._unpack, struct.Struct("<q").unpack_from
@@ -403,7 +403,7 @@ def list_vdb_files(path: Path) -> VdbSequence:
 
 
 def _split_frame_number(name: str) -> tuple[str, int] | None:
-    """Return the sequence of a .vdb file, its name with ``*`` after the prefix, and its number; None without number."""
+    """Return a .vdb file's name without its last number, and that number; None for a name without a number."""
     match = re.fullmatch(r"(.*?)([0-9]+)([^0-9]*)", Path(name).stem, re.DOTALL)
     if match is None or len(match[2]) > 18:
         return None

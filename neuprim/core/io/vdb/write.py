@@ -265,7 +265,7 @@ def _vdb_slot_numbers(corners: np.ndarray, origin: tuple[int, int, int], slots: 
 
 
 def _value_packer(flags: int, unit: int) -> Callable[[bytes], bytes]:
-    """Return the function that packs values of ``unit`` bytes; if ``flags`` compress, the length comes first."""
+    """Return the function that packs values of ``unit`` bytes. Compressed values are preceded by their length."""
     if not flags & (ZIP | BLOSC):
         return lambda raw: raw
     blosc = blosc_module() if flags & BLOSC else None

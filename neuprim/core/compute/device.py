@@ -38,7 +38,7 @@ def cuda_unavailable() -> str | None:
 
 
 def current_device(kind: str) -> torch.device:
-    """Return the device of a ``kind``, "cpu" or "cuda", that a run uses; of several GPUs, torch's current one."""
+    """Return the torch device of ``kind`` "cpu" or "cuda"; of several GPUs, torch's current one."""
     return torch.device(kind, torch.cuda.current_device()) if kind == CUDA else torch.device(kind)
 
 
@@ -52,7 +52,7 @@ def copy_to_device(tensor: Tensor, device: torch.device) -> Tensor:
 
 
 def to_device_like(tensor: Tensor, like: Tensor) -> Tensor:
-    """Return a small tensor with the device and dtype of ``like``; differentiable, asynchronous from the CPU."""
+    """Return a small tensor on the device and in the dtype of ``like``; differentiable, asynchronous from the CPU."""
     return tensor.to(like, non_blocking=tensor.is_cpu)
 
 

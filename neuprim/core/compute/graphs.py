@@ -11,17 +11,17 @@ from neuprim.core.errors import warn_once
 
 
 class GraphRecorder:
-    """Records functions that work on a GPU, on tensors whose memory never changes; elsewhere it just calls them.
+    """Records functions that work on a GPU as CUDA graphs; on other devices, the functions are just called.
 
-    The first function runs without being recorded: this loads its kernels, and finds an operation that waits for the
-    device, which a graph cannot hold. Then nothing is recorded.
+    The tensors of a function must keep their memory. The first function runs without being recorded, which loads its
+    kernels. If one of its operations waits for the device, which a graph cannot do, nothing is ever recorded.
 
     Args:
         where: device of the functions.
-        what: what they do, for the warning that they wait.
+        what: what the functions do, for the warning that they wait for the device.
 
     Attributes:
-        failed: whether an operation waited; the last function stopped there.
+        failed: whether an operation waited for the device; the function that contains it stopped there.
     """
 
     def __init__(self, where: torch.device, what: str) -> None:
@@ -32,7 +32,7 @@ class GraphRecorder:
         self._pool = torch.cuda.graph_pool_handle() if self._on_gpu else None
 
     def record(self, function: Callable[[], None]) -> Callable[[], None]:
-        """Return a function with the same effect as ``function``, which is replayed from its second call on."""
+        """Return a function with the effect of ``function``. Its later calls replay the recorded graph."""
         if not self._on_gpu:
             return function
         replay: list[Callable[[], None]] = []

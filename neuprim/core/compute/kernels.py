@@ -37,7 +37,7 @@ from neuprim.version import __version__
 
 
 def _prefer_wide_vectors() -> None:
-    """Ask LLVM for 512-bit vectors, unless NUMBA_CPU_FEATURES is set. Call before compiling anything."""
+    """Ask LLVM for 512-bit vectors, unless NUMBA_CPU_FEATURES is set. Call this before any kernel is compiled."""
     features = llvm.get_host_cpu_features()
     if features.get("avx512f") and numba.config.CPU_FEATURES is None:  # type: ignore[attr-defined]
         numba.config.CPU_FEATURES = features.flatten() + ",-prefer-256-bit"  # type: ignore[attr-defined]
@@ -110,7 +110,7 @@ _sources_hash = functools.cache(sources_hash)
 
 
 class KernelLocator(getattr(caching, "UserProvidedCacheLocator", object)):  # type: ignore[misc]
-    """numba's cache locator with a folder name that does not depend on the location of the sources."""
+    """Locator of numba's kernel cache whose folder name does not depend on the location of the sources."""
 
     @classmethod
     def get_suitable_cache_subpath(cls, py_file: str) -> str:
@@ -166,9 +166,9 @@ _SIXTEEN = ir.VectorType(ir.FloatType(), 16)
 
 
 def _borrow_kernel_array(context, array):  # type: ignore[no-untyped-def]
-    """Return a view of an array without its owner: no reference counting, which is atomic and slow.
+    """Return a view of an array without reference counting, which is atomic and slow.
 
-    Something else must keep the array alive. For a kernel's own array, :func:`release_array` after the last use does.
+    The caller must keep the array alive. For a kernel's own array, call :func:`release_array` after the last use.
     """
 
     def code(context, builder, signature, arguments):  # type: ignore[no-untyped-def]
@@ -285,7 +285,7 @@ def code_cache(folder: Path) -> Path:
 
 
 def folder_weakness(folder: Path) -> str:
-    """Return a text that says which other users can change the contents of a folder; "" if none can, and on Windows."""
+    """Return which other users can change the contents of a folder, as text; "" if none can, and always on Windows."""
     if not hasattr(os, "getuid"):
         return ""
     own = os.getuid()

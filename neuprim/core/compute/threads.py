@@ -52,7 +52,7 @@ def core_count() -> int:
 
 @contextmanager
 def limit_process_threads(threads: int) -> Iterator[None]:
-    """Limit the whole process to ``threads`` cores inside the block; 0: all. Use one at a time."""
+    """Limit the whole process to ``threads`` cores inside the block; 0 means all. Blocks must not overlap."""
     global _share
     before, _share = _share, threads
     try:
@@ -63,7 +63,7 @@ def limit_process_threads(threads: int) -> Iterator[None]:
 
 @contextmanager
 def limit_threads(threads: int) -> Iterator[None]:
-    """Make "all cores" mean ``threads`` cores (0: all) inside the block, also in code without that argument."""
+    """Make "all cores" mean ``threads`` cores (0: all) inside the block, for all code without a thread setting."""
     token = _limit.set(threads)
     try:
         yield
@@ -117,7 +117,7 @@ def parallel_for(function: Callable[..., Any], count: int, chunk: int, threads: 
 
 
 class _ForwardKernelContext:
-    """Stand-in for an autograd context when no backward pass follows: ignores what the forward pass saves."""
+    """Stand-in for an autograd context if no backward pass follows; ignores what the forward pass saves."""
 
     def save_for_backward(self, *tensors: Tensor) -> None:
         pass

@@ -57,7 +57,7 @@ _Bare: Any = type(wp.from_torch(torch.empty(1), return_ctype=True))
 
 
 class _KernelArray:
-    """A tensor passed to a kernel as an array of ``dtype``; a vector dtype takes up the last dimension."""
+    """A tensor to pass to a kernel as an array of ``dtype``; a vector dtype takes up the last dimension."""
 
     __slots__ = ("dtype", "tensor")
 
@@ -92,7 +92,7 @@ def _fill_descriptor(given: _KernelArray, into: Any) -> None:
 
 
 def _pack_argument(value: Any) -> Any:
-    """Return an argument as Warp expects it, in memory of its own."""
+    """Return an argument in the type that Warp expects, in its own memory."""
     if value is None:
         return _Bare()
     if isinstance(value, _KernelArray):

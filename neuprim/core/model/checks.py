@@ -96,7 +96,7 @@ def _check_lowered_form(who: str, form: Any, kinds: tuple[type[PrimitiveTensors]
 
 
 def check_lowered_channels(found: int, colour: ColourField) -> None:
-    """Raise :class:`FormError` unless a lowered colour has ``found == colour.channels`` channels."""
+    """Raise :class:`FormError` unless ``found``, the channels of a lowered colour, equals ``colour.channels``."""
     if found != colour.channels:
         raise FormError(
             f"{model_method_label(colour, 'lower')} returned a colour of C={found}; "
@@ -114,7 +114,7 @@ def check_model_tensor_shape(name: str, value: Any, shape: tuple[int, ...], why:
 
 
 def check_active_primitive_rows(rows: Any, model: int | None, who: str, length: int | None = None) -> None:
-    """Raise :class:`FormError` unless ``rows`` are ``length`` ascending int64 row numbers below ``model``."""
+    """Raise :class:`FormError` unless ``rows`` are ascending int64 numbers below ``model``, ``length`` in number."""
     found = None
     if not _is_dense_primitive_tensor(rows) or rows.dtype != torch.int64 or rows.dim() != 1:
         found = _describe_model_tensor(rows)
@@ -170,7 +170,7 @@ def check_initial_primitive_tensor(spec: ParameterSpec, context: InitContext, wh
 
 
 def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) -> dict[str, Tensor]:
-    """Return the tensors that a field's method returned; raise FormError unless names and shapes are as in ``like``."""
+    """Return the tensors that a field's method returned; raise FormError for names or shapes other than in ``like``."""
     if not isinstance(found, Mapping):
         raise FormError(f"{who} returned type {type(found).__name__}; expected a dict of tensors by name")
     if set(found) != set(like):
@@ -187,7 +187,7 @@ def check_primitive_tensors(found: Any, like: Mapping[str, Tensor], who: str) ->
 
 
 def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFiniteError:
-    """Return the error for primitive ``row``, some value of which is not finite or exceeds the range of float32."""
+    """Return the error for primitive ``row``, which has a value that is not finite or beyond the range of float32."""
     for name, value in tensors.items():
         if not bool(torch.isfinite(value[row]).all()):
             return NonFiniteError(f"{name} of primitive {row} is not finite: {value[row].flatten()[:8].tolist()}")

@@ -319,7 +319,7 @@ def smaller_cosine_neuron_counts(neurons: int) -> tuple[int, ...]:
 
 
 def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: float) -> dict[str, Tensor]:
-    """Keep the ``keep`` neurons of each primitive whose terms of the density vary most; add the other means to b2."""
+    """Keep the ``keep`` neurons of each primitive whose terms vary most; add the means of the other terms to b2."""
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
     rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations

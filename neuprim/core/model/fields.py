@@ -61,7 +61,7 @@ class ConditionSpec:
         sweep: a text that animates the condition, for the commands that reports suggest; empty for none.
         in_frames: (text, count) -> text of the same animation with ``count`` frames; None if the text states a number
             of frames.
-        place: for positions: used instead of ``parse``, (text in world coordinates, world) -> scene units.
+        place: replaces ``parse`` for positions: (text in world coordinates, world) -> positions in scene units.
         of_scene: (scene settings) -> whether the views of a scene have the condition.
     """
 
@@ -77,7 +77,7 @@ class ConditionSpec:
     of_scene: Callable[[Mapping[str, Any]], bool] = lambda scene: True
 
     def within(self, world: World) -> ConditionSpec:
-        """Return this condition with a ``parse`` that converts positions from the user's ``world`` to scene units."""
+        """Return this condition with a ``parse`` that converts positions from ``world`` coordinates to scene units."""
         place = self.place
         return self if place is None else replace(self, parse=lambda text: place(text, world))
 
@@ -110,7 +110,7 @@ class Field(ABC):
 
     @classmethod
     def every_parameter(cls) -> list[ParameterSpec]:
-        """Return all parameters that the field can have; presets may give learning rates for them."""
+        """Return all parameters that the field has under any settings; presets may give learning rates for them."""
         return cls().parameters()
 
     def set_progress(self, progress: float) -> None:  # noqa: B027 - a hook most fields do not need
@@ -129,7 +129,7 @@ class Field(ABC):
         return dict(params)
 
     def reductions(self) -> dict[str, tuple[int, ...]]:
-        """Return the settings that can be reduced after training, with smaller values: ``{"degree": (2, 1, 0)}``."""
+        """Return setting -> smaller values to which it can be reduced after training: ``{"degree": (2, 1, 0)}``."""
         return {}
 
     def reduce(self, params: Params, geometry: Geometry, name: str, value: int) -> tuple[Self, dict[str, Tensor]]:
@@ -230,12 +230,12 @@ class ColourField(Field):
     channels: int  # number of channels of the images
 
     def harmonics(self, params: Params, conditions: Conditions) -> tuple[Tensor, Tensor | None] | None:
-        """Return the spherical harmonics of the colours, ``dc`` (N, C) and ``rest`` as for
+        """Return the SH coefficients of the colours, ``dc`` (N, C) and ``rest`` as for
         :func:`~neuprim.core.model.sh.sh_colors`; None for colours that are no spherical harmonics."""
         return None
 
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the part (N, C) of the colour that depends on neither direction nor light, at least 0; None: none."""
+        """Return the (N, C) part of the colour that needs neither direction nor light, at least 0; None for no part."""
         found = self.harmonics(params, conditions)
         return None if found is None else lowest_band_colors(found[0])
 

@@ -86,12 +86,12 @@ class Cosine(PrimitiveTensors):
         )
 
     def primitive_rows(self, index: Tensor | slice) -> Cosine:
-        """Return the form of the primitives ``index`` only, (M,) int64 or first:end, without gradient."""
+        """Return the density of the primitives ``index`` only, (M,) int64 or a slice, without gradient."""
         W1, b1, w2, b2 = (x.detach()[index] for x in (self.W1, self.b1, self.w2, self.b2))
         return Cosine(W1, b1, w2, b2, self.omega0, self.edge)
 
     def scaled(self, factors: Tensor) -> Cosine:
-        """Return the form of sigma times (N,) factors, at least 0."""
+        """Return this density multiplied by ``factors`` (N,), at least 0."""
         factors = factors.to(self.b2)
         w2, b2 = self.w2 * factors[:, None], self.b2 * factors.reshape(self.b2.shape)
         return Cosine(self.W1, self.b1, w2, b2, self.omega0, self.edge)
@@ -114,8 +114,9 @@ class CustomDensity(PrimitiveTensors):
     """A density given by PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
     Attributes:
-        line_integral: (prim, origin, direction, t0, t1) -> (M,) optical depths, from (M,) rows, (M, 3) ray origins and
-            unit directions, and (M,) ends of the chords, scene units.
+        line_integral: function (prim, origin, direction, t0, t1) -> (M,) optical depths. Its arguments are primitive
+            rows (M,), ray origins and unit directions (M, 3), and ray distances of the chords' ends (M,), in scene
+            units.
     """
 
     edge: ClassVar[int] = 0
@@ -125,13 +126,13 @@ class CustomDensity(PrimitiveTensors):
         return labelled_fault("line_integral", function_fault(self.line_integral))
 
     def primitive_rows(self, index: Tensor | slice) -> CustomDensity:
-        """Return the form of the primitives ``index`` only, (M,) int64 or first:end."""
+        """Return the density of the primitives ``index`` only, (M,) int64 or a slice."""
         if isinstance(index, slice):
             return CustomDensity(lambda prim, *ray: self.line_integral(prim + (index.start or 0), *ray))
         return CustomDensity(lambda prim, *ray: self.line_integral(index[prim], *ray))
 
     def scaled(self, factors: Tensor) -> CustomDensity:
-        """Return the form of sigma times (N,) factors, at least 0."""
+        """Return this density multiplied by ``factors`` (N,), at least 0."""
 
         def line_integral(prim: Tensor, *ray: Tensor) -> Tensor:
             found = self.line_integral(prim, *ray)
@@ -183,7 +184,7 @@ class Constant(PrimitiveTensors):
 
     @property
     def flat(self) -> Tensor:
-        """(N, C) colours that hold everywhere in a primitive."""
+        """The (N, C) colours, each valid everywhere in its primitive."""
         return self.rgb
 
 
@@ -192,7 +193,7 @@ class CustomColour(PrimitiveTensors):
     """A colour given by PyTorch code for pairs of ray and primitive; only the reference backend renders it.
 
     Attributes:
-        radiance: (prim, x, d) -> (M, C) colours, from (M,) rows, (M, 3) chord middles and unit directions.
+        radiance: function (prim, x, d) -> (M, C) colours, for (M,) primitive rows, (M, 3) chord middles and directions.
     """
 
     per_primitive: ClassVar[bool] = False
@@ -207,7 +208,7 @@ class CustomColour(PrimitiveTensors):
         return labelled_fault("radiance", function_fault(self.radiance))
 
     def shaded(self, factors: Tensor | None) -> CustomColour:
-        """Return the form times (N,) factors, at least 0; None: 1."""
+        """Return these colours multiplied by ``factors`` (N,), at least 0; None: unchanged."""
         if factors is None:
             return self
 
@@ -262,7 +263,7 @@ class RayNet(PrimitiveTensors):
         return int(self.Wx.shape[1])
 
     def shaded(self, factors: Tensor | None) -> RayNet:
-        """Return the form times (N,) factors, at least 0; None: 1."""
+        """Return these colours multiplied by ``factors`` (N,), at least 0; None: unchanged."""
         if factors is None:
             return self
         factors = factors.to(self.base)
@@ -298,9 +299,9 @@ class Shading:
     """Factors on the colours of a frame that are computed from all primitives, such as shadows; no gradient.
 
     Attributes:
-        primitives: (M,) factors of at least 0, one per primitive of the frame; None: 1.
+        primitives: (M,) factors of at least 0, one per primitive of the frame; None: all are 1.
         pixels: function that returns one factor per pixel, from the scene point at the pixel's mean depth (deferred
-            shading); None: 1.
+            shading); None: all are 1.
     """
 
     primitives: Tensor | None = None

@@ -52,7 +52,7 @@ class Geometry(PrimitiveTensors):
 
     @property
     def log_length_scale(self) -> Tensor:
-        """Logarithm of the longest semi-axis m, (N,). Of equal axes, the first gets the gradient, in every backend."""
+        """Logarithm of the longest semi-axis m, (N,). If axes are equal, the first one gets the gradient."""
         first = self.log_scales.argmax(dim=-1, keepdim=True)
         return self.log_scales.gather(-1, first)[..., 0]
 

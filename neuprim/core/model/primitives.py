@@ -223,7 +223,7 @@ class Primitives:
         return self._of(field, self.params)
 
     def _of(self, field: DensityField | ColourField, params: dict[str, Tensor]) -> dict[str, Tensor]:
-        """Return the tensors that one field owns, by name, from ``params`` with the tensors of all."""
+        """Return the tensors that belong to one field, by name, from ``params``, the tensors of the whole model."""
         return {name: params[name] for name in self._names[field is self.colour]}
 
     def lower(
@@ -232,7 +232,7 @@ class Primitives:
         """Return the renderer's input for a frame: closed forms without inactive primitives; differentiable.
 
         Args:
-            settings: for images that a colour field itself renders, such as shadow maps; None: the defaults.
+            settings: render settings of images that a colour field renders itself (shadow maps); None: the defaults.
             shaded: whether to apply :meth:`~neuprim.core.model.fields.ColourField.shade`.
 
         Raises:
@@ -294,9 +294,9 @@ class Primitives:
     def active(
         self, conditions: Conditions, dtype: torch.dtype | None = None, everything: bool = False
     ) -> ActivePrimitives:
-        """Return the active primitives of a frame; differentiable. With ``dtype``, detached and of this dtype.
+        """Return the active primitives of a frame; differentiable. With ``dtype``, they are detached and of this dtype.
 
-        ``everything``: keep the others, too.
+        ``everything``: keep inactive primitives, too.
         """
         rows = None if everything else self.density.active_rows(self.of(self.density), conditions)
         params = self.params

@@ -44,7 +44,7 @@ def count_unit_numbers(unit: PrunableUnit, params: Params) -> int:
 def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients: Params) -> Tensor:
     """Return (N,) sums over the unit of value times gradient.
 
-    The sum is, to first order and negated, how much the differentiated loss changes when the unit becomes zero.
+    To first order, setting the unit to zero changes the differentiated loss by minus this sum.
     """
     slopes = unit.of(gradients)
     parts = [_flat_primitive_rows(value.detach() * slopes[name]).sum(1) for name, value in unit.of(params).items()]

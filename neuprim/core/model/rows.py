@@ -54,7 +54,7 @@ def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-d
 def _each_primitive_table(
     kernel: Callable[..., None], rows: np.ndarray, pairs: list[tuple[np.ndarray, np.ndarray]]
 ) -> None:
-    """Run the kernel on each (source, target) pair as 2D tables; threads share the pairs."""
+    """Run the kernel on each (source, target) pair, reshaped to 2D tables; the pairs are divided among threads."""
     tables = [tuple(x.reshape(len(x), -1) for x in pair) for pair in pairs if pair[0].size and pair[1].size]
 
     def share(start: int, stop: int) -> None:

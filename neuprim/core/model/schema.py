@@ -51,7 +51,7 @@ class InitContext:
 
     @property
     def thickness(self) -> Tensor:
-        """Harmonic mean of the semi-axes over the longest one, (N,) float64; 1 for spheres."""
+        """Harmonic mean of the semi-axes divided by the longest one, (N,) float64; 1 for spheres."""
         if self.axes is None:
             return torch.ones(self.count, dtype=torch.float64)
         axes = self.axes.double()
@@ -100,7 +100,7 @@ class ParameterSpec:
 
     @property
     def fixed(self) -> bool:
-        """Whether the tensor is a label that is not learned."""
+        """Whether the parameter is a label, which is not learned."""
         return self.lr == 0
 
     @property

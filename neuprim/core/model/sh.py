@@ -23,7 +23,7 @@ def sh_coefficient_count(degree: int) -> int:
 
 
 def sh_basis(directions: Tensor, degree: int) -> Tensor:
-    """Return the (N, (degree + 1)^2) values of the basis at unit ``directions`` (N, 3), degree 0..3."""
+    """Return (N, (degree + 1)^2) values of the spherical harmonics at unit ``directions`` (N, 3), degree 0..3."""
     if not 0 <= degree <= 3:
         raise ValueError(f"spherical-harmonics degree {degree}; expected 0..3")
     x, y, z = directions.unbind(-1)
@@ -100,7 +100,7 @@ def _check_sh_inputs(means: Tensor, dc: Tensor, rest: Tensor | None, origin: Ten
 
 
 def truncate_sh_bands(params: Params, name: str, degree: int) -> dict[str, Tensor]:
-    """Return the parameters with the bands of ``name`` cut above ``degree``, the closest approximation on average."""
+    """Return the parameters without the bands of ``name`` above ``degree``: the best approximation on average."""
     kept = {key: value for key, value in params.items() if key != name}
     return {**kept, name: params[name][:, : sh_coefficient_count(degree) - 1].contiguous()} if degree else kept
 

@@ -55,8 +55,8 @@ def function_fault(value: Any) -> str | None:
 
 
 def primitive_tensors_fault(tensors: Iterable[tuple[str, Any, tuple[Shape, ...]]], sizes: Sizes) -> str | None:
-    """Return what is wrong with the first of (name, tensor, allowed shapes) whose tensor kernels cannot read or whose
-    shape is not allowed; None if all are valid. Adds the sizes found to ``sizes``."""
+    """Return the first fault among ``tensors``, entries (name, tensor, allowed shapes): a tensor that kernels cannot
+    read or that has another shape. Returns None if all are valid. Adds the sizes found to ``sizes``."""
     for name, value, shapes in tensors:
         fault = primitive_tensor_fault(value)
         if fault is None:
@@ -141,7 +141,7 @@ class PrimitiveTensors:
     def fault(self, sizes: Sizes) -> str | None:
         """Return the first error in the tensors, ``"w2 has shape (5,); expected (100, 3), as means has N=100 ..."``.
 
-        Returns None if all tensors are valid. ``sizes``: sizes known so far; those of these tensors are added.
+        Returns None if all tensors are valid. ``sizes``: known sizes, to which the sizes found are added.
         """
         return primitive_tensors_fault(
             [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes

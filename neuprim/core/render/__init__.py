@@ -97,7 +97,7 @@ def render(
 
 
 def _frame_recorder(model: Primitives, camera: AnyCamera, settings: RenderSettings) -> FrameRecorder | None:
-    """Return what replays frames of this model as CUDA graphs; None where they cannot be recorded."""
+    """Return the recorder that replays frames of this model as CUDA graphs; None if they cannot be recorded."""
     if model.device.type != device.CUDA or torch.is_grad_enabled():
         return None
     if [backend.name for backend in candidate_backends(settings, device.CUDA)][:1] != ["cuda"]:
@@ -170,7 +170,7 @@ def render_slabs(
 ) -> tuple[Tensor, Tensor]:
     """Render each group of primitives (slab) alone; return (S, H, W) opacities and (S, H, W) mean depths; no gradients.
 
-    S is the number of slabs that have primitives. They keep their order; empty slabs are left out.
+    S is the number of slabs that have primitives. Slabs without primitives are left out; the others keep their order.
 
     Args:
         slabs: (N,) index of the slab of each primitive, 0 to ``count`` - 1, on the primitives' device.

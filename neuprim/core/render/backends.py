@@ -214,7 +214,7 @@ def check_render_backend(settings: RenderSettings) -> None:
 
 
 def with_available_render_backend(settings: RenderSettings) -> RenderSettings:
-    """Return settings to render a finished run: without a GPU, device "cuda" of backend "auto" becomes "auto"."""
+    """Return settings for a finished run: if no GPU works and the backend is "auto", device "cuda" becomes "auto"."""
     gone = settings.device == hardware.CUDA and gpu_backends_unavailable() is not None and settings.backend == AUTO
     return replace(settings, device="auto") if gone else settings
 

@@ -64,7 +64,7 @@ class LayerFrame:
 
     @cached_property
     def shading(self) -> Tensor | None:
-        """Mean shading factor in each pixel, (H, W), 0 where the ray hits no primitive; None without shading."""
+        """Mean shading factor in each pixel, (H, W), 0 where the ray hits nothing; None if there is no shading."""
         geometry, density = self.lowered.geometry, self.lowered.density
         with torch.no_grad():
             found = self.model.colour.shade(geometry, density, self.conditions, self.settings)
@@ -110,7 +110,7 @@ class LayerFrame:
         return found if n == 1 else found.reshape(self.camera.height, n, self.camera.width, n).mean((1, 3))
 
     def _thin(self, transmittance: Callable[[float], Tensor]) -> Tensor:
-        """Return -log of a transmittance function at full density; opaque pixels use ever lower densities."""
+        """Return -log of ``transmittance(1)``. For opaque pixels, compute it at lower densities and scale it up."""
         T = transmittance(1.0)
         found, opaque, factor = _depth_of_transmittance(T), T <= _CLEAR, 1.0
         for _ in range(_ROUNDS):
@@ -195,7 +195,8 @@ def select_layers(text: str | None, own: Sequence[LayerSpec], several: bool) -> 
     Args:
         text: names separated by commas, or None.
         own: the layers of the task, beside the common ones.
-        several: whether several lights are on. Then only those of the task's layers that are light can be selected.
+        several: whether several lights are on. If so, only the task's layers of light can be selected besides the
+            common ones.
 
     Raises:
         ConfigError: an unknown name, or no name.

@@ -21,9 +21,9 @@ _MIN_NEAR = 1e-6  # share of the typical depth, in case a point lies at a camera
 
 
 def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tuple[float, float]:
-    """Return (nearest, median) depth of points (N, 3) in the cameras that see them; ray distance for a ``RayCamera``.
+    """Return (nearest, median) depth of points (N, 3) in the cameras that see them; ray distance for ``RayCamera``.
 
-    If no camera sees a point, both are taken over the distances of all points from all cameras.
+    If no camera sees any point, the distances of all points from all cameras are used instead.
     """
     means = means.detach().double().cpu()[:: max(len(means) // _MAX_POINTS, 1)]
     cameras = [
@@ -41,7 +41,7 @@ def nearest_and_median_depth(means: Tensor, cameras: Sequence[AnyCamera]) -> tup
 
 
 def near_plane_extent(extent: float, means: Tensor, cameras: Sequence[AnyCamera]) -> float:
-    """Return ``extent``, or the median depth of points (N, 3) if the depth is over 100 times as large."""
+    """Return ``extent``, or the median depth of points (N, 3) if this depth is over 100 times as large."""
     _, depth = nearest_and_median_depth(means, cameras)
     return extent if extent >= _MIN_EXTENT * depth else depth
 

@@ -85,7 +85,7 @@ def rasterize(
 
 
 def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
-    """Save the inputs' dtypes and devices for :func:`rasterizer_input_gradients`; keep unused gradients None."""
+    """Save the inputs' dtypes and devices for :func:`rasterizer_input_gradients`; leave unused gradients None."""
     ctx.inputs_like = [(x.device, x.dtype) for x in inputs]
     ctx.set_materialize_grads(False)  # without a gradient, the depth image adds no cost
 
@@ -93,7 +93,7 @@ def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
 def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
     """Return what ``backward`` must return: a gradient per input, in its dtype and on its device.
 
-    ``view``: (3, 4) dL/d(R | t); ``gradients``: those of the tensors after ``viewmat``.
+    ``view``: (3, 4) dL/d(R | t); ``gradients``: gradients of the tensors that follow ``viewmat``.
     """
     full = None
     if view is not None:

@@ -24,7 +24,7 @@ _BLOCK = 32  # pixels per side of a block; limits memory, does not change result
 
 
 class _FlooredSqrt(torch.autograd.Function):
-    """sqrt(D) with its derivative taken at max(D, floor): the exact one grows as D^-1/2 at a silhouette."""
+    """sqrt(D) with its derivative taken at max(D, floor), because the derivative grows as D^-1/2 at a silhouette."""
 
     @staticmethod
     def forward(ctx: Any, D: Tensor, floor: float) -> Tensor:

@@ -94,7 +94,7 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
-    """For three channels: recover T; fill GRAD, and with a ``net`` dL/d RAY_COLOUR; add to sums over 16 pixels."""
+    """Go back over a row of three channels: recover T, fill GRAD and (with ``net``) dL/d RAY_COLOUR, add ``sums``."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -140,7 +140,7 @@ def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # t
 
 @inline
 def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyped-def]
-    """For any number of channels: add the sum of c dL/d colour to ``cg``."""
+    """Add the sum over all channels of colour times dL/d colour to ``cg``, for any number of channels."""
     for c in range(color.shape[0]):
         st = state[L.G_COLOR + c * P.PIXELS + base :]
         if net is None:
@@ -155,7 +155,7 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 
 @inline
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
-    """Any number of channels, with depth: recover T; fill weights ``w`` and GRAD.
+    """For any number of channels, with depth: recover T of a row of pixels; fill weights ``w`` and GRAD.
 
     ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz).
     """
@@ -228,7 +228,7 @@ def _sum_row(sums, first):  # type: ignore[no-untyped-def]
 
 @inline
 def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-untyped-def]
-    """Fill the state of a tile's pixels; return the largest number of primitives composited in a pixel."""
+    """Fill the state of a tile's pixels; return 1 + the rank of the last primitive composited in any pixel."""
     transmittance, last, g_rgb, g_transmittance, g_z, error, _, with_depth = image
     height, width = norms.shape
     state[:] = f(0)

@@ -114,7 +114,7 @@ def _whiten_axis(b, s, u, v, fx, fy, w):  # type: ignore[no-untyped-def]
 
 @strict
 def _fill_block_rays(S, view):  # type: ignore[no-untyped-def]
-    """Fill the affine rays of a block, and TOTAL and BIGGEST, which show values that are not finite in float32."""
+    """Fill the affine rays of a block, and TOTAL and BIGGEST, which reveal values that are not finite in float32."""
     fx, fy, cx, cy, near = view.fx, view.fy, view.cx, view.cy, view.near
     for k in range(BLOCK):
         m, anchor_z, offset = S[M + k], S[ANCHOR_Z + k], S[BLOCK * P.OFFSET + k]

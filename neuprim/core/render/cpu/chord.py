@@ -128,7 +128,7 @@ def sinc_turns(z):  # type: ignore[no-untyped-def]
 
 @inline
 def dsinc_turns(z):  # type: ignore[no-untyped-def]
-    """Return d/dz of :func:`sinc_turns`, by a fit of its own, as cos - sinc cancels for small z."""
+    """Return d/dz of :func:`sinc_turns`, by a separate fit, because cos - sinc cancels for small z."""
     return ((((_D5 * z + _D4) * z + _D3) * z + _D2) * z + _D1) * z + _D0
 
 
@@ -181,7 +181,7 @@ def _hard_slopes_medium(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
-    """Return v, w reduced to half a turn, whether they were within, and 1/v, 1/w (1 if within) by one division."""
+    """Return v and w reduced to half a turn, whether they already were, and 1/v and 1/w (1 if they were)."""
     k, j = np.rint(v), np.rint(w)
     a, b = k == f(0), j == f(0)
     sv, sw = f(1) if a else v, f(1) if b else w

@@ -76,7 +76,7 @@ def _allocate_lanes(C, net):  # type: ignore[no-untyped-def]
 
 @inline
 def _allocate_hits(start, stop, across, frame, C, net):  # type: ignore[no-untyped-def]
-    """Allocate memory for the hits of any one of tiles ``start:stop``: one per pixel in the box of each pair."""
+    """Allocate memory for the hits of the largest of tiles ``start:stop``: one per pixel in the box of each pair."""
     room, pairs = 1, 1
     for t in range(start, stop):
         first, end = frame.starts[t], frame.starts[t + 1]
@@ -185,7 +185,7 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Like :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last`` gets the hits per pixel."""
+    """Like :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last``: number of hits per pixel."""
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE

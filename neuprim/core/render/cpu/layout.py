@@ -30,7 +30,7 @@ def net_row_width(hidden: int, channels: int) -> int:
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the floats in a row of gradients, for K padded neurons, C colours, H padded units; a multiple of 16."""
+    """Return the number of floats in a gradient row: K padded neurons, C colours, H padded units; a multiple of 16."""
     return _padded_row_width(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 

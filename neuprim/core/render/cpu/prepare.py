@@ -111,7 +111,7 @@ def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
     """Return r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
 
-    ``most``: F; ``longest``: s, in units of the longest semi-axis; Rounded to float32, so that backends agree.
+    ``most``: F; ``longest``: s, in units of the longest semi-axis. Rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -155,7 +155,7 @@ def _longest_half_chord(c, m, reach, tc, fx, fy, e_length, ex_length, ey_length)
     """Return an upper bound, <= 1, of the half chords of all rays, in units of the longest semi-axis.
 
     A ray's half chord through the centre is m / |e|. No point is farther than m from the centre, which bounds the
-    slopes. 1 where the anchor is not the centre.
+    slopes. The bound is 1 where the anchor is not the centre.
     """
     u, v, wide = abs(c[0] / c[2]), abs(c[1] / c[2]), m / (c[2] - reach)
     du, dv = wide * (1.0 + u), wide * (1.0 + v)

@@ -57,8 +57,8 @@ class TileLists:
 def depth_order(depth: NDArray[np.float64]) -> NDArray[np.int64]:
     """Return the indices that sort primitives front to back by ``depth``; equal depths stay in index order.
 
-    Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. Depths
-    that agree to about 1e-9 of their value (1 million primitives) count as equal.
+    Sorts unique integer keys (depth bits above, index below), many times faster than a stable float argsort. With 1
+    million primitives, depths that agree to about 1e-9 of their value count as equal.
     """
     count = depth.shape[0]
     bits = max(int(count - 1).bit_length(), 1)

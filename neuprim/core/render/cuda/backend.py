@@ -117,7 +117,7 @@ def render(
 ) -> RenderOutput:
     """Render a frame; see :data:`neuprim.core.render.output.Draw`. With a ``capacity`` the host never waits.
 
-    With a capacity, colours are :class:`Constant`, and sizes take the place of the counts in the statistics.
+    Then colours must be :class:`Constant`, and the statistics contain sizes of arrays instead of counts.
     """
     return rasterize(_Rasterize, "cuda", lowered, camera, background, settings, capacity)
 

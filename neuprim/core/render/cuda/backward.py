@@ -71,7 +71,7 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the first kernel, for pixels, of a form; ``depth``: the sum of w z has a gradient."""
+    """Return the first backward kernel, for pixels; ``depth``: whether the sum of w z has a gradient."""
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -138,7 +138,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the second kernel, for pairs, of a form; ``depth``: the sum of w z has a gradient."""
+    """Return the second backward kernel, for pairs; ``depth``: whether the sum of w z has a gradient."""
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -366,7 +366,7 @@ def rasterizer_gradient_rows(
     settings: RenderSettings,
     gradient: ImageGradient,
 ) -> tuple[Tensor, Tensor | None]:
-    """Return gradient rows, (N, gradient_width), and those of networks, (N, net_gradient_row_width), or None.
+    """Return gradient rows of primitives, (N, gradient_width), and of networks, (N, net_gradient_row_width) or None.
 
     Overwrites the slots.
     """

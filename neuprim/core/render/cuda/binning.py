@@ -48,7 +48,7 @@ _MOST = 2**31  # indices of pairs are int32
 
 @dataclass(frozen=True)
 class FrameCapacity:
-    """Sizes of a frame's arrays, so that the host need not wait for the frame's counts.
+    """Fixed sizes of a frame's arrays, with which the host need not wait for the frame's counts.
 
     A frame that does not fit, or has a primitive that is not finite, is drawn empty and sets ``refused``.
     """
@@ -79,7 +79,8 @@ class TileCounts:
 class TileLists:
     """Pairs (tile, primitive), sorted by image (if there are several), then by tile, depth and index.
 
-    Within a :class:`FrameCapacity`, zeros follow the pairs of the frame, whose number is the last of ``starts``.
+    With a :class:`FrameCapacity`, arrays have room for more pairs; zeros fill the rest. The last of ``starts`` is the
+    number of pairs.
     """
 
     starts: Tensor  # (tiles + 1,) int32, first pair of each tile, of all images
@@ -209,7 +210,7 @@ def longest_half_chord(p: ProjectedPrimitive, r: Ray, v: View, reach: wp.float64
 
 @wp.func
 def _chord_bound_by_edge(edge: int, hard: wp.float64, one: wp.float64, two: wp.float64):
-    """Return the argument for edge exponent 0, 1 or 2. An array with a variable index would need stack memory."""
+    """Return ``hard``, ``one`` or ``two`` for edge 0, 1 or 2. Indexing an array would need stack memory."""
     number = hard
     if edge == 1:
         number = one

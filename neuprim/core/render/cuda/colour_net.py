@@ -176,7 +176,7 @@ def _kernel_types(double: bool) -> tuple[Any, Any, Any]:
 def prepare_rasterizer_colour_net(
     log_scales: Tensor, quats: Tensor, Wx: Tensor, bias: Tensor, Wout: Tensor
 ) -> ColourNet:
-    """Return the networks with the rows of all primitives; :func:`fill_wide_net` fills ``wide``, which is empty."""
+    """Return the networks with the rows of all primitives. ``wide`` stays empty until :func:`fill_wide_net`."""
     tensors = (log_scales, quats, Wx, bias, Wout)
     double = any(x.dtype == torch.float64 for x in tensors)
     dtype = torch.float64 if double else torch.float32
@@ -214,7 +214,7 @@ def fill_wide_net(net: ColourNet, which: Tensor, log_scales: Tensor, quats: Tens
 def colour_net_backward(
     net: ColourNet, parameters: Sequence[Tensor], weights: Tensor, grads: Tensor, out: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the float32 gradients of Wx, bias and Wout; add to those of log_scales and quats in ``out``.
+    """Return the float32 gradients of Wx, bias and Wout; add the gradients of log_scales and quats to ``out``.
 
     ``weights``, ``grads``: (N, ...) gradient rows of the density and of the networks.
     """

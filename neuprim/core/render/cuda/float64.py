@@ -270,7 +270,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the gradient kernel for float64 pairs of a form; ``depth``: the sum of w z has a gradient."""
+    """Return the gradient kernel for float64 pairs of a form; ``depth``: whether the sum of w z has a gradient."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

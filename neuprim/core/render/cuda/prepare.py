@@ -377,7 +377,7 @@ def prepare_frame(
 
     Args:
         palette: (N, C) colours.
-        tensors: those of :data:`~neuprim.core.render.rasterize.PARAMETERS`, all on one device.
+        tensors: the tensors that :data:`~neuprim.core.render.rasterize.PARAMETERS` names, all on one device.
         forced: (N,) bool, primitives that are always rendered in float64.
         images: (N,) int32 index of the image of each primitive, and the number of images; None for one image.
 

@@ -59,7 +59,7 @@ class FrameRecorder:
         self, model: Primitives, camera: Camera, conditions: Conditions, settings: RenderSettings,
         background: Tensor | None,
     ) -> RenderOutput | None:  # fmt: skip
-        """Return a replayed frame; None if it must be rendered without, and then given to :meth:`observe`."""
+        """Return a replayed frame. If None, the caller must render the frame and pass it to :meth:`observe`."""
         with self._turn:
             memory = tuple(value.data_ptr() for value in model.params.values())
             if memory != self._memory:
@@ -95,7 +95,7 @@ class FrameRecorder:
             return replace(made, rgb=made.rgb.clone(), alpha=made.alpha.clone(), depth=depth)
 
     def observe(self, output: RenderOutput) -> None:
-        """Note the counts of a frame that was not recorded, and enlarge the arrays if it would not have fitted."""
+        """Read the counts of a frame that was not recorded, and enlarge the arrays if a count exceeds the capacity."""
         with self._turn:
             counts = frame_counts(output.stats)
             if self._capacity is not None and self._capacity.fits(counts):

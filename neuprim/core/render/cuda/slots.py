@@ -52,7 +52,7 @@ def row_spans(
     rows: Vec4s2d, silhouettes: Floats2d, boxes: Vec4is, starts: Ints, ids: Ints, tiles: Ints, size: wp.vec2i,
     spans: Shorts2d, counts: Ints2d,
 ):  # fmt: skip
-    """Thread n writes which pixels of its tile pair n covers: start << 8 | last << 4 | first for each of 16 rows.
+    """Thread n writes the pixels that pair n covers in its tile: start << 8 | last << 4 | first for each of 16 rows.
 
     Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. The slots
     take a fifth of the memory of whole tiles. ``counts`` (2, pairs): number of slots; 1 if the pair needs float64.
@@ -126,7 +126,7 @@ def refuse_frame(
 
 
 def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) -> tuple[int, Tensor, Tensor]:
-    """Return the number of slots, (pairs + 1,) first slots, and float64 pairs; -1 follows the latter.
+    """Return the number of slots, the (pairs + 1,) first slots, and a list of the float64 pairs, padded with -1.
 
     Waits for the device if there is no ``capacity``. Raises BackendUnavailable if there are too many slots.
     """

@@ -70,14 +70,14 @@ class FormError(NeuprimError):
 
 
 def cut_error_text(text: str, most: int = 80) -> str:
-    """Cut a text to ``most`` characters; messages quote values from files and users only through this."""
+    """Shorten a text to at most ``most`` characters; for values from files and users that messages quote."""
     return text if len(text) <= most else f"{text[: most - 3]}..."
 
 
 def nearest(name: str, choices: Iterable[str], limit: int = 3, prefix: str = "") -> str:
-    """Return the end of an error message that suggests the closest of ``choices``, ``"; did you mean 'a' or 'b'?"``.
+    """Return a hint for the end of an error message: the closest of ``choices``, ``"; did you mean 'a' or 'b'?"``.
 
-    Names get ``prefix`` in front. If no name is close, all are listed.
+    The hint writes ``prefix`` before each name. If no name is close, it lists all choices.
     """
     options = sorted(set(choices))
     close = difflib.get_close_matches(name[:200], options, n=limit, cutoff=0.5)
@@ -96,7 +96,7 @@ _FULL_GPU = (
 
 
 def one_line(error: BaseException) -> str | None:
-    """Return the one-line message of an error that a user can correct; None for any other error, a bug."""
+    """Return the one-line message of an error that a user can correct; None for any other error, which is a bug."""
     if isinstance(error, NeuprimError):
         text = " ".join(str(error).split())
         return text if len(text) <= _HEAD + _TAIL else f"{text[:_HEAD]} ... {text[-_TAIL:]}"

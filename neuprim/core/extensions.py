@@ -92,21 +92,21 @@ class ExportJob:
         return conditions_per_frame(specs, self.conditions, several)
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:
-        """Return an option that is a finite number from ``low`` to ``high``, or None; raises ConfigError otherwise."""
+        """Return option ``name``, a finite number from ``low`` to ``high`` or None; raise ConfigError otherwise."""
         value: float | None = validate_value(self.options[name], Annotated[float, Range(low, high)] | None, name)
         return value
 
     def count(self, name: str, low: int, high: int) -> int | None:
-        """Return an option that is a whole number from ``low`` to ``high``, or None; raises ConfigError otherwise."""
+        """Return option ``name``, a whole number from ``low`` to ``high`` or None; raise ConfigError otherwise."""
         value: int | None = validate_value(self.options[name], Annotated[int, Range(low, high)] | None, name)
         return value
 
     def choice(self, name: str, *offered: str) -> str:
-        """Return an option that is one of the values ``offered``; raises ConfigError otherwise."""
+        """Return option ``name``, one of the texts ``offered``; raise ConfigError otherwise."""
         return str(validate_value(self.options[name], Literal[offered], name))
 
     def flag(self, name: str) -> bool:
-        """Return an option that is true or false; raises ConfigError otherwise."""
+        """Return option ``name``, true or false; raise ConfigError otherwise."""
         return bool(validate_value(self.options[name], bool, name))
 
 

@@ -91,7 +91,7 @@ def _format_bound(value: float | None) -> str:
 
 @dataclass(frozen=True)
 class Accepts:
-    """Requirement on a setting's value, as a function: ``Annotated[str, Accepts(str.islower, "lower-case text")]``."""
+    """Requirement on a setting's value, with a test: ``Annotated[str, Accepts(str.islower, "lower-case text")]``."""
 
     test: Callable[[Any], bool]  # test of the converted value
     says: str  # text of messages for the expected value
@@ -219,7 +219,7 @@ class _UnfitValue(ConfigError):
 
 
 def validate_setting_names(values: Iterable[object], names: Iterable[str], where: str) -> None:
-    """Raise ConfigError for the first of ``values`` that is not in ``names``; it suggests the nearest names."""
+    """Raise ConfigError for the first of ``values`` that is not in ``names``; the message suggests similar names."""
     known = list(names)
     for key in values:
         if key not in known:
@@ -314,7 +314,7 @@ def _validate_union_value(value: Any, options: tuple[Any, ...], where: str) -> A
 
 
 def _validate_plain_value(value: Any, kind: Any, notes: tuple[Any, ...], where: str) -> Any:
-    """Return ``value`` as the plain type ``kind``; its annotations ``notes`` serve only the message."""
+    """Return ``value`` as the plain type ``kind``; ``notes``, the type's annotations, serve only the error message."""
     origin, args = get_origin(kind), get_args(kind)
     if kind is Any:
         return value

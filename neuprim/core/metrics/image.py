@@ -31,7 +31,7 @@ def comparable_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
-    """Return both images as :func:`comparable_images`, but two float32 images stay float32."""
+    """Return both images as :func:`comparable_images` does, but keep two float32 images in float32."""
     images = {"rendered": rendered, "truth": truth}
     for name, image in images.items():
         if not image.is_floating_point():
@@ -159,7 +159,7 @@ def format_metrics(metrics: Mapping[str, Any]) -> str:
 
 
 def format_failed_views(metrics: Mapping[str, Any]) -> str:
-    """Name the held-out views of metrics.json that are worse than a black image; empty without any."""
+    """Name the held-out views of metrics.json that are worse than a black image; "" if there are none."""
     bad = metrics["worse_than_black_image"]
     if not bad:
         return ""

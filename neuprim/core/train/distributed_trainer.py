@@ -32,7 +32,7 @@ _ALIGNMENT = 16
 
 
 class _RankMessage(NamedTuple):
-    """Message of a rank to the others in a step.
+    """Message that a rank sends to all other ranks in each step.
 
     Attributes:
         checksum: checksum of the positions before the step; a difference reveals a rank that computes differently.
@@ -159,7 +159,7 @@ class DistributedTrainer(Trainer):
         return every, self._sums.finish(self.model.params, present)
 
     def _stop_clock(self, start: float) -> float:
-        """Return rank 0's training time at :meth:`_combine_views`; the rest of the step counts in the next step."""
+        """Return rank 0's training time at :meth:`_combine_views`; the rest of the step counts for the next step."""
         self._after = time.perf_counter() - self._agreed_at
         return self._agreed
 
@@ -225,7 +225,7 @@ class GradientSum:
     def finish(self, params: Mapping[str, Tensor], present: Sequence[bool]) -> Contributions:
         """Set the summed gradients of the ``present`` parameters, and return the summed contributions.
 
-        Both are valid until the next :meth:`add`, which starts a new sum.
+        Gradients and contributions are valid until the next :meth:`add`, which starts a new sum.
         """
         self._empty = True
         self.group.all_gather(self._buffer, self._sum)

@@ -20,7 +20,7 @@ from neuprim.core.train.ssim_cpu import SSIM_TAPS, SSIM_WINDOW
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def check_adam_gradient(grad: Floats, refused: Ints):
-    """Set ``refused`` if a gradient is not finite; one thread per number."""
+    """Set ``refused`` if a gradient is not finite; one thread per element of ``grad``."""
     if not wp.isfinite(grad[wp.tid()]):
         refused[0] = 1  # whichever thread writes it
 
@@ -55,7 +55,7 @@ def adam_rows(
     values: Sequence[Tensor], grads: Sequence[Tensor], firsts: Sequence[Tensor], seconds: Sequence[Tensor],
     rates: Tensor, age: Tensor, betas: tuple[float, float], refused: Tensor,
 ) -> None:  # fmt: skip
-    """Take one Adam step in place, unless ``refused`` is set; set it and change nothing if a gradient is not finite.
+    """Take one Adam step in place, unless ``refused`` is set. If a gradient is not finite, only set ``refused``.
 
     Args:
         values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.

@@ -68,7 +68,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 @exact_kernel
 def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
-    """Return the largest bit pattern of |x|, x float32: at least that of infinity if an element is not finite."""
+    """Return the largest bit pattern of |x|, x float32; not below that of infinity if an element is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
     for k in range(bits.shape[0]):  # a maximum of integers vectorises, a sum of floats does not

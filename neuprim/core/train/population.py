@@ -81,7 +81,7 @@ class PopulationChange:
 
 
 class Population(ABC):
-    """Base class of strategies, which observe every step and return a :class:`PopulationChange` when :meth:`due`."""
+    """Base class of population control strategies, which observe all steps and change primitives when :meth:`due`."""
 
     def __init__(self, settings: PopulationSettings) -> None:
         self.settings = settings
@@ -96,7 +96,7 @@ class Population(ABC):
         """Collect statistics of a step, after its backward passes and before ``.grad`` is cleared."""
 
     def sums(self) -> tuple[Tensor | None, ...]:
-        """Return the tensors that :meth:`observe` adds to; None for one that the next step creates."""
+        """Return the tensors that :meth:`observe` adds to, with None for each tensor that the next step creates."""
         return ()
 
     @abstractmethod
@@ -125,9 +125,9 @@ class RelocatePopulation(Population):
     """Strategy that moves the primitives of least weight to where weight x error is largest, and adds primitives.
 
     Each primitive with a large error splits in two: one child takes its row, one the row of a primitive with little
-    weight. ``idle`` limits which primitives are replaced. Below ``grow_to`` primitives, further ones split into an old
-    and a new row: a quarter of all at a time, or as many as the remaining interventions need. Short budgets intervene
-    sooner.
+    weight. ``idle`` limits which primitives are replaced. While there are fewer than ``grow_to``, further primitives
+    split into an old and a new row: a quarter of all, or as many as the remaining interventions need. Short budgets
+    intervene sooner.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:
@@ -236,10 +236,10 @@ def _split_population_into_rows(
 class GradientPopulation(Population):
     """Strategy of the authors of the method: clone, split and prune by the gradient of the density network.
 
-    Splits are exact (method: "Population"). g = mean over views that show the primitive of |dW1| + |db1| + |dw2| +
-    |db2|, one view per step. g >= grow_threshold: clone in place, both copies at half density, if max s <= clone_scale
-    x extent, else split in two (s/1.6). Prune if g < prune_threshold, max s > prune_scale x extent, or no view shows
-    the primitive.
+    Splits are exact (method: "Population"). g is |dW1| + |db1| + |dw2| + |db2|, averaged over the steps whose views
+    show the primitive. g >= grow_threshold: clone in place, both copies at half density, if max s <= clone_scale x
+    extent, else split in two (s/1.6). Prune if g < prune_threshold, max s > prune_scale x extent, or no view shows the
+    primitive.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:

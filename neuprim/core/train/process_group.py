@@ -129,7 +129,7 @@ class ProcessGroup:
         return values
 
     def share_number(self, name: str, make: Callable[[], int]) -> int:
-        """Call ``make`` on rank 0 only; return its result on all ranks. ``name``: a key that is used once.
+        """Call ``make`` on rank 0 only; return its result on all ranks. ``name``: a key not used by other calls.
 
         Raises RankError.
         """

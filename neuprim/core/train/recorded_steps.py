@@ -57,7 +57,7 @@ _MOST_PROGRAMS = 16
 
 
 class RecordableTrainer(Protocol):
-    """What recording needs of a :class:`~neuprim.core.train.trainer.Trainer`, whose members these are."""
+    """The members of :class:`~neuprim.core.train.trainer.Trainer` that the recording of steps uses."""
 
     current_model: Primitives
     dataset: Dataset
@@ -103,7 +103,7 @@ def recording_fault(trainer: RecordableTrainer) -> str | None:
 
 @dataclass
 class _Inputs:
-    """The tensors of a step's views and points on the device: those of a recording are always in the same memory."""
+    """The tensors of a step's views and points on the device. Those of a recording never change their memory."""
 
     views: list[tuple[View, Pixels]]
     samples: PointSamples | None
@@ -155,12 +155,12 @@ class _Flight(NamedTuple):
 
 
 class StepRecorder:
-    """Records and replays the steps of one trainer; on the CPU, for tests, it runs the same steps again.
+    """Records and replays the steps of one trainer. On the CPU, for tests, a replay just runs the step again.
 
     Attributes:
         capacity: sizes of the arrays; None until a step that was not recorded gave the counts.
         replayed: number of steps that were replayed.
-        repeated: number of replayed steps that were refused, or came after one, and were taken again.
+        repeated: number of replayed steps that were taken again because they, or an earlier step, were refused.
     """
 
     def __init__(self, trainer: RecordableTrainer) -> None:
@@ -185,7 +185,7 @@ class StepRecorder:
         self._seen.clear()
 
     def observe_counts(self, stats: RenderStats) -> None:
-        """Note the counts of a frame that was not recorded, and enlarge the arrays if it would not have fitted."""
+        """Read the counts of a frame that was not recorded, and enlarge the arrays if a count exceeds the capacity."""
         from neuprim.core.render.cuda.backend import frame_counts
         from neuprim.core.render.cuda.binning import FrameCapacity
 
@@ -198,7 +198,7 @@ class StepRecorder:
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
-        """Replay one step; None if it must be taken by the trainer itself, because nothing is recorded for it yet."""
+        """Replay one step. Return None if nothing is recorded for it yet; the trainer must then take the step."""
         trainer, sums = self.trainer, self.trainer.population.sums()
         if self._graphs.failed or self.capacity is None or trainer.fake_quantize is not None or trainer.zero_masks:
             return None
@@ -236,7 +236,7 @@ class StepRecorder:
         return report
 
     def settle(self, keep: int = 0) -> list[_Flight]:
-        """Read the results of replayed steps but the last ``keep``; return those that must be taken again, in order."""
+        """Read the results of replayed steps except the last ``keep``; return the steps to take again, in order."""
         while len(self._flights) > keep:
             first = self._flights[0]
             if first.event is not None:
@@ -283,7 +283,7 @@ class StepRecorder:
         return program
 
     def _make_program(self, inputs: _Inputs) -> _Program:
-        """Return a program with tensors of its own for such inputs."""
+        """Return a program whose own tensors have the shapes of ``inputs``."""
         where, each = self.trainer.device, 16 + self.trainer.dataset.channels
         rates = each * len(inputs.views)
         scales = rates + len(self.trainer.current_model.specs)

@@ -28,7 +28,7 @@ class Sensitivity:
     """Mean squared effects of changes to a model, over the pixels and channels of some views, or over points.
 
     Attributes:
-        whole: (N,) effect of removing each primitive; in views, if its colour differs by 1 from the colour behind it.
+        whole: (N,) effect of removing each primitive; in views, for a colour difference of 1 to what is behind.
         seen: (N,) number of views, or frames, that show the primitive; where it is 0, the effects are unknown.
         pieces: name of a unit -> (N,) effect of setting each primitive's unit to zero.
         columns: parameter -> (C,) float64 effect of each column, if the values of all primitives change by independent
@@ -48,7 +48,7 @@ class Sensitivity:
 
 
 class _SensitivitySums:
-    """Sums the squared gradients of backward passes from random signs."""
+    """Sums of squared gradients over backward passes that start from random signs."""
 
     def __init__(self, model: Primitives) -> None:
         self._model, self._pieces = model, prunable_units_of_model(model.density, model.colour)
@@ -105,7 +105,7 @@ def sensitivity(
 def inner_sensitivity(model: Primitives, draws: Sequence[PointSamples], seed: int = 0, threads: int = 0) -> Sensitivity:
     """Estimate the effects on the extinction at points, relative to typical extinction; returns CPU tensors.
 
-    For volumes with known extinction. Images do not show these effects.
+    It serves volumes with known extinction, because images do not show these effects.
 
     Args:
         draws: samples of points, each from one frame.

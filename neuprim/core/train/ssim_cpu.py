@@ -93,7 +93,7 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
-    """Set unequal[i] to the range [first, end) of elements that differ in row i, or [n, 0); rows start:stop."""
+    """Set unequal[i] to the range [first, end) of differing elements of row i, [n, 0) for none; rows start:stop."""
     n = x.shape[0] // height
     for i in range(start, stop):
         first, end = 0, n
@@ -108,7 +108,8 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
     """Return the range [first, end) that contains the unequal elements of image rows start:stop.
 
-    The range is extended by ``before`` and ``after`` within [0, most). If no elements differ, end is first.
+    The range is extended by ``before`` and ``after`` within [0, most). If no elements differ, it is empty (end is
+    first).
     """
     first, end = most, np.int64(0)
     for i in range(start, stop):

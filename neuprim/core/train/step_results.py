@@ -20,7 +20,7 @@ from neuprim.core.train.training_views import PixelStride
 class StepReport:
     """Result of one training step.
 
-    On a GPU, the first look at ``loss``, ``parts`` or ``psnr`` waits for the step to end.
+    On a GPU, the first access to ``loss``, ``parts`` or ``psnr`` waits until the step has ended.
 
     Attributes:
         seconds: training time up to the end of this step.
@@ -39,7 +39,7 @@ class StepReport:
 
     @classmethod
     def pending(cls, settle: Callable[[], None], **known: Any) -> StepReport:
-        """Return a report without loss, parts and psnr; ``settle`` calls :meth:`resolve` with them."""
+        """Return a report without loss, parts and psnr; calling ``settle`` passes them to :meth:`resolve`."""
         report = cls.__new__(cls)
         report.__dict__.update(known, _settle=settle)
         return report
@@ -70,8 +70,8 @@ class ViewResult(NamedTuple):
     Attributes:
         loss: the view's part of the step's loss; that of the last view includes points and regularisers.
         parts: named parts of the loss; those of the last view include points.
-        gain: gradient of the logarithm of the view's exposure, one number per channel; None without exposures.
-        correction: gradient of the view's corrections; None without them.
+        gain: gradient of the logarithm of the view's exposure, one number per channel; None if none are learned.
+        correction: gradient of the view's corrections; None if none are learned.
     """
 
     view: int
@@ -96,7 +96,7 @@ class RenderedView:
     contributions: Contributions
 
     def numbers(self, cost: Tensor, more: Iterable[Tensor] = ()) -> Tensor:
-        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` as one float64 tensor, which takes one wait."""
+        """Return ``cost``, ``squared``, ``counted``, parts and ``more`` in one float64 tensor, to wait only once."""
         values = (cost.detach(), self.squared, self.counted, *self.parts.values(), *more)
         like = self.squared
         return torch.stack(
@@ -140,5 +140,5 @@ def summarize_views(views: list[ViewResult]) -> tuple[float, dict[str, float], f
 
 
 def name_views(names: Sequence[str]) -> str:
-    """Return the name of a step for reports, from those of its views."""
+    """Return the name of a step for reports, from the names of its views."""
     return names[-1] if len(names) == 1 else f"{names[-1]} and {len(names) - 1} more"

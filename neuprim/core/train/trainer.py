@@ -146,7 +146,7 @@ class Trainer:
         return self.stop_requested()
 
     def rates(self, progress: float | None = None) -> dict[str, float]:
-        """Return the learning rates by parameter at ``progress``; None for the current one."""
+        """Return the learning rates by parameter name at ``progress`` (None: the current progress)."""
         s, model = self.settings, self.current_model
         factor = s.rate_factor(self.step, self.progress if progress is None else progress)
         unit = {"absolute": 1.0, "extent": self.extent, "pixel": self.pixel}
@@ -247,9 +247,9 @@ class Trainer:
         report.resolve(cost, parts, psnr)
 
     def settle(self, keep: int = 0) -> None:
-        """Wait for recorded steps, but for the last ``keep``, and repeat those that the device refused.
+        """Wait for all recorded steps except the last ``keep``, and repeat those that the device refused.
 
-        Raises as :meth:`train_step`.
+        Raises the errors of :meth:`train_step`.
         """
         if self.recorder is None:
             return

@@ -122,7 +122,7 @@ def choose_stride(stride: int | Literal["auto"], covered: float, primitives: int
 
 
 def draw_stride(stride: int, view: View, generator: torch.Generator) -> PixelStride:
-    """Draw a random first pixel for a stride. The stride is lowered until 11 pixels a side remain."""
+    """Draw a random first pixel for a stride. The stride is lowered until at least 11 x 11 pixels remain."""
     stride = max(min(stride, min(view.camera.width, view.camera.height) // _MIN_SIDE), 1)
     if stride == 1:
         return PixelStride()
@@ -174,7 +174,7 @@ class _NumbersOfViews:
         return {"numbers": self.numbers, "m": self.m, "v": self.v, "seen": self.seen}
 
     def load_state(self, state: dict[str, Tensor]) -> None:
-        """Restore the result of :meth:`state`, which must fit."""
+        """Restore the result of :meth:`state`, whose tensors must have the same shapes."""
         self.numbers, self.m, self.v = state["numbers"], state["m"], state["v"]
         self.seen = state["seen"].cpu()
 

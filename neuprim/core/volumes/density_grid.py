@@ -33,7 +33,7 @@ POINTS_LIMIT = 2**30
 def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, tuple[int, int, int]]:
     """Return a regular grid of cell centres that fills the box ``bounds``, (2, 3) lower and upper corner.
 
-    The longest side has ``resolution`` cells. The grid is a (4, 4) matrix scene_from_index and a shape.
+    The longest side has ``resolution`` cells. The grid is given by matrix scene_from_index (4, 4) and shape (X, Y, Z).
     """
     low, high = np.asarray(bounds, np.float64)
     step = float((high - low).max()) / resolution
@@ -44,9 +44,9 @@ def box_lattice(bounds: np.ndarray | Tensor, resolution: int) -> tuple[Tensor, t
 
 
 def voxels_in_box(bounds: np.ndarray | Tensor, scene_from_index: np.ndarray) -> tuple[Tensor, tuple[int, int, int]]:
-    """Return (4, 4) scene_from_index and shape of the part of a grid whose voxel centres lie in the box ``bounds``.
+    """Return matrix scene_from_index (4, 4) and shape of the part of a grid whose voxel centres lie in a box.
 
-    ``bounds`` is (2, 3), in scene units. For a rotated grid, the part is a block of voxels around the box.
+    ``bounds`` (2, 3) is the box, in scene units. For a rotated grid, the part is a block of voxels around the box.
     """
     corners = np.stack(np.meshgrid(*np.asarray(bounds, np.float64).T, indexing="ij"), -1).reshape(-1, 3)
     back = np.linalg.inv(scene_from_index)

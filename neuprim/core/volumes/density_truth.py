@@ -146,7 +146,7 @@ class DensityTruth(ABC):
     def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
         """Return the grid on which a model is compared with a frame, e.g. a file's voxels; None for an empty frame.
 
-        The grid is a (4, 4) float64 matrix scene_from_index and a shape.
+        The grid is given by matrix scene_from_index (4, 4), float64, and shape (X, Y, Z).
         """
 
     @abstractmethod
@@ -167,7 +167,7 @@ class DensityGridSource(DensityTruth):
 
     @abstractmethod
     def grid_transform(self, frame: int) -> np.ndarray | None:
-        """Return the (4, 4) float64 world_from_index of the absorbing grid of a frame; None if it has no such grid."""
+        """Return the (4, 4) float64 world_from_index of a frame's absorbing grid; None if the frame has none."""
 
     @abstractmethod
     def open_files(self, path: Path) -> DensityTruth:

@@ -112,7 +112,7 @@ def volume_values_at(
 def _point_values(
     values: Tensor, width: int, rows: Tensor | None, shares: PointShares, named: tuple[str, ...]
 ) -> PointValues:
-    """Return the columns of ``values``: extinction, ``width`` of the source, and the ``named`` components."""
+    """Split the columns of ``values`` into extinction, source (``width`` columns) and the ``named`` components."""
     components = dict(zip(named, values[:, 1 + width :].unbind(1), strict=True))
     return PointValues(values[:, 0], values[:, 1 : 1 + width] if width else None, rows, shares, components)
 

@@ -151,7 +151,7 @@ def _prepare_point_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate,
 
 @exact_kernel
 def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prims, pulled, gradients):  # type: ignore[no-untyped-def]
-    """Fill gradients of (log_scales, quats, W1, b1, w2, b2) from those of A, rate, phase, amplitude and offset."""
+    """Fill gradients of (log_scales, quats, W1, b1, w2, b2) from gradients of A, rate, phase, amplitude and offset."""
     A, rate, phase, amplitude, offset = prims
     p_A, p_rate, p_phase, p_amplitude, p_offset = pulled
     g_log_scales, g_quats, g_W1, g_b1, g_w2, g_b2 = gradients
@@ -184,7 +184,7 @@ def _density_parameters_backward(start, stop, log_scales, quats, omega0, m, prim
 
 @exact_kernel
 def _sort_density_points(points, low, step, counts, starts, order, placed):  # type: ignore[no-untyped-def]
-    """Sort points by cell, by counting: fill ``starts`` (pass zeros), ``order`` and the sorted ``placed``."""
+    """Sort points by cell with a counting sort: fill ``starts`` (pass zeros), ``order`` and the sorted ``placed``."""
     cells = np.empty(points.shape[0], np.int64)
     for p in range(points.shape[0]):
         cell = 0
@@ -205,7 +205,7 @@ def _sort_density_points(points, low, step, counts, starts, order, placed):  # t
 
 @exact_kernel
 def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
-    """Sum the ``parts`` (P, M, W), points sorted, in order; fill ``merged`` (M, W), points in their given order."""
+    """Add up ``parts`` (P, M, W) of the sorted points, in order; fill ``merged`` (M, W) in the original point order."""
     for p in range(start, stop):
         for q in range(parts.shape[2]):
             total = 0.0
@@ -283,8 +283,8 @@ def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sum
 
 @kernel
 def _density_point_values_backward(start, stop, cells, reach, prims, edge, pulled, error, gradients, shares):  # type: ignore[no-untyped-def]
-    """Fill gradients of ``prims`` from those of the sums, ``pulled`` (M, 1 + C), and ``shares`` (N, 2), the sums of
-    sigma and sigma x error."""
+    """Fill the gradients of ``prims`` from ``pulled`` (M, 1 + C), the gradients of the sums. Also fill ``shares`` (N,
+    2), the sums of sigma and of sigma x error."""
     points, starts, counts = cells.points, cells.starts, cells.counts
     means, A, rate, phase, amplitude, offset, colors = prims
     g_means, g_A, g_rate, g_phase, g_amplitude, g_offset, g_colors = gradients

@@ -25,7 +25,8 @@ _MARGIN = 1 + 1e-12  # of the boxes around ellipsoids: rounding must not leave o
 def cosine_point_values(geometry: Geometry, form: Cosine, points: Tensor, weights: Tensor, shares: Any) -> Tensor:
     """Return (M, 1 + C) float32 extinction and weighted extinctions at ``points`` (M, 3), without a wait for the GPU.
 
-    All are NaN if a number is not finite. Differentiable in all but the points; the backward pass fills ``shares``.
+    All values are NaN if a parameter is not finite. Differentiable except in the points; the backward pass fills
+    ``shares``.
 
     Args:
         weights: (N, C) factors of the extinction of each primitive.

@@ -30,8 +30,8 @@ class Rasterized:
     Attributes:
         rgb: (C, H, W, channels) colours, composited over the backgrounds.
         alpha: (C, H, W) accumulated opacity 1 - T.
-        depth: (C, H, W) weighted mean camera-z of the chord middles, scene units, 0 where a ray hits no primitive;
-            None unless ``rasterize`` got ``depth=True``.
+        depth: (C, H, W) mean camera-z of the chord midpoints, with the weights of the colours, scene units; 0 where a
+            ray hits no primitive. None unless ``rasterize`` got ``depth=True``.
         stats: statistics of each camera's image, see :class:`~neuprim.core.render.output.RenderStats`.
     """
 
@@ -83,10 +83,10 @@ def rasterize(
     ``Ks`` with ``backend="reference"``.
 
     Args:
-        primitives: tensors by name, on one device and of one dtype (float32 or float64), which is also the images':
+        primitives: name -> tensor. All tensors and the images have the same device and dtype, float32 or float64:
             ``means`` (N, 3) centres, ``log_scales`` (N, 3) natural logarithms of the semi-axes, scene units;
-            ``quats`` (N, 4) wxyz, any non-zero norm; ``W1`` (N, K, 3) frequencies, ``b1`` (N, K) phases, both before
-            the factor omega0, ``w2`` (N, K) amplitudes, ``b2`` (N, 1) or (N,) offsets, K = 0 to 256; ``colors``
+            ``quats`` (N, 4) wxyz, any non-zero norm; ``W1`` (N, K, 3) frequencies, ``b1`` (N, K) phases, both without
+            the factor omega0, ``w2`` (N, K) amplitudes, ``b2`` (N, 1) or (N,) offsets, K is 0 to 256; ``colors``
             (N, channels), or (C, N, channels) for colours that depend on the camera; and optionally ``log_gain``
             (N, 1) or (N,), clamped to +-20, without gradient beyond.
         viewmats: (C, 4, 4) world-to-camera, OpenCV axes (x right, y down, z forward). float64 is best.
@@ -98,8 +98,8 @@ def rasterize(
         **settings: fields of :class:`neuprim.core.settings.RenderSettings`: ``backend``, ``near``, ``depth``, ...
 
     Raises:
-        DataError: a tensor of the wrong type, dtype, device or shape; a camera that is not finite, rigid and free of
-            skew. The message names the argument, what was found and what was expected.
+        DataError: a tensor has a wrong type, dtype, device or shape; a camera is not finite or not rigid, or has skew.
+            The message names the argument, what was found and what was expected.
         ConfigError: a setting is unknown, or its value is impossible.
         NonFiniteError: a primitive tensor or background holds NaN or infinity, or a quaternion is zero.
         BackendUnavailable: ``Ks`` requires a gradient, but ``backend`` allows a backend that does not compute it.

@@ -119,7 +119,7 @@ def _write_gaussian_ply(job: ExportJob) -> ExportReport:
 
 
 def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: World) -> np.ndarray:
-    """Return PLY vertices in the coordinates of the user's data; centres are double where float32 is too coarse."""
+    """Return Gaussians as PLY vertices in the user's coordinates. Centres are double if float32 is too coarse."""
     gaussians, colours = gaussians.to_scene(world.inverse), colours.rotate(world.inverse.rotation)
     scales, quats = gaussians.axes()
     opacity = gaussians.opacities.numpy()
@@ -139,7 +139,7 @@ def _gaussian_ply_rows(gaussians: Gaussians, colours: ExportHarmonics, world: Wo
 def _draw_export_images(
     job: ExportJob, which: str, conditions: Conditions, rgb: Sequence[int]
 ) -> tuple[list[tuple[View, Tensor]], str]:
-    """Render the model's red, green and blue for the PSNR; return (view, image) pairs and the views' description."""
+    """Render the model for the PSNR. Return pairs (view, (H, W, 3) image), and a text that describes the views."""
     run = job.run
     views, what = choose_export_views(job, which, conditions)
     background, images = _export_background(job), []
@@ -204,7 +204,7 @@ class Gaussians:
 
 
 def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gaussians:
-    """Fit one Gaussian to each primitive of a model that absorbs light under the given conditions.
+    """Fit one Gaussian to each primitive that absorbs light under the given conditions.
 
     ``size`` chooses the method:
 
@@ -280,8 +280,8 @@ def _fit_gaussian_ply_profile(
     """Fit size="profile" of :func:`fit_gaussians`: return (n,) factors on the covariance, and (n,) opacities.
 
     Each of the three ``screens`` is a projection of n primitives along an axis: (alpha, covariance, mean, area). The
-    fit tries every factor, with the opacity that preserves the integral of alpha, at most 0.99. The factor with the
-    least squared error wins. The error includes the Gaussian's part outside of the image, in closed form.
+    fit tries a list of factors. For each factor, the opacity preserves the integral of alpha, but is at most 0.99. The
+    factor with the smallest squared error wins. The error includes the Gaussian's part outside of the image.
     """
     step = ticks[1] - ticks[0]
     weights = torch.stack([screen[3] for screen in screens])
@@ -310,8 +310,8 @@ def draw_exported_gaussians(
 
     Gaussians are projected by a local affine approximation (EWA) and blurred by 0.3 square pixels. In a pixel, alpha is
     min(0.99, opacity exp(-d^2/2)); Gaussians with alpha below 1/255 are skipped. Compositing is front to back by the
-    depth of centres, and stops before the transmittance falls below 1e-4. Gaussians nearer than 0.2 are left out.
-    Unlike in 3DGS, a footprint ends where alpha is 1/255, not at the tile around three standard deviations.
+    depth of centres, and stops before the transmittance falls below 1e-4. Gaussians with a depth below 0.2 are left
+    out. 3DGS draws a Gaussian only in the tiles within three standard deviations; here, only alpha limits it.
     """
     view = camera.viewmat.double()
     W, t = view[:3, :3], gaussians.means @ view[:3, :3].T + view[:3, 3]

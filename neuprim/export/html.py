@@ -81,7 +81,7 @@ def _write_html_export(job: ExportJob) -> ExportReport:
 
 
 def _load_html_export_views(job: ExportJob, limit: int) -> tuple[list[PageView], list[str]]:
-    """Load at most ``limit`` held-out views for the page; return them, and a note that says why there are none."""
+    """Load at most ``limit`` held-out views for the page. Return the views, and the reason if they cannot be read."""
     if limit == 0:
         return [], []
     job.progress("reading the scene", 0.0)
@@ -104,7 +104,7 @@ def _make_html_export_draw(run: TrainedModel) -> DrawView:
 def _measure_html_export_psnr(
     job: ExportJob, stored: Primitives, views: Sequence[PageView], conditions: Mapping[str, Tensor]
 ) -> float:
-    """Return the PSNR in dB of the ``stored`` model against the run's model, over page views or else an orbit."""
+    """Return the PSNR, dB, of images of the ``stored`` model against the run's model, on ``views`` or else an orbit."""
     model = job.run.model
     if not views and not model.active(conditions).geometry.count:
         return math.inf  # both images are the background

@@ -53,7 +53,7 @@ def _pack_export_header(job: ExportJob) -> str:
 
 
 def _unpack_export_header(text: str, path: Path) -> tuple[dict[str, Any], dict[str, tuple[int, ...]], str]:
-    """Parse an untrusted line of :func:`_pack_export_header`: model header, parameter shapes, configuration."""
+    """Parse and check a line of :func:`_pack_export_header`; return model header, parameter shapes, configuration."""
     try:
         record = load_json(text)
     except (ValueError, RecursionError) as error:

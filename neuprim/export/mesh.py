@@ -122,7 +122,10 @@ def _write_mesh(job: ExportJob) -> ExportReport:
 
 
 def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Sample the model's extinction on a grid with an empty border; return the grid and (4, 4) scene_from_index."""
+    """Return the model's extinction on a grid with an empty border, and the (4, 4) matrix scene_from_index.
+
+    Without the border, the longest side of the grid has ``count`` voxels.
+    """
     low, high = (v.numpy() for v in find_export_box(job, [conditions]))
     step = float((high - low).max()) / count
     shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
@@ -138,9 +141,9 @@ def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int)
 def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
     """Find the extinction whose isosurface best matches the opaque regions of a grid.
 
-    The level maximises the number of matching columns of voxels, along all three axes. A column matches if both or
-    neither of two conditions hold: its largest extinction exceeds the level, and its optical depth exceeds ln 2, i.e.
-    it is more than half opaque. If no column is half opaque, half of the largest optical depth replaces ln 2.
+    Columns of voxels are compared along all three axes. The mesh covers a column if its largest extinction exceeds the
+    level. The model covers a column if its optical depth exceeds ln 2 (alpha 1/2), or half of the largest optical depth
+    if that is smaller. The result is the level at which mesh and model agree on the most columns.
 
     Args:
         sigma: (X, Y, Z) extinction, 1/scene unit.
@@ -160,7 +163,7 @@ def find_export_surface_level(sigma: np.ndarray, step: float) -> float:
 
 
 def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
-    """Drop components below ``keep`` times the largest one's area; return the mesh and the number dropped."""
+    """Drop components whose area is below ``keep`` times the largest; return the mesh and the number dropped."""
     import trimesh
 
     if keep <= 0:
@@ -178,7 +181,7 @@ def _drop_small_pieces(mesh: Any, keep: float) -> tuple[Any, int]:
 def _exported_vertex_colours(
     job: ExportJob, conditions: Conditions, colours: ExportHarmonics, points: np.ndarray, normals: np.ndarray
 ) -> np.ndarray:
-    """Return (V, C) colours at mesh vertices: the density-weighted mean of primitives there, or else the nearest."""
+    """Return (V, C) vertex colours: the density-weighted mean of the primitives at a vertex, else the nearest one's."""
     with torch.no_grad():
         active = job.run.model.active(conditions)
         moved = active.geometry
@@ -231,7 +234,7 @@ def _save_mesh(mesh: Any, colours: Tensor, space: str, path: Path, up: str, worl
 
 
 def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
-    """Export the mesh translated by ``offset`` (3,) float64, without the rounding of large float32 coordinates."""
+    """Return the file content of a mesh moved by ``offset`` (3,), without rounding large coordinates to float32."""
     import trimesh
 
     if suffix == ".glb":
@@ -256,7 +259,7 @@ def _export_far_mesh(mesh: Any, suffix: str, offset: np.ndarray) -> Any:
 
 
 def _compare_exported_silhouettes(job: ExportJob, conditions: Conditions, mesh: Any) -> float:
-    """Return the intersection over union of the mesh's and the model's silhouettes, pooled over an orbit."""
+    """Return the intersection over union of the mesh's and the model's silhouettes, over all images of an orbit."""
     views, _ = choose_export_views(job, "orbit", conditions)
     both = either = 0
     for i, view in enumerate(views):

@@ -61,10 +61,10 @@ class ExportHarmonics:
 
 
 def find_export_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, int, int]:
-    """Return the indices of a model's red, green and blue channels; the single channel of a grey model three times.
+    """Return the indices of a model's red, green and blue channels; three equal indices for a grey model.
 
     Raises:
-        ConfigError: the model has no such channels; ``hint`` is inserted into the message.
+        ConfigError: the model is neither coloured nor grey; ``hint`` is inserted into the message.
     """
     channels = run.channels
     if channels.rgb is None:
@@ -78,7 +78,7 @@ def fit_export_harmonics(run: TrainedModel, conditions: Conditions) -> ExportHar
     """Return a model's colours under some conditions as spherical harmonics.
 
     The result is exact if the colour field consists of spherical harmonics. Otherwise, degree 3 is fitted by least
-    squares to the colours at the primitives' centres, seen from 64 directions far away.
+    squares to the colours at the primitives' centres, seen from far away in 64 directions.
 
     Raises:
         ConfigError: the colour field does not give one colour per primitive.
@@ -124,8 +124,8 @@ def choose_export_views(job: ExportJob, which: str, conditions: Conditions) -> t
     """Choose at most eight views to compare an export with its model; return the views and their description.
 
     Args:
-        which: "test" cameras of the scene, an "orbit" of the model, or "auto": test cameras for models without
-            conditions, whose scenes load quickly.
+        which: "test" for cameras of the scene, "orbit" around the model, or "auto". "auto" takes test cameras if the
+            model has no conditions (such scenes load quickly) and the scene can be read, else an orbit.
     """
     if which == "test" or (which == "auto" and not job.run.task.conditions):
         try:

@@ -56,7 +56,7 @@ _MOST_VOXELS = 2**34
 
 @dataclass(frozen=True)
 class _GridFrame:
-    """A frame to write: the number in its file's name, its conditions, and its index in the source's files, if any."""
+    """A frame to write: number in the file's name, conditions, and index among the source's files or None."""
 
     number: int
     conditions: Conditions
@@ -115,7 +115,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
 
 
 def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) -> Primitives:
-    """Return the model to export; if flames absorb, too, only the component of the source's extinction grid.
+    """Return the model to export. If flames add to sigma, it has only the part of the source's extinction grid.
 
     Raises:
         ConfigError: the model has not learned this component.
@@ -133,7 +133,7 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
 
 
 def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> VdbGrid:
-    """Clamp a grid to the largest value and to the box of a source frame.
+    """Limit a grid to the largest value and to the box of a source frame, ``extent``.
 
     A value of 1 in the source corresponds to ``per_unit`` in the grid.
     """
@@ -154,7 +154,7 @@ def _clamp_exported_grid(grid: VdbGrid, extent: GridExtent, per_unit: float) -> 
 def _find_export_source(
     job: ExportJob,
 ) -> tuple[DensityGridSource | None, DensityGridPlacement | None, list[str]]:
-    """Return the source's .vdb files, how the scene maps to their world, each None if unknown, and notes."""
+    """Return the source's .vdb files or None, their placement in the world or None, and messages for the user."""
     notes: list[str] = []
     source = None
     try:
@@ -173,7 +173,7 @@ def _find_export_source(
 
 
 def _list_export_frames(job: ExportJob, placement: DensityGridPlacement | None) -> list[_GridFrame]:
-    """List the frames to write: those that the user names, or else all of the run; one without conditions."""
+    """List the frames to write: those that the user names, else all of the source. A static model has one."""
     if not job.run.task.conditions:
         return [_GridFrame(0, {})]
     if job.conditions or placement is None:
@@ -229,7 +229,7 @@ def _export_voxel_transform(
 
 
 class _VdbExportSampler(NamedTuple):
-    """Sample a model's extinction times ``factor`` on voxels; values below ``threshold`` become background."""
+    """Sampler of extinction on voxels. It multiplies by ``factor``; results below ``threshold`` become background."""
 
     job: ExportJob
     model: Primitives
@@ -273,7 +273,7 @@ class _VdbExportSampler(NamedTuple):
     def _sample_blocks(
         self, conditions: Conditions, scene_from_index: np.ndarray, first: np.ndarray, size: np.ndarray
     ) -> Iterator[VdbGrid]:
-        """Yield sparse grids of blocks of bounded memory, whose first two sides are multiples of 8 voxels."""
+        """Yield one sparse grid per block. Memory limits the blocks; their x and y sides are multiples of 8 voxels."""
         settings = self.job.run.settings
         rows = max(8, min(int(size[1]), _SLAB_BYTES // (32 * int(size[2])) & ~7))
         planes = max(8, min(int(size[0]), _SLAB_BYTES // (4 * rows * int(size[2])) & ~7))

@@ -34,12 +34,12 @@ class InspectionFrame:
 
     Attributes:
         scene_from_index: (4, 4) transform from grid index to scene; the axes are parallel to the scene's.
-        top: largest extinction shown, 1/scene unit; the same for all frames.
+        top: upper end of the colour scale of the extinction, 1/scene unit; the same for all frames.
         gain: factor on the opacity of :class:`~neuprim.inspect.layers.Volume`; the same for all frames.
         focus: (3,) centre of the extinction of all frames, scene units.
-        levels: extinctions of isosurfaces, 1/scene unit; empty for a tenth, a third and two thirds of ``top``.
-        primitive: row of the primitive to show alone; None for the one that absorbs most.
-        truth: computes (X, Y, Z) float32 ground truth on the grid; None if there is none.
+        levels: extinctions of isosurfaces, 1/scene unit; by default a tenth, a third and two thirds of ``top``.
+        primitive: index of the primitive to show alone; None for the primitive that absorbs most.
+        truth: function that returns the ground truth on the grid, (X, Y, Z) float32; None without ground truth.
         numbers: errors of the model against the ground truth.
         side: "model", or "truth" for a panel that shows the ground truth instead.
     """
@@ -88,7 +88,7 @@ class InspectionFrame:
 
     @property
     def sigma(self) -> np.ndarray:
-        """Extinction of the model, each primitive clamped at 0, or of the truth on side "truth"; (X, Y, Z) float32."""
+        """Extinction, (X, Y, Z) float32: of the model, primitives clamped at 0, or, on side "truth", of the truth."""
         if self.side not in self._grids:
             if self.side == "model":
                 grid = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
@@ -112,7 +112,7 @@ class InspectionFrame:
 
     @cached_property
     def rows(self) -> np.ndarray:
-        """Rows of the active primitives in the model, (M,) int64, in the order of :attr:`geometry`."""
+        """Indices of the active primitives in the model, (M,) int64, in the order of :attr:`geometry`."""
         return np.arange(self.model.count) if self.active.rows is None else self.active.rows.numpy()
 
     @property
@@ -154,7 +154,7 @@ class InspectionFrame:
 
 
 def measure_absorption(active: ActivePrimitives) -> np.ndarray:
-    """Return (M,) float64: for each primitive, the mean of max(0, sigma) at 33 points inside, times the volume."""
+    """Estimate the integral of max(0, sigma) of each primitive: mean at 33 points times volume; (M,) float64."""
     i = torch.arange(33)
     radius, height, angle = ((i + 0.5) / 33) ** (1 / 3), 1 - 2 * ((i * 0.618034 * 7 + 0.5) % 1), i * 2.399963
     ring = (1 - height**2).clamp_min(0).sqrt()
@@ -219,7 +219,7 @@ def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
 
 
 def find_inspection_box(model: Primitives, frames: Sequence[Conditions]) -> np.ndarray:
-    """Return a (2, 3) float64 box that contains nearly all of the model's extinction in the given frames.
+    """Return a (2, 3) float64 box with nearly all of the model's extinction, measured in up to nine of ``frames``.
 
     Raises:
         DataError: the model absorbs nothing.
@@ -272,7 +272,8 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
 def pair_inspected_frames(frames: Sequence[Conditions], truth: DensityTruth) -> list[tuple[Conditions, int]]:
     """Pair each frame with the nearest frame of the ground truth.
 
-    Return one pair (conditions, truth frame) per frame of the ground truth, with the conditions of that frame.
+    Return pairs (conditions, index of the ground-truth frame) without duplicates. The conditions of a pair are those
+    of its ground-truth frame.
     """
     pairs: dict[int, Conditions] = {}
     for conditions in frames:

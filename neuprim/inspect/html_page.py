@@ -49,11 +49,12 @@ def write_inspection_page(
     frame: Callable[[int], InspectionFrame],
     inspectors: Sequence[Inspector],
 ) -> None:
-    """Write an HTML page of ``count`` frames on one grid. It opens with the first inspector; built-in ones are added.
+    """Write an HTML page of ``count`` frames. It opens with the first of ``inspectors`` and also has built-in ones.
 
     Args:
         name: name of the run.
         up: the scene's upward axis, "x", "y" or "z".
+        frame: function that returns the frame with a given index; all frames have the same grid.
 
     Raises:
         ConfigError: one page cannot hold so many frames.
@@ -109,11 +110,11 @@ def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarra
     """Encode values as uint8; return the bytes and the code's name. "root" and "signed" resolve values near 0 best.
 
     ========  ==========================  ==================================================
-    code      scales                      byte
+    code      scale                       byte
     ========  ==========================  ==================================================
-    root      that begin at 0             255 sqrt(v / high)
-    signed    with 0 between their ends   128 + 127 sign(v) sqrt(|v| / reach), so that 0 is 0
-    linear    others                      255 (v - low) / (high - low)
+    root      begins at 0                 255 sqrt(v / high)
+    signed    has 0 between its ends      128 + 127 sign(v) sqrt(|v| / reach), so that 0 is 0
+    linear    any other                   255 (v - low) / (high - low)
     ========  ==========================  ==================================================
 
     ``reach`` is the larger of |low| and |high|.
@@ -130,7 +131,7 @@ def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarra
 
 
 class InspectionFrameArrays:
-    """Compressed arrays of one frame, in the order in which its layers refer to them."""
+    """Compressed arrays of one frame. Its layers refer to an array by its index in :attr:`arrays`."""
 
     def __init__(self) -> None:
         self.arrays: list[str] = []

@@ -141,7 +141,7 @@ def unit_sphere(subdivisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def make_inspection_ball(rings: int = 48) -> tuple[np.ndarray, np.ndarray]:
-    """Make a mesh of the unit ball without its quarter x > 0 > y: (P, 3) float64 points, (F, 3) int64 triangles.
+    """Make a mesh of the unit ball without the quarter x > 0, y < 0: (P, 3) float64 points, (F, 3) int64 triangles.
 
     The sphere and the two planes of the cut share no points, so that smooth shading preserves their edges.
     """

@@ -34,7 +34,7 @@ _PANEL = (720, 640)
 
 
 def list_inspection_panels(inspectors: Sequence[Inspector], with_truth: bool) -> list[Panel]:
-    """List (inspector, side) of each panel. Inspectors of the extinction get a second panel for the ground truth."""
+    """List the panels as (inspector, side). Inspectors of the extinction get a second panel for the ground truth."""
     return [
         (i, side)
         for i in inspectors
@@ -97,12 +97,12 @@ class Window:
         self._cameras_placed = True
 
     def picture(self) -> np.ndarray:
-        """Return the window's last picture, (H, W, 3) uint8."""
+        """Return what the window shows, (H, W, 3) uint8."""
         self.plotter.render()
         return np.asarray(self.plotter.screenshot(return_img=True))[..., :3]
 
     def interact(self, count: int, frame: Callable[[int], InspectionFrame]) -> None:
-        """Show the window until the user closes it, with a slider for more than one frame."""
+        """Show the window until the user closes it. If there are several frames, a slider selects the frame."""
         if count > 1:
             self.add_slider(count, frame)
         self.draw(frame(0))
@@ -271,7 +271,7 @@ def has_display() -> bool:
 
 @cache
 def prepare_headless() -> None:
-    """Check that VTK can draw off screen. A subprocess does the test, because a missing library would crash it.
+    """Check that VTK can draw off screen. The check is a subprocess, because a missing library crashes the process.
 
     Raises:
         BackendUnavailable: VTK cannot draw; the message names the packages to install.

@@ -51,7 +51,7 @@ class ChartPoints:
     Attributes:
         joined: connect the points by a line; markers are only drawn if there are few points.
         band: draw many points as a line of their median with a band of their range.
-        spread: half-lengths of horizontal error bars; empty for none.
+        spread: half-lengths of horizontal error bars; no bars if empty.
         labels: texts below the points.
         name: text in the chart's legend.
     """
@@ -82,7 +82,7 @@ class Chart:
         title: text for screen readers, and the heading above a PNG.
         ring: (x, y) of a point that is highlighted by a ring.
         log_x, log_y: whether the axis is logarithmic.
-        least: smallest range of the y axis.
+        least: lower limit on the length of the y axis, in its unit.
     """
 
     title: str

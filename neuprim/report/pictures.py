@@ -48,7 +48,7 @@ def error_map(rendered: Tensor, truth: Tensor, scale: float = ERROR_SCALE) -> ND
 
 
 def color_bar(stops: int = 13) -> str:
-    """Return a CSS gradient of the error map's colours, from zero error on the left to the largest on the right."""
+    """Return a CSS gradient with ``stops`` colours of the error map, from zero error on the left to the largest."""
     rows = _error_map_colors()[np.linspace(0, 255, stops).round().astype(np.intp)]
     return "linear-gradient(to right, " + ", ".join("#{:02x}{:02x}{:02x}".format(*row) for row in rows.tolist()) + ")"
 
@@ -147,8 +147,7 @@ class WorstRegions:
         del self._found[MAX_REGIONS:]
 
     def write(self, folder: Path) -> list[tuple[Region, Path]]:
-        """Write ``worst_000.png`` and so on (truth, render and error side by side), worst first; return regions and
-        paths."""
+        """Write ``worst_000.png``, ... (truth, render, error side by side), worst first. Return regions and paths."""
         written = []
         for place, (region, picture) in enumerate(self._found):
             path = folder / f"worst_{place:03d}.png"

@@ -34,7 +34,7 @@ def render_page(title: str, sections: Iterable[str], kind: str = "", policy: str
         title: title of the browser's tab.
         sections: HTML of the sections, in order; empty sections leave no gap.
         kind: CSS class of the page's body; ``compared`` for pages that compare runs.
-        policy: sources appended to the content policy.
+        policy: text to append to the page's content security policy.
         script: HTML of a script, which ``policy`` must allow.
     """
     template = Template(files("neuprim.report").joinpath("page.html").read_text(encoding="utf-8"))

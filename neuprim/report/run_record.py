@@ -53,7 +53,7 @@ class ReportedRun:
         return [e for e in entries if isinstance(e, Mapping)] if isinstance(entries, list) else []
 
     def numbers_of(self, view: ViewFiles) -> Mapping[str, Any]:
-        """Return the metrics of a view that has pictures; empty if there are none."""
+        """Return the metrics of a view; empty if ``metrics.json`` does not contain the view."""
         entries = self.view_numbers
         return entries[view.index] if view.index < len(entries) else {}
 

@@ -87,7 +87,10 @@ class _TradeoffPage:
         return elements.masthead(eyebrow, title, badge, more)
 
     def fronts(self) -> list[Chart]:
-        """Return charts of PSNR against time and bytes. For a finished run the latter only has smaller models."""
+        """Return two charts: PSNR against time, and PSNR against bytes.
+
+        For a finished run, the second chart has the run's model and smaller ones only.
+        """
         bytes_of = [float(point["bytes"]) for point in self.points]
         sized = [i for i, size in enumerate(bytes_of) if self.trained or i == 0 or size < bytes_of[0]]
         dots = [Dot(bytes_of[i], self.quality(i), 0.0, self._mark("size", i), i == 0) for i in sized]

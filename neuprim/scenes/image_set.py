@@ -78,7 +78,7 @@ def average_scene_rays(values: NDArray[np.float32], size: int, samples: int) -> 
 
 
 def draw_in_parallel(work: Callable[[T], object], jobs: Sequence[T], progress: Callable[[float], None]) -> None:
-    """Call ``work`` for every job in threads; ``progress`` gets the fraction done. An error cancels waiting jobs."""
+    """Call ``work`` with each of ``jobs`` in threads; ``progress`` gets the fraction done. Errors cancel the rest."""
     pool = ThreadPoolExecutor(min(_MAX_THREADS, os.cpu_count() or 1))
     try:
         for done, _ in enumerate(pool.map(work, jobs), start=1):
@@ -94,7 +94,7 @@ def scene_drawing_text(name: str, scene: Scene, width: int, height: int) -> str:
 
 
 def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path], None], what: str) -> Path:
-    """Create the folder ``final`` with ``write``, unless all ``files`` exist in it. It appears only when complete."""
+    """Create the folder ``final`` unless it has all ``files``. It appears only after ``write`` has written them."""
     names = tuple(files)
     try:
         publish_folder(final, write, lambda folder: all((folder / name).is_file() for name in names))
@@ -105,7 +105,7 @@ def write_scene_folder(final: Path, files: Iterable[str], write: Callable[[Path]
 
 @dataclass(frozen=True)
 class SceneImageSet(Generic[V]):
-    """Images of a generated scene, in ``transforms_SPLIT.json`` and ``SPLIT/...``; ``V`` is the type of a view."""
+    """Image set of a generated scene: ``transforms_SPLIT.json`` and ``SPLIT/...``. ``V`` is the type of a view."""
 
     name: str
     key: str  # hash of everything the files depend on

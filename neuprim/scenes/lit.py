@@ -70,7 +70,7 @@ _LIT, _CAST, _ATTACHED, _HIGHLIGHT = map(PIXEL_CLASSES.index, ("lit", "cast_shad
 
 @dataclass(frozen=True)
 class LitSettings:
-    """Settings of the images of ``scene=lit_solids``: size in pixels, images per split, rays per pixel side."""
+    """Settings of the images of ``scene=lit_solids``: size in pixels, images per split, n for n x n rays per pixel."""
 
     size: ImageSize = 256
     train_views: Annotated[int, Range(1, 100000)] = 500
@@ -151,9 +151,9 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
     """Return the views of ``lit_solids`` by split: "train", "test", "circle".
 
     Cameras look at the origin from a distance of 4 to 5 scene units, at most 75 degrees from the zenith. Lights have
-    the same distances, at most 60 degrees from the zenith. Directions are uniform on the spherical cap, distances on
-    the range. The test split has three :data:`PARTS` of equal size. "circle" is a video from one new camera, with a
-    light that goes around the solids once.
+    a distance of 4 to 5, too, at most 60 degrees from the zenith. Directions are uniform on the spherical cap, and
+    distances are uniform. The test split has three :data:`PARTS` of equal size. "circle" is a video from one new
+    camera, with a light that goes around the solids once.
     """
     digits = max(4, len(str(train_views)))
     cameras, lights = _draw_lit_positions(1, train_views)
@@ -181,7 +181,7 @@ def place_cameras_and_lights(train_views: int, test_views: int) -> dict[str, lis
 
 
 def _draw_lit_positions(key: int, count: int) -> tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]]:
-    """Draw positions of ``count`` cameras and lights. A larger ``count`` only appends to the list."""
+    """Draw positions of ``count`` cameras and ``count`` lights. A larger ``count`` does not change the first ones."""
     numbers = np.random.default_rng([20241208, key]).random((count, 6))
     return [_position_above_lit_solids(n[:3], _CAMERA_POLAR) for n in numbers], [
         _position_above_lit_solids(n[3:], _LIGHT_POLAR) for n in numbers
@@ -198,7 +198,7 @@ def _position_above_lit_solids(numbers: NDArray[np.float64], polar: float) -> ND
 
 
 def build_lit_solids() -> list[Solid]:
-    """Build ``lit_solids``: the solids without plate, a bright slab to show shadows, a dark ring to show highlights."""
+    """Build ``lit_solids``: solids without the plate, a bright slab that shows shadows, a dark ring with highlights."""
     thick, edge, major, minor = 0.1, 0.012, 0.235, 0.1
     profile = [(0.0, 1.0 - edge), (edge, 1.0), (thick - edge, 1.0), (thick, 1.0 - edge)]
     slab = lathe([0, 0, FLOOR - thick], [0, 0, 1], profile, sections=256)
@@ -243,9 +243,9 @@ def shade_point_light(
 ) -> ShadedRays:
     """Cast N rays and shade them under one point light at ``light`` (3,).
 
-    Radiance is (albedo / pi + highlight) cosine intensity / distance^2, or 0 in shadow. Class "highlight": the
-    highlight is brighter than the diffuse part and than :data:`_BRIGHT`. Attached shadow: the surface faces away from
-    the light. Cast shadow: another surface occludes the light.
+    Radiance is (albedo / pi + highlight) * cos(incidence) * intensity / distance^2, or 0 in shadow. Pixel classes:
+    "highlight" if the highlight is brighter than the diffuse part and than :data:`_BRIGHT`, "attached_shadow" if the
+    surface faces away from the light, "cast_shadow" if another surface occludes the light.
     """
     d = np.asarray(directions, dtype=np.float32)
     hits = scene.intersect(origins, d)

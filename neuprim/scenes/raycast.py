@@ -24,7 +24,7 @@ _DEPTH = 64  # size of the traversal's stack; median splits of 2^31 triangles ne
 
 @dataclass(frozen=True)
 class Hits:
-    """Surface hits of N rays. ``hit`` has one row per ray; all other arrays have one row per hit, M, in ray order."""
+    """Surface hits of N rays. ``hit`` has one row per ray. The other arrays have M rows, one per hit, in ray order."""
 
     hit: NDArray[np.bool_]  # (N,) bool
     position: NDArray[np.float32]  # (M, 3) float32, scene units
@@ -90,7 +90,7 @@ class Scene:
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
         """Return (N,) bool: whether a surface lies on the segment from each point along its direction.
 
-        ``distance`` is the segment's end, in lengths of the direction. Points must lie off a surface, see
+        The segment ends at ``distance``, in lengths of the direction. Points must not lie on a surface: use
         :meth:`Hits.lifted`.
         """
         o, d = _broadcast_raycast_rays(points, directions)
@@ -199,7 +199,7 @@ def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-u
 
 @numba.njit(nogil=True, error_model="numpy")
 def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
-    """Intersect a ray with a triangle (3, 3); return barycentric u, v and distance, -1 without a hit."""
+    """Intersect a ray with a triangle (3, 3); return barycentric u, v and the distance. Without a hit, it is -1."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx

@@ -188,7 +188,7 @@ class RoomLens:
         return local @ pose[:3, :3].T
 
     def _undistort(self, pixels: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Invert :meth:`pixels` by fixed-point iteration, as the lens displaces little."""
+        """Invert :meth:`pixels` by fixed-point iteration, which converges because the distortion is small."""
         middle = [self.camera.cx, self.camera.cy]
         bent = (pixels - middle) / self.focal
         points = bent.copy()
@@ -200,7 +200,7 @@ class RoomLens:
         return points
 
     def ray_bands(self, pose: NDArray[np.float64], samples: int) -> Iterator[NDArray[np.float64]]:
-        """Yield (N, 3) unit ray directions for bands of pixel rows, with ``samples`` rays per pixel side."""
+        """Yield (N, 3) unit ray directions for bands of pixel rows, ``samples`` x ``samples`` rays per pixel."""
         across = (np.arange(self.width * samples) + 0.5) / samples
         down = (np.arange(self.height * samples) + 0.5) / samples
         rows = max(1, RAYS_AT_ONCE // (len(across) * samples)) * samples
@@ -227,7 +227,7 @@ def photograph_room(
 
 
 def room_walk_positions(train: int, test: int) -> dict[str, NDArray[np.float64]]:
-    """Return the views' positions on the walk, 0..1, by split. Test views are evenly spaced, training views between."""
+    """Return the views' positions on the walk, 0..1, by split. Training views lie between evenly spaced test views."""
     held_out = (np.arange(test) + 0.5) / test
     gap = np.arange(train) * test // train
     first = np.searchsorted(gap, gap)
@@ -266,7 +266,7 @@ def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
 class ReconstructedPoints(NamedTuple):
     """N points of a simulated reconstruction."""
 
-    # surface, position: (N, 3) float64 where they really are, and where they are said to be
+    # surface, position: (N, 3) float64 true positions, and positions according to the reconstruction
     surface: NDArray[np.float64]
     position: NDArray[np.float64]
     # (N, 3) uint8 sRGB of the surface as its camera sees it, without the photograph's own exposure

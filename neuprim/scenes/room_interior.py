@@ -295,7 +295,7 @@ class Furnishing(NamedTuple):
 def furnish_room() -> list[Furnishing]:
     """Build all bodies of the scene ``room`` except the solids; every call returns equal bodies.
 
-    The walk needs space: a cylinder of radius 4.7 about z is free of furniture.
+    The cameras need space: a cylinder of radius 4.7 about the z axis is free of furniture.
     """
     inside = [*_wall_furnishings(), *_table_furnishings(), *_lamp_furnishings()]
     inside += [*_brick_side_furnishings(), *_plaster_side_furnishings()]

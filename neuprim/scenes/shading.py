@@ -36,7 +36,7 @@ def shading_dot(a: Array, b: Array) -> Array:
 
 
 def reflectance_lobes(hits: Hits, to_eye: ArrayLike, to_light: ArrayLike) -> tuple[Array, Array]:
-    """Return, per hit, the cosine to the light, clamped at 0, and pi times the highlight's reflectance.
+    """Return, per hit, the cosine of normal and light, at least 0, and pi times the highlight's reflectance.
 
     Directions are unit vectors.
     """

@@ -46,7 +46,7 @@ _GOLDEN_ANGLE = math.pi * (3 - math.sqrt(5))
 
 @dataclass(frozen=True)
 class SolidsSettings:
-    """Settings of ``scene=solids``: image size in pixels, images per split, and rays per pixel side."""
+    """Settings of ``scene=solids``: image size in pixels, images per split, and n for n x n rays per pixel."""
 
     size: ImageSize = 512
     train_views: Annotated[int, Range(1, 10000)] = 80
@@ -81,7 +81,7 @@ def describe_solids_images(
     seen: Radiance = scene_daylight_radiance,
     facts: Callable[[Any], Mapping[str, Any]] = lambda scene: {},
 ) -> SceneImageSet[_SolidsView]:
-    """Describe an image set of the scene that ``build`` returns, from the cameras of ``scene=solids``."""
+    """Describe images of the scene from ``build``, with the cameras of ``scene=solids``; ``seen`` shades the rays."""
 
     def views(split: str, count: int) -> list[_SolidsView]:
         return [_SolidsView(f"r_{i}", pose) for i, pose in enumerate(solids_camera_poses(split, count))]

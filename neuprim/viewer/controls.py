@@ -320,7 +320,7 @@ class PrimitiveControls:
 
 
 class SessionManager:
-    """Create a session for each opened page and drop it when the page closes; ``sessions`` has the open ones."""
+    """Create a session for each opened page and drop it when the page closes. ``sessions``: page id -> session."""
 
     def __init__(
         self,

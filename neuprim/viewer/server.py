@@ -53,7 +53,7 @@ _POLICY = (
 
 
 class TokenAuth:
-    """Check of the requests to one viser server, by a secret token.
+    """Check of every request to a viser server: secret token, host name and origin.
 
     Attributes:
         token: random text of 43 characters.
@@ -75,7 +75,7 @@ class TokenAuth:
     def guard_server(
         self, check_message: Callable[[Any], str | None], on_refusal: Callable[[Any, str], None]
     ) -> Iterator[None]:
-        """Context manager: add the checks to every viser server started inside; then read :attr:`installed`.
+        """Context manager: add the checks to a viser server that starts inside; then :attr:`installed` is True.
 
         viser passes its own request hook to ``websockets.asyncio.server.serve`` and offers no way to add another hook.
         Therefore ``serve`` is replaced while viser starts. A proxy would leave viser's own port open to every page.
@@ -115,7 +115,7 @@ class TokenAuth:
         return check
 
     def refuse_request(self, path: str, headers: Any) -> str | None:
-        """Return why a request (path with query, websockets ``Headers``) is refused; None if it is allowed."""
+        """Return why a request is refused; None if it is allowed. ``headers``: ``Headers`` of websockets."""
         hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
         if len(hosts) != 1 or not _HOST.fullmatch(hosts[0]):
             return "no host, or several"
@@ -133,7 +133,7 @@ class TokenAuth:
     def _is_own_name(self, host: str) -> bool:
         """Return whether ``host`` is a name of this server.
 
-        A server that listens on all addresses accepts any IP address as its name, because DNS rebinding needs a name.
+        A server that listens on all addresses accepts any IP address: DNS rebinding attacks need a host name.
         """
         name = re.sub(r":\d+$", "", host).lower()
         return name in self._hosts or (_is_unspecified_viewer_host(self._hosts[-1]) and _parse_ip(name) is not None)
@@ -169,7 +169,7 @@ _Name = Annotated[str, Meta(max_length=1024)]
 
 
 class _Message(msgspec.Struct, tag_field="type", forbid_unknown_fields=True):
-    """Base class of the messages that the page needs. viser has more, e.g. uploads, commands, shared pages."""
+    """Base class of the messages that the page needs. Others are refused, e.g. uploads, commands, shared pages."""
 
 
 class ViewerCameraMessage(_Message):
@@ -357,7 +357,7 @@ class ViewerServer:
 
 
 def _free_viewer_port(host: str, port: int) -> int:
-    """Return ``port`` if it is free, or any free port for 0."""
+    """Return ``port``, or any free port if it is 0; ConfigError if ``port`` is in use."""
     try:
         found = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE)
         family, kind, number, _, address = found[0]

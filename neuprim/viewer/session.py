@@ -40,9 +40,10 @@ class _Job(NamedTuple):
 
 
 class RenderQueue:
-    """Queue of render jobs. A new job replaces a waiting job with the same key, so a moving camera causes no backlog.
+    """Queue of jobs: functions that use the model, e.g. to render an image.
 
-    All methods are thread-safe. Only one thread may use the model; it calls :meth:`work` to run the jobs.
+    A new job replaces a waiting job with the same key, so a moving camera causes no backlog. All methods are
+    thread-safe. Only one thread may use the model; it calls :meth:`work` to run the jobs.
     """
 
     def __init__(self) -> None:
@@ -60,11 +61,11 @@ class RenderQueue:
         """Add a job to the queue.
 
         Args:
-            key: (client, kind of work).
-            run: the job.
+            key: (page id, kind of work).
+            run: function that does the work.
             on_error: called with the exception that ends the job.
-            delay: least number of seconds before the job runs.
-            replace: False: if a job with the same key waits, keep that job and drop the new one.
+            delay: seconds to wait before the job may run.
+            replace: whether to replace a waiting job with the same key. If not, the new job is dropped.
         """
         with self._changed:
             if replace or key not in self._jobs:
@@ -72,7 +73,7 @@ class RenderQueue:
                 self._changed.notify_all()
 
     def drop_client(self, client: Hashable) -> None:
-        """Remove all waiting jobs of a client."""
+        """Remove all waiting jobs of a page."""
         with self._changed:
             self._jobs = {key: job for key, job in self._jobs.items() if key[0] != client}
 
@@ -107,7 +108,7 @@ class RenderQueue:
 
 
 def next_resolution(resolution: float, seconds: float) -> float:
-    """Return the resolution factor of the next image during motion, from factor and time of the last image."""
+    """Return the resolution factor of the next image during motion, from factor and render time of the last image."""
     if seconds > _SMOOTH_SECONDS:
         return max(resolution / 2, _MIN_RESOLUTION)
     return min(resolution * 2, 1.0) if seconds < _SMOOTH_SECONDS / 4 else resolution
@@ -161,10 +162,10 @@ class Session:
 
     Attributes:
         client: a ``viser.ClientHandle``.
-        training: whether a training changes the model.
+        training: whether the model is being trained.
         closed: whether the page was closed.
         quantity: one of :func:`~neuprim.viewer.viewer_scene.list_viewer_quantities`.
-        conditions: every condition of the task.
+        conditions: name -> value, for every condition of the task.
         settings: render settings of the image.
         longest: pixels on the longer side of the image at full resolution.
         on_full_image: called after every full-resolution image, on the thread that may use the model.
@@ -222,7 +223,7 @@ class Session:
             camera.fov = pose.fov
 
     def viewpoint(self, resolution: float = 1.0) -> Viewpoint:
-        """Return the page's current viewpoint, at a fraction of its resolution."""
+        """Return the page's current viewpoint; ``resolution`` is a factor on the size of the image."""
         camera = self.client.camera
         pose = ViewerPose(camera.wxyz.copy(), camera.position.copy(), float(camera.fov))
         size = fit_viewer_size((camera.image_width or 1, camera.image_height or 1), self.longest)
@@ -240,7 +241,7 @@ class Session:
         self.redraw()
 
     def submit(self, kind: str, run: Callable[[], None], delay: float = 0.0, replace: bool = True) -> None:
-        """Queue a job for the thread that may use the model. Errors of the job appear in the page."""
+        """Queue ``run`` for the thread that may use the model; errors appear in the page. See :class:`RenderQueue`."""
         self.queue.submit((self.client.client_id, kind), run, self.report_error, delay, replace)
 
     def redraw(self) -> None:

@@ -76,7 +76,7 @@ class TrainingProgress:
     Attributes:
         fraction: used fraction of the budget, 0..1.
         text: what the run does now.
-        curves: finite (step, PSNR in dB) of the training views, smoothed, and of the held-out views.
+        curves: name -> points (step, finite PSNR in dB): of the training views, smoothed, and of the held-out views.
     """
 
     def __init__(self) -> None:

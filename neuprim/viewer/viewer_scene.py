@@ -54,7 +54,7 @@ class Viewpoint:
 
 
 class Picture(NamedTuple):
-    """A rendered image, (H, W, 3) uint8 sRGB; a caption for its colours, may be empty; and the render time."""
+    """A rendered image, (H, W, 3) uint8 sRGB, with a caption that explains its colours (or "") and its render time."""
 
     image: np.ndarray
     caption: str
@@ -76,7 +76,7 @@ class ViewerScene:
         settings: render settings of the run.
         background: (C,) colour behind everything.
         up: (3,) upward direction.
-        center: (3,) point that a camera turns around, scene units.
+        center: (3,) point around which dragging turns the camera, scene units.
         world: coordinates in which positions are typed and shown.
         dataset: data set with the held-out views; None if its files cannot be read.
     """

@@ -262,7 +262,7 @@ def stored_up_axis(header: Mapping[str, Any]) -> tuple[float, ...]:
 
 
 def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition]) -> dict[str, Tensor]:
-    """Return the initial conditions. If no primitive is active there, vary one condition so that most are active."""
+    """Return the initial conditions. If no primitive is active, change one condition so that most are active."""
     start = {condition.spec.name: condition.value for condition in conditions}
     if model.active(start).geometry.count:
         return start

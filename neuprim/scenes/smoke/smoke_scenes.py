@@ -115,7 +115,7 @@ class SmokeStage:
     def region(
         self, low: tuple[float, float, float], high: tuple[float, float, float]
     ) -> tuple[tuple[slice, slice, slice], Axes]:
-        """Return slices and coordinates of the cells whose centres lie in a world box, at least one per axis."""
+        """Return slices and coordinates of the cells whose centres lie in a world box, at least one cell per axis."""
         slices, axes = [], []
         for axis, (a, b) in enumerate(zip(low, high, strict=True)):
             line = self.axes[axis].reshape(-1)
@@ -131,7 +131,7 @@ class SmokeStage:
 class SmokeScene:
     """A simulated smoke scene: number of frames, seconds per frame, grids to write, and gas properties.
 
-    The module describes the grids. ``forcing`` returns sources and forces at a given time, seconds.
+    The module's docstring describes the grids. ``forcing`` returns sources and forces at a time in seconds.
     """
 
     name: str
@@ -265,7 +265,7 @@ def _force_ground_explosion(stage: SmokeStage, time: float) -> GasForcing:
 
 
 def _fade_out(time: float, end: float, length: float) -> float:
-    """Return a factor: 1, falling linearly to 0 at ``end`` over the last ``length`` seconds."""
+    """Return a factor that is 1 at first, and falls linearly to 0 in the last ``length`` seconds before ``end``."""
     return min(1.0, max(0.0, (end - time) / length))
 
 
@@ -355,7 +355,7 @@ def simulate_smoke(
 
     Args:
         name: one of :data:`SMOKE_SCENES`.
-        frames: number of frames from the start, at most :data:`MAX_TIMESTEPS`; None for the scene's number.
+        frames: number of frames, at most :data:`MAX_TIMESTEPS`; None for the default number of the scene.
         resolution: cells across the box, which is 1.5 times as high as wide.
         seed: seed of the turbulence; not negative.
 
@@ -402,7 +402,7 @@ def simulation_key(scene: SmokeScene, frames: int, resolution: int, seed: int) -
 
 
 def smoke_box(resolution: int) -> SmokeBox:
-    """Return the simulation box: one world unit wide and deep, 1.5 high, rounded up to blocks of 8 voxels."""
+    """Return the simulation box: one world unit wide and deep, and 1.5 high, rounded up to a multiple of 8 voxels."""
     return SmokeBox((resolution, resolution, -(-3 * resolution // 16) * 8), 1.0 / resolution)
 
 

@@ -120,7 +120,7 @@ def _smoke_solver_flow_at_centres(velocity: Faces) -> Tensor:
 
 
 def _smoke_solver_flow_at_faces(centred: Tensor) -> Faces:
-    """Interpolate velocity from cell centres to faces: the mean of both cells, or the single cell's value at an end."""
+    """Interpolate velocity from cell centres to faces: the mean of the cells on both sides, one at the box's ends."""
     parts = []
     for axis, field in enumerate(centred):
         first, last, count = field.narrow(axis, 0, 1), field.narrow(axis, -1, 1), field.shape[axis] - 1
@@ -144,7 +144,7 @@ class GasProperties:
         radiation: further loss of temperature per second at temperature 1, proportional to its fourth power.
         burn: fuel burnt per second, at any concentration; a flame burns for 1 / burn seconds.
         heat, soot, expansion: temperature, density and volume produced per unit of burnt fuel.
-        smoothing: 0..1, how far each step replaces face velocities by means of centre velocities.
+        smoothing: 0..1, share by which each step blends face velocities with the mean of adjacent cells' velocities.
         cfl: cells that gas may cross in one step; faster gas leads to more steps per frame.
         most_steps: maximum number of steps per frame.
     """
@@ -195,7 +195,7 @@ class GasSource(NamedTuple):
 
     Attributes:
         where: slices of the cells of the region.
-        rate: (x, y, z) per second; after a time t, the difference to the values is reduced by exp(-rate * t).
+        rate: (x, y, z) per second; in a time t, the difference from the values is multiplied by exp(-rate * t).
         density, temperature, fuel: the given values, numbers or fields over ``where``.
         colour: albedo of the smoke, three numbers.
         velocity: (3, x, y, z), world units per second.
@@ -215,7 +215,7 @@ class GasForcing(NamedTuple):
 
     Attributes:
         sources: applied in order.
-        gusts: (3, X, Y, Z) acceleration of smoke; in full where density, temperature and fuel add up to 1/2.
+        gusts: (3, X, Y, Z) acceleration, multiplied by min(1, 2 (density + temperature + fuel)).
         expansion: (X, Y, Z) volume produced per volume and second.
         fade: (X, Y, Z) per second, rate at which smoke, heat and fuel vanish near open ends.
     """
@@ -227,7 +227,7 @@ class GasForcing(NamedTuple):
 
 
 def advance_gas(state: GasState, settings: GasProperties, box: SmokeBox, forcing: GasForcing, time: float) -> GasState:
-    """Advance the gas by ``time`` seconds; its speed determines the number of equal steps, up to ``most_steps``."""
+    """Advance the gas by ``time`` seconds in equal steps. Faster gas takes more steps, up to ``most_steps``."""
     fastest = max(float(component.abs().max()) for component in state.velocity)
     count = min(max(math.ceil(fastest * time / box.cell / settings.cfl), 1), settings.most_steps)
     for _ in range(count):
@@ -361,8 +361,8 @@ _INVISIBLE = 1e-4  # values up to this are not corrected; most of a box holds no
 class _SmokeSolverStencil(NamedTuple):
     """Trilinear interpolation stencils of N points in a table (X * Y * Z, C) of cell values.
 
-    ``embedding_bag`` sums them several times faster than ``grid_sample`` in three dimensions, with the same result for
-    any number of threads.
+    With ``embedding_bag``, stencils are several times faster than ``grid_sample`` in three dimensions, and the result
+    is the same for any number of threads.
     """
 
     rows: Tensor  # (N, 8) int32, the cells around each point; the first is the lowest corner
@@ -448,7 +448,7 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
 
 
 def _advect_in_threads(work: Callable[[Job], None], jobs: Iterable[Job]) -> None:
-    """Run jobs, which write to different memory, in threads other than torch's.
+    """Call ``work`` with each of ``jobs`` in threads other than torch's. Calls must write to different memory.
 
     Torch's threads wait for each other in a busy loop after every operation. On a busy machine, the waiting takes many
     times longer than the work.

@@ -119,13 +119,13 @@ def vdb_recording_of(dataset: Dataset) -> VolumeRecording | None:
 
 
 def matter_mask(dataset: Dataset, index: int) -> Tensor | None:
-    """Return an (H, W) bool mask of pixels that matter covers in any frame of a test view's camera, or None."""
+    """Return (H, W) bool: pixels that matter covers in any frame of a test view's camera; None without volumes."""
     recording = vdb_recording_of(dataset)
     return None if recording is None else recording.matter_mask(index)
 
 
 def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
-    """Return one video clip per test camera, of all frames; empty without a volume sequence."""
+    """Return one video clip of all frames per test camera; no clips if the dataset has no volume sequence."""
     recording = vdb_recording_of(dataset)
     if recording is None:
         return ()
@@ -134,7 +134,7 @@ def held_out_clips(dataset: Dataset) -> Sequence[Clip]:
 
 
 def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str, Any]:
-    """Compare a model with its dataset's .vdb files: errors of extinction, bytes of files, invisible primitives."""
+    """Return errors of a model against its dataset's .vdb files, and facts about both; empty without such files."""
     recording = vdb_recording_of(dataset)
     if recording is None:
         return {}
@@ -200,7 +200,7 @@ _LAYERS = (
 
 
 def _import_dynamic_function(module: str, function: str) -> Callable[..., Any]:
-    """Return a wrapper of ``function`` that imports ``module`` only when called, since loaders import many others."""
+    """Return a wrapper of ``function`` that imports ``module`` only when called, since loaders import many modules."""
 
     def call(*arguments: Any) -> Any:
         return getattr(import_module(f"{__package__}.{module}"), function)(*arguments)

@@ -31,8 +31,8 @@ class TimeHarmonics(ColourField):
     """SH colour whose lowest band changes in time: c = max(0, C0 S(xi) + higher bands + 1/2).
 
     S(xi) = S0 + sum_{i=1..n} a_i xi^i + sum_{i=1..l} (b_i cos(w i xi) + c_i sin(w i xi)) has 1 + n + 2 l parameters
-    per channel. The higher bands do not change in time. Three channels with n = l = 4 (``powers``, ``waves``) have 84
-    parameters at degree 3 and 39 at degree 0. ``frequencies`` chooses w, see :data:`FREQUENCIES`.
+    per channel; n is ``powers``, l is ``waves``, and ``frequencies`` chooses w, see :data:`FREQUENCIES`. The higher
+    bands do not change in time. With n = l = 4, three channels have 84 parameters at degree 3 and 39 at degree 0.
     """
 
     def __init__(
@@ -78,7 +78,7 @@ class TimeHarmonics(ColourField):
     def reduce(
         self, params: Params, geometry: Geometry, name: str, value: int
     ) -> tuple[TimeHarmonics, dict[str, Tensor]]:
-        """Return a smaller field: a lower degree, or fewer terms in time, fitted to all terms by least squares."""
+        """Return a smaller field: a lower degree, or fewer terms in time, refitted to S(xi) by least squares."""
         field = type(self)(**{**self.settings(), name: value})
         if name == "degree":
             return field, sh.truncate_sh_bands(params, "sh_rest", value)
@@ -118,7 +118,7 @@ class TimeHarmonics(ColourField):
         return dc
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one prunable unit per SH coefficient above degree 0 and channel, and one per term in time."""
+        """Return one prunable unit per channel and SH coefficient above degree 0, and one per term in time."""
         terms = ((name, i) for name, count in self._term_counts() for i in range(count))
         units = (PrunableUnit(f"{name} {i + 1}", {name: (i,)}) for name, i in terms)
         return (*sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest"), *units)

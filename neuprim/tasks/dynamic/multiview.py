@@ -109,7 +109,7 @@ def _read_timed_frames(
 
 
 def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: str) -> _TimeRange:
-    """Return the file times that become 0 and 1. ``others`` are files of further splits, used for "auto" only.
+    """Return the times in the files that become 0 and 1. "auto" also reads ``others``, the files of further splits.
 
     Raises:
         DataError: a frame has no time, a time is not finite or out of range, or "auto" finds a single time.
@@ -168,9 +168,9 @@ class MultiviewSettings(FolderSettings):
     """Settings of the scene.
 
     Attributes:
-        train_split, test_split: names in transforms_NAME.json.
-        test_every: every n-th frame by name is held out where there is one transforms.json.
-        time_range: "LOW:HIGH" of the files' times, mapped to 0..1, or "auto": the lowest and highest time there are.
+        train_split, test_split: NAME of the split's file transforms_NAME.json.
+        test_every: n; of a single transforms.json, every n-th image in the order of names is held out.
+        time_range: "LOW:HIGH", the times in the files that become 0 and 1; "auto" for the lowest and highest time.
     """
 
     train_split: SplitName = "train"
@@ -197,11 +197,11 @@ def sample_moving_points(views: ViewSet, count: int, generator: torch.Generator)
     Positions are in scene units, colours in the images' colour space. Points lie on visual hulls. Each hull is
     computed for one moment, since a hull of all masks would carve away whatever moves. Each point has the "time" and
     the colour of its hull's moment. If several cameras share each time, a moment is one time. If every image has its
-    own time, as in D-NeRF, a moment is a run of four successive images, and runs overlap: the hull of an object that
-    moves by less than its size during a run contains its middle, and the other runs supply the rest.
+    own time, as in D-NeRF, a moment is a run of four successive images. If an object moves by less than its size during
+    a run, the hull contains the middle of the object. Runs overlap, so that other runs supply the rest.
 
-    If the cameras have no common target, points lie along rays. Without alpha, or if every image has its own time and
-    all hulls are empty, points fill a box in front of the cameras at random times.
+    If the cameras do not look at a common target, points lie along rays. Without alpha, or if every image has its own
+    time and all hulls are empty, points fill a box in front of the cameras at random times.
 
     Raises:
         ConfigError: ``count`` is not positive.
@@ -275,7 +275,7 @@ def _choose_moments(times: Tensor) -> tuple[list[tuple[list[int], float]], bool]
 
 
 def _draw_moving_point_per_cell(points: Tensor, side: float, generator: torch.Generator) -> Tensor:
-    """Return the index of one random point per cubic cell of edge ``side``; static surfaces occur in all moments."""
+    """Return indices of one random point per cubic cell of edge ``side``, as static surfaces occur in all moments."""
     shuffled = torch.randperm(len(points), generator=generator)
     cells = ((points[shuffled] - points.min(0).values) / side).floor().long().numpy()
     _, first = np.unique(cells, axis=0, return_index=True)

@@ -79,10 +79,10 @@ def validate_time_chunk_overlaps(seams: Sequence[Sequence[float]]) -> ChunkOverl
 
 
 def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Tensor:
-    """Return each primitive's weight 0..1 at time ``xi``, given the time chunk of each; float64, shape of ``chunk``.
+    """Return the weight 0..1 of each primitive at time ``xi``, by its time chunk; float64, shape of ``chunk``.
 
     Args:
-        chunk: numbers 0 to len(overlaps), any dtype; they are rounded, since compression may change them slightly.
+        chunk: each primitive's chunk, 0 to len(overlaps), any dtype; rounded, as compression may change it slightly.
     """
     numbers = chunk.detach().double().round()
     weights = torch.ones_like(numbers)
@@ -103,7 +103,7 @@ class TimeDensity(DensityField):
     * ``rate``: W_t is initialised uniformly from -rate..rate.
 
     Args:
-        seams: :data:`ChunkOverlaps` of a model joined from chunks; empty for other models.
+        seams: overlaps in time of the chunks from which a model was joined; empty for other models.
         components: names of the source grids whose share of the extinction each primitive stores.
     """
 
@@ -243,7 +243,7 @@ class TimeDensity(DensityField):
         return field, {key: value for key, value in remaining.items() if key in kept}
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return prunable units: neurons, offset, motion per axis. Windows have none: zeros would not remove them."""
+        """Return prunable units: neurons, offset, motion per axis. A window is not prunable: zeros do not remove it."""
         rates = ("W_t",) if "phase" in self.parts else ()
         units = [
             PrunableUnit(unit.name, {**unit.places, **dict.fromkeys(rates, unit.places["b1"])})
@@ -325,7 +325,7 @@ def _time_window_factor(params: Params, xi: Tensor) -> Tensor:
 
 
 def _time_weights(params: Params) -> list[tuple[Tensor, Tensor]]:
-    """Return sample times for means: pairs (time, (N, 1) weights), where each primitive's weights add up to 1."""
+    """Return pairs (time, (N, 1) weights) for means over time; the weights of a primitive add up to 1."""
     times = _sequence_mean_times(params["b1"])
     if "window_center" not in params:
         even = torch.full_like(params["b2"].double(), 1.0 / _MEAN_TIMES)

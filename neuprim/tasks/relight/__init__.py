@@ -109,7 +109,7 @@ def relight_matter_mask(dataset: Dataset, index: int) -> Tensor | None:
 def relight_metrics(
     dataset: Dataset, index: int, rendered: Tensor, truth: Tensor, structure: bool = True
 ) -> dict[str, float]:
-    """Return the metrics of a test image: :func:`relight_scores`, PSNR of its test part, errors per pixel class."""
+    """Return metrics of a test image: :func:`relight_scores`, PSNR by test part (e.g. new light), errors per class."""
     known, result = dataset_lighting(dataset), relight_scores(rendered, truth, structure)
     part = next((p for p in known.parts if dataset.test.view(index).name.startswith(p)), None)
     if part is not None:
@@ -133,7 +133,7 @@ def diagnose_lighting(dataset: Dataset, model: Primitives) -> dict[str, Any]:
 
 
 def lighting_baseline_scores(dataset: Dataset) -> dict[str, dict[str, Any]]:
-    """Return mean test scores of the baselines, which use no model, by name; without SSIM and FLIP, which are slow."""
+    """Return baseline name -> mean test scores. Baselines use no model. SSIM and FLIP are left out: they are slow."""
 
     found = {}
     for name, guess in {"black": None, **dataset_lighting(dataset).baselines}.items():
@@ -160,7 +160,7 @@ def light_facts(dataset: Dataset) -> dict[str, Any]:
 
 
 def light_orbit(dataset: Dataset, frames: int) -> list[View]:
-    """Return views of an orbiting camera; the light orbits the opposite way, at its mean distance and height."""
+    """Return views of an orbit. The light orbits the opposite way, at the training lights' mean distance and height."""
     training = [dataset.train.view(i).conditions for i in range(len(dataset.train))]
     up, center = dataset.up.double() / dataset.up.double().norm(), dataset.center.double()
     offsets = torch.stack([c["light"] for c in training]).double() - center

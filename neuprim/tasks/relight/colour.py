@@ -170,10 +170,10 @@ def prune_light_network_units(
 ) -> dict[str, Tensor]:
     """Prune a :class:`LightNetwork` to the ``keep`` hidden units per primitive that affect the colour most.
 
-    A removed unit is replaced by its mean. With x~ over the ellipsoid, d and l over all directions, the mean of
-    cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), b the
-    mean over a ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean becomes
-    part of the albedo.
+    A removed unit is replaced by its mean over x~ in the ellipsoid and over all directions d and l. The mean of
+    cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), where b
+    is the mean over a ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean
+    becomes part of the albedo.
     """
     net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
     phase, out = boost * params["net_phase"].double(), params["net_out"].double()
@@ -254,7 +254,7 @@ class LightHarmonics(ColourField):
 def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
     """Evaluate orthonormal real spherical harmonics at unit directions (N, 3): (N, (degree + 1)^2).
 
-    Bands are in order, m = -l..l. By recurrence of the associated Legendre functions without the Condon-Shortley phase:
+    Bands are in order, m = -l..l. Recurrences give the associated Legendre functions, without Condon-Shortley phase:
     P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m -
     (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are polynomials in x, y.
     """

@@ -183,7 +183,7 @@ def _olat_viewmat(record: JsonReader, ignore_corrections: bool) -> Tensor:
 
 
 def _light_intensity(source: JsonReader) -> Tensor:
-    """Return ``pl_intensity`` as (3,) float32; 1 if it is missing."""
+    """Return ``pl_intensity`` as (3,) float32; ones if it is missing."""
     expected = "3 numbers of at least 0, or one"
     if not source.has("pl_intensity"):
         return torch.ones(3)
@@ -229,7 +229,7 @@ def load_lit_solids_for_relighting(settings: Mapping[str, Any], context: SceneCo
 
 
 def _lit_solids_olat_lighting(dataset: Dataset, folder: Path) -> Lighting:
-    """Return the facts about ``lit_solids``: pixel classes, test parts, two baselines, a clip of a circling light."""
+    """Return facts about ``lit_solids``: pixel classes, test parts, two baselines, a clip with a circling light."""
     names = {"no_cast_shadows": "unshadowed.exr", f"nearest_light_of_{NEAR_LIGHTS}": "nearest.exr"}
     baselines = {name: partial(_read_lit_companion_image, ending) for name, ending in names.items()}
     views = read_olat_split(folder, "circle", OlatSettings(path=folder))

@@ -19,7 +19,7 @@ _CHUNK = 2048  # primitives per unit of work
 
 @strict
 def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
-    """Divide a vector by max(length, ``shortest``); return it, the reciprocal of the divisor, and 1.0 or 0.0.
+    """Divide a vector by max(length, ``shortest``); return the quotient, the inverse of the divisor, and 1.0 or 0.0.
 
     The last value is 1.0 if the result has unit length. The backward pass needs it: the gradient of a normalised vector
     has no component along the vector. NaN stays NaN.
@@ -33,7 +33,7 @@ def _unit(x, y, z, shortest):  # type: ignore[no-untyped-def]
 
 @strict
 def _project_gradient(g, i, unit):  # type: ignore[no-untyped-def]
-    """Convert row i of ``g`` in place: from the gradient of the output of :func:`_unit` to that of the input."""
+    """Convert row i of ``g`` in place: from the gradient of :func:`_unit`'s output to that of its input."""
     x, y, z, over, whole = unit
     along = (g[i, 0] * x + g[i, 1] * y + g[i, 2] * z) * whole
     g[i, 0], g[i, 1], g[i, 2] = (g[i, 0] - along * x) * over, (g[i, 1] - along * y) * over, (g[i, 2] - along * z) * over
@@ -85,7 +85,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
     start, stop, means, sizes, normal, albedo, highlight, log_gloss, indirect, light, eye, grad,
     g_light, g_eye, g_normal, g_albedo, g_highlight, g_log_gloss, g_indirect,
 ):  # fmt: skip
-    """Write the gradients of all inputs; g_light and g_eye (N, 3) are those of the vectors to light and camera."""
+    """Write the gradients of all inputs. g_light, g_eye: (N, 3) gradients of the vectors to light and camera."""
     lobes, numbers, channels = log_gloss.shape[1], indirect.shape[1], albedo.shape[1]
     g_l = np.empty(3)
     for i in range(start, stop):

@@ -21,7 +21,7 @@ _SHARPNESS = 2.0  # initial sharpness of a lobe: half as bright 49 degrees off i
 
 
 class SphericalHarmonics(ColourField):
-    """SH colour c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; C (degree + 1)^2 parameters.
+    """SH colour c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; (degree + 1)^2 parameters per channel.
 
     During training, one more SH band becomes active after every fraction ``sh_every`` of the training budget. A loaded
     model uses all bands.
@@ -63,7 +63,7 @@ class SphericalHarmonics(ColourField):
         return params["sh_dc"], params.get("sh_rest")
 
     def prunable_units(self) -> tuple[PrunableUnit, ...]:
-        """Return one prunable unit per SH coefficient above degree 0 and channel."""
+        """Return one prunable unit per channel and SH coefficient above degree 0."""
         return sh.prunable_sh_coefficients(self.degree, self.channels, "sh_rest")
 
     def script(self) -> str:

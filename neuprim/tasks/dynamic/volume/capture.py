@@ -71,10 +71,11 @@ class Capture:
 
     Attributes:
         frames: the .vdb files, in order.
-        cameras: training cameras, then ``held_out`` test cameras; ``samples``: rays per pixel side.
-        lights: number of lights per frame. Training cameras take turns; test cameras have other lights if several.
+        cameras: training cameras, then ``held_out`` test cameras.
+        samples: n for n x n rays per pixel.
+        lights: number of lights per frame. If several, training cameras take turns; test cameras have other lights.
         bounds: (2, 3) box around all matter, scene units.
-        ends: numbers of the frames with time 0 and 1; None: the first and the last frame.
+        ends: numbers of the frames with time 0 and 1; None for the first and the last frame.
         measured: frame number -> extent of its extinction grid; empty if unknown.
     """
 
@@ -92,7 +93,7 @@ class Capture:
 
     @property
     def components(self) -> tuple[str, ...]:
-        """The meaning of the extinction grid if flames add to sigma, as models then store its share; else empty."""
+        """The extinction grid's meaning if flames add to sigma, so that models store the grid's share; else empty."""
         return (self.reader.extinction,) if self.optics.mixes(self.reader.names) else ()
 
     @property
@@ -106,7 +107,7 @@ class Capture:
         return (frame.number - first) / max(last - first, 1)
 
     def select_frames(self, first: int, last: int) -> Capture:
-        """Return a capture of the frames ``first`` to ``last``; the times do not change."""
+        """Return a capture of only the frames numbered ``first`` to ``last``. Frames keep their times."""
         return replace(self, frames=[frame for frame in self.frames if first <= frame.number <= last], ends=self.clock)
 
     def key(self) -> str:
@@ -118,7 +119,10 @@ class Capture:
         return hashlib.sha256(json.dumps(parts, default=_encode_capture_value).encode()).hexdigest()[:16]
 
     def frame_lights(self, frame: VdbFrame) -> list[Light | None]:
-        """Return each camera's light in a frame: the optics' light for the first, constant lights for test cameras."""
+        """Return each camera's light in a frame; with :attr:`lights` = 1, all have the light of the optics.
+
+        Of several lights, the first is the light of the optics. The lights of test cameras are the same in all frames.
+        """
         if self.lights == 1:
             return [self.optics.light] * len(self.cameras)
         lights = [self.optics.light, *draw_lights(self.optics, self.lights - 1, frame.number)]
@@ -186,7 +190,7 @@ class Capture:
         """Render a frame from all cameras; write its images and points into a folder.
 
         Raises:
-            DataError: the frame's file cannot be read, or its light does not fit half floats.
+            DataError: the frame's file cannot be read, or a radiance is too large for half floats.
             OSError: a file cannot be written.
         """
         medium = self.medium(frame)
@@ -363,10 +367,10 @@ def hemisphere_capture_cameras(
 
 
 def choose_rays_per_pixel(camera: Camera, voxel: float) -> int:
-    """Return the rays per pixel side: 1 if pixels at the centre of the box are narrower than a ``voxel``, else 2.
+    """Return n for n x n rays per pixel: 1 if pixels at the centre of the box are narrower than a ``voxel``, else 2.
 
-    ``voxel`` is in scene units. For such narrow pixels, the PSNR of one ray against many is 67 to 72 dB (`smoke_fire`
-    at 160×160), measured by hand, in a third of the time of two per side.
+    ``voxel`` is in scene units. For such narrow pixels, images with one ray have a PSNR of 67 to 72 dB against many
+    rays (`smoke_fire` at 160×160), and take a third of the time of 2 x 2 rays.
     """
     return 1 if _DISTANCE / camera.fx < voxel else 2
 
@@ -380,7 +384,7 @@ def sample_extinction(
 ) -> np.ndarray:
     """Sample a medium's extinction at the points of a grid, trilinearly: (X, Y, Z) float32.
 
-    If ``part``, the result is only the contribution of the extinction grid, without flames.
+    With ``part``, the result is only the contribution of the extinction grid, without flames.
     """
     if medium.values.size == 0:
         return np.zeros(shape, np.float32)
@@ -395,8 +399,8 @@ class CaptureDensity(DensityGridSource):
     """Ground-truth density of the .vdb files of ``path``, or of the scene if ``path`` is None.
 
     Grids, optics, placement and times are those of the scene. If ``path`` is a folder, frames outside the scene's
-    times are left out. If it is a single file outside these times, it has no time. Models are compared on the voxels
-    of the frame, within the sequence's box.
+    times are left out. If ``path`` is a single file outside these times, its frame has no time. Models are compared
+    on the voxels of the frame, in a box that also contains the sequence's box.
 
     Raises:
         DataError: there is no file, or no frame within the scene's times.

@@ -39,7 +39,7 @@ T = TypeVar("T")
 
 
 class _RecentFrames(Generic[T]):
-    """LRU cache of items, read by index on first use. The oldest items are dropped beyond ``memory`` bytes."""
+    """Cache of items, read by index on first use. Beyond ``memory`` bytes, the least recently used are dropped."""
 
     def __init__(self, read: Callable[[int], T], size: Callable[[T], int], memory: float) -> None:
         self._read, self._size, self._memory = read, size, memory
@@ -66,7 +66,7 @@ class VdbFrameViews(ViewSet):
         folder: store of the images.
         exposure: radiance that is scaled to 1.
         every: use every n-th frame only; times remain relative to the whole sequence.
-        memory: bytes of decoded images in memory.
+        memory: limit on the decoded images in memory, bytes.
     """
 
     def __init__(
@@ -120,7 +120,8 @@ class VdbFrameViews(ViewSet):
 def light_conditions(capture: Capture, light: Light | None) -> dict[str, Tensor]:
     """Return the conditions "light" (position) and "light_intensity" (irradiance) of a view with a light at infinity.
 
-    The position is so far away that rays are practically parallel. The result is empty if all views have one light.
+    The position is so far away that rays are practically parallel. If all views have the same light, the result is
+    empty.
     """
     if capture.lights == 1 or light is None:
         return {}
@@ -137,7 +138,7 @@ class VolumeRecording:
         folder: store of the rendered images.
         exposure: the brightest radiance that any camera sees.
         weights: total extinction of each frame.
-        every: every n-th frame is used for training.
+        every: n, if every n-th frame is used for training.
         test: the held-out views: all frames of one camera, then of the next.
     """
 
@@ -182,7 +183,7 @@ class VolumeRecording:
         return PointCloud(torch.cat(means), torch.cat(colors), {"time": torch.cat(times)}, steps=steps)
 
     def matter_mask(self, index: int) -> Tensor:
-        """Return an (H, W) bool mask of pixels that matter covers in any frame of a test view's camera; cached."""
+        """Return (H, W) bool: pixels that matter covers in any frame of a test view's camera; cached."""
         frames = len(self.capture.frames)
         camera = index // frames
         if camera not in self._masks:
@@ -198,8 +199,8 @@ class TrainingFrames:
 
     Attributes:
         every: train on every n-th frame.
-        span: numbers of the first and last frame for training and evaluation; None: all.
-        memory: bytes of decoded images and voxels in memory.
+        span: numbers of the first and last frame for training and evaluation; None for all frames.
+        memory: limit on the decoded images and voxels in memory, bytes.
     """
 
     every: int = 1
@@ -218,7 +219,7 @@ def volume_dataset(
 ) -> Dataset:
     """Return the dataset of a rendered volume sequence.
 
-    Colours are linear radiance over the brightest value that any camera sees.
+    Colours are linear radiance, divided by the brightest value that any camera sees.
 
     Raises:
         DataError: every frame is black, or a file is damaged.
@@ -308,7 +309,7 @@ class MediumVoxels:
 
     Attributes:
         index: (V,) int64 ascending, flat indices (i Y + j) Z + k of a grid of ``shape``.
-        values: (V, C) float32: sigma, sigma times radiance (3), and the extinction grid's part if flames add to sigma.
+        values: (V, C) float32: sigma, sigma times RGB radiance and, if flames add to sigma, the extinction grid's part.
         scene_from_index: (4, 4) float64.
     """
 
@@ -377,15 +378,15 @@ class MediumVoxels:
 class FrameVoxels(PointSupervision):
     """Sampler of voxels, for training that compares the model with the extinction of the files.
 
-    Each sample is from one frame. The probability of a frame is proportional to its extinction; one draw in ten is
-    uniform over frames. 70 % of the points are voxels with matter, 20 % lie up to six voxels away from such a voxel,
-    and 10 % anywhere in a box larger than the sequence's box.
+    The points of one draw are from one frame. The probability of a frame is proportional to its extinction; in one
+    draw of ten, it is the same for all frames. 70 % of the points are voxels with matter, 20 % lie up to six voxels
+    away from such a voxel, and 10 % anywhere in a box larger than the sequence's box.
 
     Args:
         folder: store of the images. Lit voxels are stored there, too, since their light takes long to compute.
         views: training views; their frames, times and exposure are used.
-        weights: total extinction of each of these frames.
-        memory: bytes of voxels in memory.
+        weights: total extinction of each frame of ``views``.
+        memory: limit on the voxels in memory, bytes.
     """
 
     def __init__(
@@ -436,7 +437,7 @@ class FrameVoxels(PointSupervision):
         return self.folder.retry(lambda: self._read_or_make_voxels(self.frames[t]), warn_once)
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
-        """Return a frame's medium, including a single light. With several lights, the model adds scattered light."""
+        """Return a frame's medium. It includes the light, unless there are several: then the model adds their light."""
         medium = self.capture.medium(frame)
         return light_medium(medium, self.capture.frame_lights(frame)[0]) if self.capture.lights == 1 else medium
 

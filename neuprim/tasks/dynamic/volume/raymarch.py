@@ -47,12 +47,12 @@ _NEGLIGIBLE = 1e-7  # optical depth across a cell, and share of the strongest so
 class Medium:
     """Extinction and source of a medium at voxel centres, trilinear in between. A medium may have no voxels.
 
-    The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at its end.
+    The radiance along a ray is L = ∫ T(s) σ(s) c(s) ds with T(s) = exp(-∫₀ˢ σ), and alpha = 1 - T at the ray's end.
 
     Attributes:
         values: (X, Y, Z, 4) float32, C-contiguous: σ in 1/scene unit, and σ times the source radiance in linear RGB.
             The outermost voxels are zero, so that the field is continuous; :meth:`padded` adds that layer.
-        scene_from_index: (4, 4) float64, affine and invertible: the centre of voxel (i, j, k) is at it @ (i, j, k, 1).
+        scene_from_index: (4, 4) float64, affine and invertible; maps (i, j, k, 1) to the centre of voxel (i, j, k).
         scattering: (X, Y, Z) float32, the extinction grid's part of σ; None if flames do not add to σ.
         scattered: (X, Y, Z, 3) float32, the extinction grid's part of σ times the albedo; None without a light.
     """
@@ -69,7 +69,7 @@ class Medium:
         scattering: np.ndarray | None = None,
         scattered: np.ndarray | None = None,
     ) -> Medium:
-        """Build the medium of (X, Y, Z, 4) ``values`` inside one layer of empty voxels.
+        """Build the medium of (X, Y, Z, 4) ``values``, surrounded by one layer of empty voxels.
 
         Raises:
             DataError: a value is not finite.
@@ -102,9 +102,9 @@ class Medium:
 
     @cached_property
     def skips(self) -> np.ndarray:
-        """Chessboard distance of cells to the nearest non-empty one, up to 255; (X-1, Y-1, Z-1) uint8.
+        """Chessboard distance of each cell to the nearest non-empty cell, up to 255; (X-1, Y-1, Z-1) uint8.
 
-        A ray in a cell of distance d may leave the cube of 2d-1 cells around it at once.
+        A ray in a cell with distance d crosses the cube around the cell, 2d - 1 cells wide, in one step.
         """
         if self.empty:
             return np.zeros((0, 0, 0), np.uint8)
@@ -125,7 +125,7 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 
     Args:
         camera: pinhole, scene units.
-        samples: rays per pixel side, on a regular grid.
+        samples: n for n x n rays per pixel, on a regular grid.
         subdivisions: sub-intervals per cell; more than 1 only to verify the error.
     """
     if medium.empty or medium.skips.min() > 0:
@@ -142,7 +142,7 @@ def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarra
     """Return (X, Y, Z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
     The transmittance is exact up to rounding. ``direction`` points to the light, on the scene's axes, any length > 0.
-    Voxels without extinction get 1 instead of a traced ray.
+    Voxels without extinction get 1; no ray is traced from them.
     """
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
@@ -229,7 +229,7 @@ def _march_step_gains(a, b):  # type: ignore[no-untyped-def]
     """Return the weights of the sources at the two Gauss points of a step, and the step's transmittance, float32.
 
     Args:
-        a, b: optical depths of the two points' halves of the step.
+        a, b: optical depth of the first and the second half of the step, each from the extinction at one point.
     """
     depth = a + b
     if depth > _HALF:  # shortest steps in an almost opaque medium: the points one after the other, always in range
@@ -254,8 +254,8 @@ def _generate_two_march_points(context: Any, flat: Any, corner: Any, first: Any,
 
     Args:
         flat: float32 array of the interleaved voxels.
-        corner: (o, dy, dx) uint64, offsets of the cell's lowest corner and between neighbours in y and x; those in z
-            are 4 apart.
+        corner: (o, dy, dx) uint64: offset of the cell's lowest corner, and strides along y and x. The stride along z
+            is 4.
         first, second: (x, y, z) float32 fractions within the cell, of each point.
     """
     signature = types.UniTuple(types.float32, 8)(flat, corner, first, second)
@@ -309,7 +309,7 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
         values, skips: of a :class:`Medium`.
         pose: (3, 4) float64, from camera space (scene units) to indices.
         lens: (4,) float64 fx fy cx cy.
-        samples: rays per pixel side. parts: sub-intervals per cell.
+        samples: n for n x n rays per pixel. parts: sub-intervals per cell.
         image: (H, W, 4) float32, premultiplied RGBA, written.
     """
     nx, ny, nz = skips.shape
@@ -405,7 +405,7 @@ def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def
 
 @kernel
 def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-untyped-def]
-    """Write optical depths from voxels of slices start … stop in one direction to the grid's end.
+    """Write the optical depth along one direction, from each voxel of slices start … stop to the grid's border.
 
     Args:
         sigma: (X, Y, Z) float32. skips: of a :class:`Medium`.

@@ -106,7 +106,7 @@ class SequenceSurvey:
         extents: frame number -> extent of its extinction grid.
         hottest: largest value of the flame grids.
         peaks: meaning -> a value that one voxel in a thousand exceeds.
-        voxel: shortest edge of a voxel of these grids, world units.
+        voxel: shortest edge of a voxel of the extinction and flame grids, world units.
     """
 
     box: np.ndarray
@@ -152,13 +152,13 @@ def survey_volume_frames(
 
 
 def _count_vdb_values(values: np.ndarray) -> np.ndarray:
-    """Count positive values per bin, (2^15,); the bin is the upper half of a float32's bits, sorted by value."""
+    """Return a histogram (2^15,) of positive values. Bins ascend: a value's bin is the upper 16 bits of its float32."""
     positive = values[np.isfinite(values) & (values > 0)]
     return np.bincount(positive.astype(np.float32).view(np.uint32) >> 16, minlength=1 << 15)
 
 
 def _peak_vdb_value(counts: np.ndarray) -> float:
-    """Return a quantile close to the largest value, to about 1 %, from counts per bin; 0 if all counts are 0."""
+    """Return the 99.9 % quantile of a histogram of :func:`_count_vdb_values`, to about 1 %; 0 if it is empty."""
     cumulative = np.cumsum(counts)
     place = int(np.searchsorted(cumulative, _PEAK_QUANTILE * cumulative[-1]))
     return float(np.uint32(place << 16 | 1 << 15).view(np.float32)) if cumulative[-1] else 0.0

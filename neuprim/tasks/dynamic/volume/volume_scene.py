@@ -82,23 +82,23 @@ class VdbSceneSettings:
 
     Attributes:
         vdb: folder of .vdb files, or None to simulate.
-        simulation: name of the built-in simulation; ``resolution``: voxels across its box; ``timesteps``: None: all.
+        simulation: name of a built-in simulation. ``resolution``: voxels across its box. ``timesteps``: None for all.
         frames: "all", "FIRST:LAST" or "FIRST:LAST:STEP" by number, LAST included.
-        span: "FIRST:LAST" by number, the frames for training and evaluation; times, box, exposure and images stay those
-            of all ``frames``. None: all.
-        chunks: number of chunks of time, each trained in its own run; "auto": see
-            :func:`count_time_chunks`; None or 1: one run.
-        grids: meaning -> name in the files.
+        span: "FIRST:LAST" by number, the frames for training and evaluation; None for all. Times, box, exposure and
+            images stay those of all ``frames``.
+        chunks: number of time chunks, each trained in its own run; None or 1 for one run. For "auto" see
+            :func:`count_time_chunks`.
+        grids: meaning ("density", "flames", ...) -> name of the grid in the files.
         look: name of a preset of the optics, or "auto"; ``optics``: changes to the preset's settings.
         size: width and height of the images in pixels.
-        samples: rays per pixel side; None: 1 where pixels are narrower than voxels, else 2.
-        cameras: on the upper hemisphere; two are held out. ``field_of_view``: degrees.
-        lights: different directional lights of each frame, the look's own and drawn ones, which the cameras take in
-            turns; models of more than one know light, others have it in their colours.
-        train_every: train on every n-th frame only; the test views keep all.
+        samples: n for n x n rays per pixel; None for 1 if pixels are narrower than voxels, else 2.
+        cameras: number of cameras on the upper hemisphere; two are held out. ``field_of_view``: degrees.
+        lights: number of directional lights per frame: the light of the look, then random ones. The cameras take turns.
+            With several lights, the light is a condition of the model; a single light is part of the colours.
+        train_every: n: train on every n-th frame only. The test views have all frames.
         up: "y" or "z", the upward axis of the files.
-        cache: folder or URL where the ground truth is stored; None: the user's cache on this machine.
-        memory: MiB of decoded images and voxels in memory; others are read again when needed.
+        cache: folder or URL where the ground truth is stored; None for the user's cache on this machine.
+        memory: limit on the decoded images and voxels in memory, MiB; others are read again when needed.
     """
 
     vdb: Annotated[Path, nonempty_text("a folder of .vdb files, or one of them")] | None = None
@@ -178,7 +178,7 @@ class _PreparedVdbScene:
     held_out: range
 
     def span_ends(self) -> tuple[int, int] | None:
-        """Return first and last number of the chosen frames within ``scene.span``; None for all frames."""
+        """Return first and last number of the frames within ``scene.span``; None if the user set no span."""
         wanted = None if self.settings.span is None else _vdb_frame_range(self.settings.span)
         if wanted is None:
             return None
@@ -309,7 +309,7 @@ change of models is visible where little moves. But both chunks must be trained 
 
 
 def split_into_time_chunks(config: Mapping[str, Any], context: SceneContext) -> Chunks | None:
-    """Split a run into ``scene.chunks`` chunks; None for one run. Renders all frames: chunks share one exposure.
+    """Return the time chunks of a run; None if it is not split. Renders all frames, as chunks share one exposure.
 
     Raises:
         ConfigError: there are too few frames for so many chunks. Other errors as in :func:`load_volume_scene`.
@@ -372,7 +372,7 @@ def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int
 
 
 def _rescale_time(capture: Capture, frames: Sequence[VdbFrame], config: Mapping[str, Any]) -> dict[str, Any]:
-    """Return changed settings for a chunk: learning rates in units of its length, windows at most as long."""
+    """Return settings to change for a chunk: learning rates relative to its length, and windows that fit into it."""
     length = capture.time(frames[-1]) - capture.time(frames[0])
     density = TimeDensity(config["model"]["neurons"], **config["model"]["density"])
     rates = {spec.name: config["train"]["rates"].get(spec.name, spec.lr) for spec in density.parameters()}

@@ -53,7 +53,7 @@ class MeshSettings(SolidsSettings):
 
 
 def load_mesh(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
-    """Load ``scene=mesh``, rendered on first use; raises DataError if the mesh is damaged or names files elsewhere."""
+    """Load ``scene=mesh``, rendered on first use; DataError if the mesh is damaged or needs files of other folders."""
     asked = validate_settings(MeshSettings, settings, "scene")
     folder = generate_mesh_images(asked, context.cache_dir, context.progress)
     from neuprim.tasks.static.datasets import load_blender

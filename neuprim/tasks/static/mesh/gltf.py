@@ -106,7 +106,7 @@ class _GltfReader:
         return found, self.vertices
 
     def _count_primitive(self, primitive: _GltfPrimitive) -> None:
-        """Add one use of a primitive to the counts; raise DataError above a limit."""
+        """Count vertices and triangles of one use of a glTF primitive; raise DataError above a limit."""
         self.vertices += len(primitive.positions)
         self.triangles += len(primitive.faces)
         self.parts += 1
@@ -167,7 +167,7 @@ class _GltfReader:
         return _GltfPrimitive(name, faces, positions, normals, colour, uv, glow_uv)
 
     def _texture_coordinates(self, primitive: Mapping[str, Any], name: str, key: str) -> NDArray[np.float32] | None:
-        """Return (V, 2) coordinates, v upward, of the set that a material's texture uses; None if it is missing."""
+        """Return the (V, 2) texture coordinates that a material's texture uses, v upward; None if they are missing."""
         material = self.document.content["materials"][int(name)]
         texture = {**_gltf_base_colour(material), "emissiveTexture": material.get("emissiveTexture", {})}.get(key, {})
         moved = texture.get("extensions", {}).get("KHR_texture_transform", {})
@@ -209,7 +209,7 @@ class _GltfReader:
         return moved
 
     def _place_primitive(self, primitive: _GltfPrimitive, matrix: NDArray[np.float64]) -> Faces:
-        """Return a primitive transformed by ``matrix`` (4, 4) to scene coordinates."""
+        """Return a glTF primitive, transformed by ``matrix`` (4, 4) to scene coordinates."""
         faces = primitive.faces
         with np.errstate(all="ignore"):
             positions = primitive.positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -220,7 +220,7 @@ class _GltfReader:
         return Faces(positions[faces], primitive.material, *of_corners)
 
     def _node_matrices(self, nodes: Sequence[Mapping[str, Any]]) -> dict[int, NDArray[np.float64]]:
-        """Return node -> (4, 4) scene-from-node matrix, for the nodes of the default scene."""
+        """Return node index -> (4, 4) scene-from-node matrix, for the nodes of the default scene."""
         children = [[to_gltf_index(child) for child in node.get("children", [])] for node in nodes]
         scenes = self.document.entries("scenes")
         if scenes:
@@ -241,7 +241,7 @@ class _GltfReader:
         return found
 
     def _instance_matrices(self, node: Mapping[str, Any], matrix: NDArray[np.float64]) -> list[NDArray[np.float64]]:
-        """Return the (4, 4) transforms of a node's mesh: one per instance (EXT_mesh_gpu_instancing), else one."""
+        """Return (4, 4) transforms of a node's mesh: one per instance (EXT_mesh_gpu_instancing), or the node's own."""
         instancing = node.get("extensions", {}).get("EXT_mesh_gpu_instancing")
         if instancing is None:
             return [matrix]

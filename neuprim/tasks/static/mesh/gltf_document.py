@@ -69,7 +69,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
 
 
 class GltfDocument:
-    """A glTF document; its version and required extensions are checked. Gives access to its arrays."""
+    """A glTF document with access to its arrays. Version and required extensions are checked."""
 
     def __init__(self, folder: MeshFolder) -> None:
         data = folder.read_model()

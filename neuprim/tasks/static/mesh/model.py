@@ -96,7 +96,7 @@ def find_model_file(path: Path) -> Path:
 
 
 class MeshFolder:
-    """Reader of a mesh file and of files below its folder, up to a total size; computes a hash of all bytes read."""
+    """Reader of a mesh file and of files below its folder, ``budget`` bytes at most; hashes all bytes that it reads."""
 
     def __init__(self, file: Path, skip_missing: bool = False, budget: int = MAX_BYTES) -> None:
         self.file, self.skip_missing = file, skip_missing
@@ -122,7 +122,7 @@ class MeshFolder:
         return found
 
     def read_optional(self, references: Sequence[str], what: str) -> bytes | None:
-        """Read the first existing file of ``references``. If none exists: DataError, or None with ``skip_missing``."""
+        """Read the first of ``references`` that exists; else raise DataError or, with ``skip_missing``, return None."""
         faults = []
         for reference in references:
             found, fault = self._resolve_reference(reference, what)
@@ -136,7 +136,7 @@ class MeshFolder:
         return None
 
     def _resolve_reference(self, reference: str, what: str) -> tuple[bytes | None, str]:
-        """Read the file or data URI ``reference``; return its bytes, or None and why it is refused."""
+        """Read the file or data URI ``reference``; return its bytes and "", or None and the reason for the refusal."""
         shown = reference if len(reference) <= 80 else reference[:77] + "..."
         if reference.startswith("data:"):
             return self._decode_data_uri(reference, what), ""
@@ -284,7 +284,10 @@ def _flatten_polygon(points: NDArray, normal: NDArray) -> NDArray[np.float64]:
 
 
 def _cut_ears(points: NDArray[np.float64], tests: int) -> tuple[NDArray[np.int64] | None, int]:
-    """Triangulate a polygon by ear clipping (Meisters 1975); return (T, 3) corners or None, and remaining ``tests``."""
+    """Triangulate a polygon by ear clipping (Meisters 1975), with at most ``tests`` tests of ears.
+
+    Return (T, 3) corner indices, or None on failure, and the number of tests that are left.
+    """
     left, found = list(range(len(points))), []
     place, strict, failed = 0, True, 0
     while len(left) >= 3:

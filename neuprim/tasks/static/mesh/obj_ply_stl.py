@@ -121,7 +121,7 @@ def _look_up_obj_corners(table: NDArray[np.float64], index: NDArray[np.int64], m
 
 
 def _obj_number_table(key: str, numbers: NDArray[np.float64], lengths: NDArray[np.integer]) -> NDArray[np.float64]:
-    """Return the lines of one key as a table (N, 2 or more); missing values are NaN, or 0 for ``vt``."""
+    """Return the numbers on the N lines that start with ``key`` as N rows; missing ones are NaN, or 0 for ``vt``."""
     width = min(max(2, int(lengths.max(initial=2))), _WIDTHS[key][1])
     table = np.full((len(lengths), width), 0.0 if key == "vt" else np.nan)
     first = np.cumsum(lengths) - lengths
@@ -331,8 +331,8 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
 def read_stl(folder: MeshFolder) -> Model:
     """Read an .stl file.
 
-    The file is read as binary if its length matches the face count at byte 80, else as text. Its first bytes do not
-    matter.
+    The file is read as binary if its length matches the face count at byte 80, else as text, whatever its first bytes
+    are.
     """
     data = folder.read_model()
     count = int.from_bytes(data[80:84], "little")
@@ -360,7 +360,7 @@ def _read_stl_text(path: Path, data: bytes) -> tuple[list[Faces], int]:
 
 
 def _read_stl_binary(path: Path, data: bytes) -> tuple[list[Faces], int]:
-    """Parse a binary .stl file, with colours as by VisCAM (bit 15 set) or Materialise Magics (COLOR=)."""
+    """Parse a binary .stl file with the colours of VisCAM (bit 15 is set) or of Materialise Magics (COLOR=)."""
     rows = np.frombuffer(data, _STL, offset=84)
     bits = rows["attribute"].astype(np.int64)
     fives = np.stack([(bits >> shift & 31) / 31 for shift in (10, 5, 0)], axis=-1)

@@ -120,7 +120,7 @@ _ROWS = 256
 
 
 class MeshTexture:
-    """A mip-mapped texture, (H, W, 4) uint8 sRGB with straight alpha; levels halve the size."""
+    """A mip-mapped texture, (H, W, 4) uint8 sRGB with straight alpha. Each level has half the size of the last."""
 
     def __init__(self, pixels: NDArray[np.uint8], wrap: tuple[str, str] = ("repeat", "repeat")) -> None:
         self.wrap = wrap
@@ -339,7 +339,7 @@ class MeshSurface(Scene):
 
 
 class _MeshColourLayer:
-    """Colours of the faces with ``kept`` (F,) bool: interpolated corner colours times textures.
+    """Colours of the faces for which ``kept`` (F,) is true: interpolated corner colours times textures.
 
     ``area`` (F,) is twice the area of each face, in units of the squared distance between rays.
     """
@@ -415,7 +415,7 @@ def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.in
 def _smooth_normals(
     given: NDArray[np.float64], across: NDArray[np.float64], mesh: trimesh.Trimesh
 ) -> NDArray[np.float64]:
-    """Return (F, 3, 3) unit normals: ``given`` ones, flipped to the face's side, or :func:`solid_corner_normals`.
+    """Return (F, 3, 3) unit normals: ``given`` flipped to the face's side, or else :func:`solid_corner_normals`.
 
     ``given`` are the file's normals; ``across`` (F, 3) are the face normals.
     """

@@ -63,7 +63,7 @@ def report_note(text: str) -> str:
 
 
 def report_folded(title: str, body: str) -> str:
-    """Return a section that opens with a click. Both arguments are HTML."""
+    """Return a collapsed section, which opens with a click. Both arguments are HTML."""
     return f"<details><summary>{title}</summary>{body}</details>"
 
 
@@ -75,7 +75,7 @@ def masthead(eyebrow: str, title: str, badge: str = "", more: str = "") -> str:
 
 
 def report_banner(notes: Iterable[str]) -> str:
-    """Return a banner with warnings as HTML; ``notes`` are HTML."""
+    """Return a banner with the warnings ``notes``, as HTML. The warnings are HTML, too."""
     return "".join(f'<p class="banner" role="status">{text}</p>' for text in notes)
 
 
@@ -89,7 +89,7 @@ def report_tiles(items: Iterable[Tile]) -> str:
 
 
 def figure(source: Path | Tensor, caption: str, alternative: str, attributes: str = "") -> str:
-    """Return a picture with its caption as HTML; a box with a note if the file is missing or damaged.
+    """Return a picture with its caption as HTML; a box with a message if the file is missing or damaged.
 
     Args:
         source: a picture file, or an (H, W, 3) image.
@@ -147,7 +147,7 @@ def escape(value: object) -> str:
 
 
 def format_report_setting(value: object) -> str:
-    """Format a setting as users type it: ``true``, ``null``, ``0.001``, ``[1, 2]``; strings bare. Not escaped."""
+    """Format a setting as users type it: ``true``, ``null``, ``0.001``, ``[1, 2]``, text. HTML is not escaped."""
     if isinstance(value, str):
         return value
     if value is None or isinstance(value, bool | int | float | Sequence | Mapping):

@@ -32,7 +32,7 @@ class ReportedRun:
     Attributes:
         metrics: content of ``metrics.json``; empty if the run has not finished.
         log: complete lines of ``metrics.jsonl``.
-        views, clips: pictures and films in ``renders/``.
+        views, clips: pictures of held-out views, and video clips, in ``renders/``.
     """
 
     run_dir: Path
@@ -70,7 +70,7 @@ def median_and_worst(views: Sequence[Mapping[str, Any]]) -> tuple[int, ...]:
     If both are the same view, its index is returned once.
 
     Args:
-        views: entries of ``per_view`` in ``metrics.json``; those without a PSNR are left out.
+        views: entries of ``per_view`` in ``metrics.json``; entries without a PSNR are left out.
     """
     known = [(value, i) for i, entry in enumerate(views) if (value := metric_from_json(entry, "psnr")) is not None]
     order = [i for _, i in sorted(known)]
@@ -113,7 +113,7 @@ def _parse_reported_line(text: str) -> Mapping[str, Any] | None:
 
 
 def _find_reported_views(folder: Path) -> list[ViewFiles]:
-    """Return the views that have pictures. A view's error map is written last, so if it exists the others do, too."""
+    """Return the views that have all pictures: those with an error map, which is the last picture to be written."""
     views = []
     for error in folder.glob("test_*_error.png"):
         name = error.stem.removesuffix("_error")

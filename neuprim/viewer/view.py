@@ -154,7 +154,7 @@ class LiveTraining:
     The training calls :meth:`between` between its steps.
 
     Raises:
-        ConfigError, BackendUnavailable: those of :class:`~neuprim.viewer.server.ViewerServer`.
+        ConfigError, BackendUnavailable: see :class:`~neuprim.viewer.server.ViewerServer`.
     """
 
     def __init__(

@@ -150,7 +150,7 @@ class ViewerScene:
 
     @cached_property
     def start_view(self) -> View:
-        """First view of a page: the held-out view with most contrast, else the whole model from the side."""
+        """First view of a page: the held-out view with most contrast or, without data, the model from the side."""
         if self.dataset is not None:
             views = held_out_webpage_views(self.dataset, self.channels, _START_CANDIDATES, truths=False)
             if views:
@@ -242,7 +242,7 @@ class FrameEllipsoids(NamedTuple):
 def list_viewer_ellipsoids(
     model: Primitives, viewpoint: Viewpoint, channels: Channels, limit: int, row: int | None = None
 ) -> FrameEllipsoids:
-    """Return the ellipsoids at a viewpoint: the ``limit`` that absorb most, or only that of primitive ``row``."""
+    """Return the ellipsoids of the ``limit`` primitives that absorb most, or only of primitive ``row``, if given."""
     with torch.no_grad():
         lowered = model.lower(viewpoint.camera, viewpoint.conditions)
         geometry = lowered.geometry

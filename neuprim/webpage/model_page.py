@@ -206,7 +206,7 @@ def held_out_webpage_views(dataset: Dataset, channels: Channels, limit: int, tru
 def initial_webpage_conditions(
     specs: Sequence[ConditionSpec], views: Sequence[PageView], given: Mapping[str, Tensor]
 ) -> list[Condition]:
-    """Return the initial value of each condition, float64: the given value, else that of the first view, else the
+    """Return the initial value of each condition, float64: the given value, else the first view's value, else the
     middle of a bounded range, else 1.
     """
     shown = {**(views[0].conditions if views else {}), **given}
@@ -277,7 +277,7 @@ def fullest_webpage_conditions(model: Primitives, conditions: Sequence[Condition
 
 @torch.no_grad()
 def _measure_webpage_extent(model: Primitives, conditions: Mapping[str, Tensor]) -> tuple[list[float], float, float]:
-    """Return centre and radius of the active primitives, and the 95 % quantile of their extinction at the centres."""
+    """Return centre and radius of all active primitives, and the 95 % quantile of the extinction at their centres."""
     active = model.active(conditions)
     if not active.geometry.count:
         return [0.0, 0.0, 0.0], 1.0, 1.0

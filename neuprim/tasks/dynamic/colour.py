@@ -99,7 +99,7 @@ class TimeHarmonics(ColourField):
         return field, {**others, **kept, "sh_dc": dc[:, 0].contiguous()}
 
     def _terms(self, xi: Tensor) -> dict[str, Tensor]:
-        """Return the basis functions of time at ``xi``, float64, by the name of their coefficient tensor."""
+        """Return name of a coefficient tensor -> its basis functions of time at ``xi``, float64."""
         turn = FREQUENCIES[self.frequencies] * xi
         waves = turn * torch.arange(1, self.waves + 1, dtype=torch.float64, device=xi.device)
         powers = xi ** torch.arange(1, self.powers + 1, dtype=torch.float64, device=xi.device)

@@ -207,7 +207,7 @@ class SurfaceColour(ColourField):
     ) -> tuple[SurfaceColour, dict[str, Tensor]]:
         """Return a smaller colour field: fewer coefficients of indirect light, or fewer lobes.
 
-        The remaining lobes are those with the largest product of colour and integral over the sphere.
+        The lobes with the largest product of colour and integral over the sphere remain.
         """
         field, found = SurfaceColour(**{**self.settings(), name: value}), dict(params)
         if name == "indirect":

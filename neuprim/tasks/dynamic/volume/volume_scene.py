@@ -138,7 +138,7 @@ class VdbSceneSettings:
     def resolve_optics(self, has_density: bool = True) -> Optics:
         """Return the optics: the preset with the user's changes.
 
-        ``look="auto"`` is "smoke_fire" for files with a density, else "embergen_fire", where hot gas absorbs.
+        ``look="auto"`` selects "smoke_fire" for files with a density, else "embergen_fire", in which hot gas absorbs.
 
         Raises:
             ConfigError: a preset or setting does not exist, or a value is out of range.

@@ -84,11 +84,16 @@ def run_ablation(
 ) -> tuple[Path, TradeoffRecord]:
     """Train and measure models with varied settings; write ``tradeoff.json``, ``tradeoff.html`` and ``front.png``.
 
-    Returns the folder of these files, and the record. The same call with a larger budget adds models.
+    The same call with a larger budget adds models.
 
     Args:
-        request: the request; its overrides are those of ``neuprim run``.
-        launcher: where models are trained. This process measures them.
+        request: settings to vary, and the budget. Its ``words`` are overrides of ``neuprim run``.
+        launcher: settings of the launcher that trains the models. This process measures them.
+        tell: called with lines of text for the user.
+        progress: called with (text, done fraction 0..1).
+
+    Returns:
+        The folder with the three files, and the content of ``tradeoff.json``.
 
     Raises:
         NeuprimError: overrides, settings, data or folder are wrong.
@@ -121,7 +126,7 @@ def run_ablation(
 
 @dataclass(frozen=True)
 class _AblationSet:
-    """A set of models to compare: folder, the centre's overrides and configuration, and where to train models."""
+    """A set of models to compare: its folder, overrides and configuration of the centre, and launcher settings."""
 
     folder: Path
     words: list[str]
@@ -166,7 +171,7 @@ class _AblationSession(TradeoffSession):
         return time.monotonic() - self.begun - self._compiling
 
     def seconds_left(self, part: float) -> float:
-        """Return the seconds until the fraction ``part`` of the budget that remained after planning is used."""
+        """Return the seconds left until the fraction ``part`` of the time after planning is used."""
         return self._planned_at + part * max(self.request.budget - self._planned_at, 0.0) - self.spent
 
     def run(self, wanted: Sequence[Variant]) -> None:
@@ -220,7 +225,7 @@ class _AblationSession(TradeoffSession):
         return AblationStepTimes(self.centre, self._loaded[0])
 
     def _find_pace(self, variant: Variant, paces: dict[str, float]) -> str | None:
-        """Store a variant's measured time per step in ``paces``; return why it cannot be trained, else None."""
+        """Measure a variant's time per step and store it in ``paces``. Return why it cannot be trained, else None."""
         if not variant.turned:
             paces[variant.name] = 1.0
         if variant.name in paces:
@@ -240,8 +245,8 @@ class _AblationSession(TradeoffSession):
     # ------------------------------------------------------------ training
 
     def _train(self, wanted: Sequence[Variant], part: float) -> None:
-        """Train and measure the variants that the record lacks, while time is left until ``part`` of the budget. The
-        centre and unfinished trainings are trained in any case.
+        """Train and measure the variants that the record lacks, until the fraction ``part`` of the budget is used. The
+        centre and interrupted trainings are trained in any case.
         """
         known = {(point.turned, point.length) for point in self.record.points}
         todo = [variant for variant in wanted if (variant.turned, variant.length) not in known]
@@ -341,7 +346,7 @@ def _compose_ablation_set(request: TradeoffRequest, launcher: LauncherSettings) 
 
 
 def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) -> None:
-    """Raise an error if the folder holds other files, or a set with another centre."""
+    """Raise an error if the folder holds other files, or a set of models with another centre."""
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
@@ -356,7 +361,7 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
 def _resume_ablation_set(
     folder: Path, before: TradeoffRecord | None, identity: Mapping[str, Any], tell: Tell
 ) -> TradeoffRecord:
-    """Return the record of an earlier session. Its points are dropped if they were measured under other conditions."""
+    """Return the record to continue, with the points of ``before`` if they were measured under the same conditions."""
     record = TradeoffRecord(dict(identity))
     if before is None:
         return record

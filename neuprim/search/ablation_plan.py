@@ -35,8 +35,8 @@ _STEPS_PER_TURN, _TURNS = 4, 6  # step times: variant and centre alternate, so t
 
 @dataclass(frozen=True)
 class Variant:
-    """A model to train: the setting that it varies, its overrides on top of the centre's, and the fraction of the full
-    training length.
+    """A model to train: the setting that it changes (``knob``), its overrides on top of the centre's (``turned``), and
+    its training length as a fraction of the full length.
     """
 
     knob: str
@@ -54,12 +54,12 @@ class Variant:
 
     @property
     def label(self) -> tuple[str, ...]:
-        """Overrides that name the variant in the record of points that were not measured."""
+        """Overrides and training length, which name the variant in the list of points that were not measured."""
         return (*self.turned, *((f"{self.length:g} of the length",) if self.length != 1.0 else ()))
 
 
 def list_variants(centre: RunConfig, task: TaskSpec) -> dict[str, list[Variant]]:
-    """Return setting -> variants that change this setting; values next to the centre's value come first."""
+    """Return setting -> variants that change only this setting, the values closest to the centre's first."""
     counts = dict.fromkeys(max(1, round(part * centre.model.count)) for part in _COUNTS)
     knob = "model.primitives"
     variants = {knob: [Variant(knob, (quote_override(knob, n),)) for n in counts if n != centre.model.count]}
@@ -96,8 +96,8 @@ class AblationPlan:
     paces: dict[str, Annotated[float, Range(above=0)]] = field(default_factory=lambda: {CENTRE: 1.0})
 
     def overrides(self, variant: Variant, words: Sequence[str], centre: RunConfig) -> list[str]:
-        """Return the overrides that train a variant in this plan. Interventions of population control are as many as in
-        a run of the centre's configuration.
+        """Return the overrides that train a variant for its planned length. Population control intervenes as often as
+        in a run of the centre's configuration.
         """
         steps = max(1, round(self.steps * variant.length / self.paces[variant.name]))
         budget = [quote_override(LENGTH, steps)] + ["train.max_seconds=null"] * (centre.train.max_seconds is not None)
@@ -132,8 +132,8 @@ def plan_training_lengths(centre: RunConfig, pace: float, available: float, leng
 
 
 class AblationStepTimes:
-    """Measures the time per step of a variant relative to the centre. Steps are those halfway through the training,
-    where all colour bands are in use.
+    """Measure the time per training step of variants, relative to the centre. The steps are those halfway through the
+    training, where all colour bands are in use.
 
     Attributes:
         seconds: seconds per step of the centre.
@@ -147,7 +147,7 @@ class AblationStepTimes:
         self.seconds = self._run_turns(self._centre)[1] / (_STEPS_PER_TURN * _TURNS)
 
     def measure(self, config: RunConfig) -> float | None:
-        """Return a configuration's time per step over the centre's; None if it builds the same model as the centre."""
+        """Return the time per step divided by the centre's; None if ``config`` builds the same model as the centre."""
         trainer = self._prepare(config)
         if _ablation_model_identity(trainer) == self._identity:
             return None
@@ -185,7 +185,7 @@ def _ablation_model_identity(trainer: Trainer) -> tuple[Any, ...]:
 
 
 def combine_ablation_changes(points: Sequence[TradeoffPoint], most: int) -> list[tuple[str, ...]]:
-    """Return at most ``most`` combinations of measured changes, for fewer bytes, less time or better quality."""
+    """Return at most ``most`` combinations of measured single changes that save bytes, save time or improve quality."""
     centre = points[0]
     smaller, faster, better = [], [], []
     for point in points[1:]:

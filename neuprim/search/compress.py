@@ -56,12 +56,12 @@ _FINEST, _COARSEST = 1e-4, 30.0  # limits of the added error, as shares of the m
 class CompressRequest:
     """Request for :func:`compress_run`, with the arguments of ``neuprim compress``.
 
-    Without level and bits, parameters get as few bits as possible while the PSNR of training views drops by at most
-    ``tolerance``. If the run's data are not available either, a default level is used.
+    ``level`` and ``bits`` set the bits of the parameters. Without both, parameters get as few bits as possible while
+    the PSNR of training views drops by at most ``tolerance``; without data, a default level is used.
 
     Attributes:
         level: 1 (nearly lossless) to 5 (very small).
-        bits: NAME=BITS, bits of single parameters that replace those of the level.
+        bits: texts NAME=BITS, which replace the level's bits for the parameter NAME.
         out: the file to write; None for ``model.neuprim`` in the run directory.
         overwrite: whether an existing file may be replaced.
         seconds: approximate time of fine-tuning the quantized model.
@@ -203,13 +203,15 @@ class QuantizedModel(NamedTuple):
 
 
 def dequantize(model: Primitives, quantizers: Quantizers) -> Primitives:
-    """Return a copy of a model with the parameters rounded as in a compressed file. The model is in canonical order."""
+    """Return a copy of a model, given in canonical order, with parameters rounded as in a compressed file."""
     params = {name: value.detach() for name, value in fake_quantize(model.params, quantizers).items()}
     return Primitives(model.density, model.colour, params)
 
 
 class QuantizationSearch:
-    """Search for quantizers by one number, the *error share*: squared error rounding may add over the model's own."""
+    """Search for quantizers by one number, the *error share*: the squared error that rounding may add to images, over
+    the squared error without rounding. A search begins at the share ``start``.
+    """
 
     def __init__(self, model: Primitives, dataset: Dataset, quality: SearchQuality) -> None:
         self.model = canonical_model(model)
@@ -222,7 +224,7 @@ class QuantizationSearch:
         self._error = 10 ** (-quality.image_quality(self.model) / 10) / max(columns, 1)
 
     def with_model(self, trained: Primitives) -> QuantizationSearch:
-        """Return a search with the same error estimates for the model after fine-tuning."""
+        """Return a search for the fine-tuned model ``trained``, with the error estimates of this search."""
         other = copy(self)
         other.model = trained
         return other
@@ -231,17 +233,17 @@ class QuantizationSearch:
         return fit_quantizers_to_error(self.model, self._effects, share * self._error)
 
     def find_coarsest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return the coarsest quantizers that ``accept`` accepts, else the finest possible, and their error share."""
+        """Return the coarsest quantizers that ``accept`` accepts, else the finest possible; and their error share."""
         fine, _ = self._bisect(accept, start)
         return self.fit(fine), fine
 
     def find_finest(self, accept: Callable[[Quantizers], bool], start: float) -> tuple[Quantizers, float]:
-        """Return the finest quantizers that ``accept`` accepts, else the coarsest possible, and their error share."""
+        """Return the finest quantizers that ``accept`` accepts, else the coarsest possible; and their error share."""
         _, coarse = self._bisect(lambda quantizers: not accept(quantizers), start)
         return self.fit(coarse), coarse
 
     def _bisect(self, is_fine: Callable[[Quantizers], bool], start: float) -> tuple[float, float]:
-        """Return two close error shares, of which only the first is fine enough; equal ones at either limit."""
+        """Return two close error shares: the first is fine enough, the second is not. At a limit, both are equal."""
         fine, coarse, share = 0.0, 0.0, start
         for _ in range(_MAX_TRIES):
             if is_fine(self.fit(share)):
@@ -260,8 +262,8 @@ class QuantizationSearch:
 def finetune_for_table(
     data: TrainingData, model: Primitives, table: BitTable, steps: int, progress: Progress
 ) -> QuantizedModel:
-    """Fine-tune a model whose parameters have the bits in ``table``; return the original model if it renders training
-    views better.
+    """Quantize a model with the bits in ``table``, after fine-tuning. If that does not improve the training views,
+    quantize the original model.
     """
     whole = canonical_model(model)
     quantizers, quality = fit_quantizers(whole, table), SearchQuality.of_run(data.config, data.dataset)

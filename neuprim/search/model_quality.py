@@ -28,7 +28,7 @@ MAX_PSNR = 200.0  # dB that stand for equal images, as JSON has no infinity
 
 @dataclass(frozen=True)
 class EvalView:
-    """A test view, its ground truth over the background, (H, W, C), and a mask of valid pixels (None: all)."""
+    """A test view, its ground truth over the background, (H, W, C), and a mask of valid pixels (None: all valid)."""
 
     view: View
     image: Tensor
@@ -44,7 +44,7 @@ class EvalQuality(NamedTuple):
 
 
 def choose_trial_views(dataset: Dataset, views: int) -> list[EvalView]:
-    """Return at most ``views`` test views, evenly spread."""
+    """Return at most ``views`` test views, evenly spread over all test views."""
     most, chosen = min(views, len(dataset.test)), []
     for i in (k * len(dataset.test) // most for k in range(most)):
         view, pixels = dataset.test.view(i), dataset.test.pixels(i)
@@ -54,7 +54,7 @@ def choose_trial_views(dataset: Dataset, views: int) -> list[EvalView]:
 
 
 def fill_masked(image: Tensor, view: EvalView) -> Tensor:
-    """Replace the pixels outside the view's mask by the ground truth."""
+    """Return ``image`` with the ground truth in the pixels outside the view's mask."""
     return image if view.mask is None else torch.where(view.mask[..., None], image, view.image.to(image))
 
 
@@ -113,7 +113,7 @@ class SearchQuality:
     def __call__(self, model: Primitives, quick: bool = False) -> float:
         """Return a model's quality in dB: the PSNR of images, or less if the extinction lost more dB than the images.
 
-        Losses are relative to the first evaluated model.
+        Losses are relative to the first model that was evaluated.
 
         Args:
             quick: evaluate fewer views and frames.
@@ -127,7 +127,7 @@ class SearchQuality:
         return min(images, inside + self._offset)
 
     def image_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return the mean PSNR of the model's images of :attr:`views`; ``quick`` uses fewer of them."""
+        """Return the mean PSNR of the model's images of :attr:`views`; with ``quick``, of some of these views."""
         step = max(len(self.views) // _QUICK_VIEWS, 1) if quick else 1
         values = []
         for index in self.views[::step]:
@@ -137,7 +137,7 @@ class SearchQuality:
         return float(np.mean(values))
 
     def inside_quality(self, model: Primitives, quick: bool = False) -> float:
-        """Return -10 log10 of the mean squared error of the extinction over its scale, dB, averaged over frames."""
+        """Return the PSNR of the extinction relative to its scale, dB, averaged over frames."""
         values = []
         with torch.no_grad():
             for samples in self.draws[:: max(len(self.draws) // _QUICK_FRAMES, 1) if quick else 1]:

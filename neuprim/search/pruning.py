@@ -57,8 +57,11 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PruningStage:
-    """One round of pruning: reductions of fields, remaining size, quality after the cut and after fine-tuning (dB), and
-    whether the loss is within the tolerance.
+    """One round of pruning.
+
+    Attributes:
+        words: reductions of fields so far. primitives, numbers: primitives and parameter values that remain.
+        cut, trained: quality after the cut and after fine-tuning, dB. kept: whether the loss is within the tolerance.
     """
 
     words: tuple[str, ...]
@@ -94,7 +97,7 @@ class _PruningState:
 
 
 def _saved_share(model: Primitives, smaller: Primitives, numbers: int) -> float:
-    """Return the fraction of values that ``smaller`` saves, in the file or per primitive, whichever is larger.
+    """Return the fraction of parameter values that ``smaller`` saves: in the file or per primitive, the larger one.
 
     ``numbers`` is the count of values in the file of ``model``.
     """
@@ -107,7 +110,7 @@ class ModelShrinker:
     """Search for the smallest model that renders the training views within a tolerance of the full model.
 
     Attributes:
-        tolerance: largest loss of PSNR, dB.
+        tolerance: PSNR that training views may lose, dB.
         steps: total number of fine-tuning steps in all rounds; 0 for none.
         base: quality of the full model, dB; set by :meth:`shrink`.
         stages: the rounds so far, in order.
@@ -269,10 +272,10 @@ class Pruning:
 
     Attributes:
         run_dir: the new run directory; None if nothing could be removed, so that nothing was written.
-        before: measurements of the original: primitives, numbers (of values), bytes, psnr and ssim of test views,
-            frames_per_second.
+        before: measurements of the original: primitives, numbers (count of parameter values), bytes, psnr and ssim of
+            test views, frames_per_second.
         reduced: reductions of fields, as in ``model.reduced``.
-        judged_psnr: PSNR of the training views that decide, before and after pruning, dB.
+        judged_psnr: PSNR of the training views by which cuts are accepted, before and after pruning, dB.
     """
 
     run_dir: Path | None

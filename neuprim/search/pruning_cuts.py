@@ -37,7 +37,7 @@ def count_unpruned_numbers(model: Primitives) -> int:
 
 
 def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
-    """Return parameter name -> (N, ...) bool mask of the values that belong to units which are zero."""
+    """Return parameter name -> (N, ...) bool mask, true for values of units that pruning has set to zero."""
     masks: dict[str, Tensor] = {}
     for unit in _units(model).values():
         gone = ~primitives_with_unit(unit, model.params)
@@ -49,7 +49,7 @@ def mask_pruned_numbers(model: Primitives) -> dict[str, Tensor]:
 
 
 def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
-    """Return (kind, name, value) of all possible reductions of the model's fields, the largest saving first."""
+    """Return all reductions of fields as ("density" or "colour", setting, smaller value), the largest saving first."""
     fields = (("density", model.density), ("colour", model.colour))
     words = [
         (kind, name, value) for kind, own in fields for name, values in own.reductions().items() for value in values
@@ -60,15 +60,15 @@ def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
 def price_cuts(
     model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: SearchQuality
 ) -> Sensitivity:
-    """Return for every primitive and unit the mean squared change of images if it is removed, plus the weighted change
-    of the extinction.
+    """Return the effect of removing each primitive and each unit: the mean squared change of images, plus the weighted
+    change of the extinction if ``inside`` has it.
     """
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
 
 def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQuality) -> float:
-    """Return the mean squared difference of colour, measured by removing the primitives with the least effect."""
+    """Measure the mean squared difference of primitives' colours to the colours behind them, by removing a few."""
     count = max(int(_PROBE * model.count), 1)
     order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
     kept = order[count:].sort().values
@@ -82,8 +82,8 @@ def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQu
 
 
 class _Sizes(NamedTuple):
-    """Sizes of what can be removed: nonzero values per primitive, (N,); for each unit, which primitives have it, (N,)
-    bool, and its number of values.
+    """Parameter values that can be removed: number of nonzero values of each primitive, (N,); unit -> which primitives
+    have the unit, (N,) bool; unit -> its number of values in one primitive.
     """
 
     whole: Tensor
@@ -94,7 +94,7 @@ class _Sizes(NamedTuple):
 def cut_to_loss(
     model: Primitives, prices: Sensitivity, quality: Callable[[Primitives], float], loss: float
 ) -> Primitives:
-    """Remove the primitives and units with the least effect per value, as many as cost at most ``loss`` dB.
+    """Remove the primitives and units with the least effect per value, as long as the loss is at most ``loss`` dB.
 
     Args:
         prices: effect of every primitive and unit on images, see :func:`price_cuts`.

@@ -69,8 +69,8 @@ _VALUES: dict[str, tuple[Any, ...]] = {
 
 
 def list_render_knobs(reference: RenderConfig, model: Primitives) -> dict[str, list[RenderConfig]]:
-    """Return setting -> render configurations that change only this setting. Reductions of fields are the settings
-    density.NAME and colour.NAME.
+    """Return setting -> render configurations that change only this setting. The settings ``density.NAME`` and
+    ``colour.NAME`` reduce a field.
     """
     cores, compared = core_count(), [name for name in backends.backend_names() if name != backends.REFERENCE]
     threads = sorted({1, 0, *(2**k for k in range(1, 7) if 2**k < cores)}) if cores > 1 else []
@@ -96,8 +96,10 @@ def measure_tradeoff(
     """Measure how a run's render settings trade quality for speed; write ``tradeoff.json``, ``tradeoff.html`` and
     ``front.png``.
 
+    ``tell`` is called with lines of text for the user, ``progress`` with (text, done fraction 0..1).
+
     Raises:
-        NeuprimError: run or setting do not exist, there are no test views, or overrides or the record are wrong.
+        NeuprimError: run, setting or test views do not exist, an override is invalid, or ``tradeoff.json`` is damaged.
     """
     folder = request.out or run_dir / TRADEOFF_FOLDER
     if request.out and folder.is_dir() and any(folder.iterdir()) and not (folder / TRADEOFF_FILE).exists():
@@ -133,7 +135,7 @@ class _RenderTradeoffSession(TradeoffSession):
         return self.setup, self.setup.parse(self.record.points[number].words)
 
     def single_changes(self, knobs: Mapping[str, list[RenderConfig]]) -> Iterator[tuple[str, RenderConfig]]:
-        """Yield (setting, configuration) that change the reference and can be rendered here; record the others."""
+        """Yield (setting, configuration) of each change that this machine can render; record the others as left out."""
         base = self.setup.backend(self.setup.reference).name
         for name, configs in self.choose_knobs(knobs).items():
             for config in configs:
@@ -144,7 +146,7 @@ class _RenderTradeoffSession(TradeoffSession):
                     yield name, config
 
     def measure(self, wanted: Sequence[tuple[str, RenderConfig]], part: float) -> None:
-        """Measure images and bytes of configurations that the record lacks, until ``part`` of the budget is used."""
+        """Measure quality and bytes of configurations that the record lacks, until ``part`` of the budget is used."""
         for number, (knob, config) in enumerate(wanted):
             words, points = self.setup.overrides(config), self.record.points
             if any(point.words == words for point in points):
@@ -157,7 +159,7 @@ class _RenderTradeoffSession(TradeoffSession):
             self.write_record()
 
     def draws_the_reference(self, point: TradeoffPoint) -> bool:
-        """Return whether a point has the reference's render settings and resolution; then only its model differs."""
+        """Return whether a point has the reference's render settings and resolution, so that only its model differs."""
         config, reference = self.setup.parse(point.words), self.setup.reference
         return config.settings == reference.settings and config.resolution == reference.resolution
 

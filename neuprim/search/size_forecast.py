@@ -54,7 +54,7 @@ def forecast_quality(lengths: Mapping[int, float], steps: float, gain: float = _
     """Predict the quality after ``steps`` from trials of one configuration.
 
     Args:
-        lengths: steps of each trial -> quality of the trial, dB.
+        lengths: training steps of a trial -> quality of this trial, dB.
         gain: assumed gain of the last doubling of steps, dB; used if there is only one trial.
     """
     tried = sorted(lengths)
@@ -76,8 +76,8 @@ def _sum_forecast_gains(gain: float, ratio: float, doublings: float) -> float:
 
 
 def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> tuple[float, float]:
-    """Bisect on a logarithmic scale between two numbers of primitives; return two close ones. ``is_low`` holds for the
-    first.
+    """Bisect on a logarithmic scale between two numbers of primitives. Return two close numbers: ``is_low`` is true for
+    the first and false for the second.
     """
     for _ in range(60):
         middle = math.sqrt(low * high)
@@ -87,13 +87,13 @@ def _bisect_count(low: float, high: float, is_low: Callable[[float], bool]) -> t
 
 @dataclass(frozen=True)
 class SizeCurve:
-    """Margin (predicted quality minus target, dB) as a function of log2 of the primitives; never decreases."""
+    """Curve of the margin (predicted quality minus target, dB) over log2 of the primitives. The curve never falls."""
 
     nodes: tuple[tuple[float, float], ...]
 
     @classmethod
     def fit(cls, tried: Sequence[tuple[int, float]]) -> SizeCurve:
-        """Fit a curve to (primitives, margin) pairs; neighbours with decreasing margins are replaced by their mean."""
+        """Fit a curve to (primitives, margin) pairs. Neighbours whose margins decrease get their mean margin."""
         blocks: list[tuple[list[float], float]] = []
         for count, margin in sorted(tried):
             blocks.append(([math.log2(count)], margin))
@@ -132,7 +132,7 @@ class SizeCurve:
         return self.at(primitives * 2**_APART) - self.at(primitives / 2**_APART)
 
     def find_count(self, wanted: float, highest: int) -> int | None:
-        """Return the least number of primitives, up to ``highest``, with the margin ``wanted``; None if none."""
+        """Return the least number of primitives that has the margin ``wanted``; None if it exceeds ``highest``."""
         if self.at(1) >= wanted:
             return 1
         if self.at(max(highest, 1)) < wanted:
@@ -141,8 +141,8 @@ class SizeCurve:
 
 
 class SizeProposal(NamedTuple):
-    """Next step of a size search: try ``primitives``, take them as the result, or report the target as unreachable with
-    them as the best.
+    """Next step of a search for the number of primitives: "try" runs trials with ``primitives``, "take" means that
+    ``primitives`` is the result, and "unreachable" that no number reaches the target and ``primitives`` comes closest.
     """
 
     kind: Literal["try", "take", "unreachable"]
@@ -150,12 +150,12 @@ class SizeProposal(NamedTuple):
 
 
 def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float, doubt: float) -> SizeProposal:
-    """Return the next step of a search for the smallest size with the margin ``wanted``.
+    """Return the next step of a search for the least number of primitives with the margin ``wanted``.
 
     Args:
-        tried: (primitives, margin) pairs, one or more.
-        highest: largest number of primitives allowed.
-        doubt: uncertainty of margins, dB; a target is only unreachable if it is missed by more.
+        tried: a pair (primitives, margin) for each number tried, one or more.
+        highest: limit on the number of primitives.
+        doubt: uncertainty of margins, dB. A target is only unreachable if it is missed by more than this.
     """
     curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
     found = curve.find_count(wanted, highest)
@@ -175,7 +175,7 @@ def propose_size(tried: Sequence[tuple[int, float]], highest: int, wanted: float
 
 
 def _move_from_tried_size(tried: int, found: int, highest: int) -> int:
-    """Return ``found``, moved far enough away from the only size tried to measure a slope between the two."""
+    """Return ``found``, or a number further from the only one tried if the two are too close to measure a slope."""
     step = math.log2(found / tried)
     if abs(step) < _APART:
         up, down = round(tried * 2**_APART), round(tried / 2**_APART)
@@ -187,7 +187,7 @@ def propose_best_size(tried: Sequence[tuple[int, float]], highest: int, worth: f
     """Return the next step of a search for the best quality with at most ``highest`` primitives.
 
     Args:
-        tried: (primitives, margin) pairs, one or more.
+        tried: a pair (primitives, margin) for each number tried, one or more.
         worth: least gain, in dB per doubling, that justifies more primitives.
     """
     curve, counts = SizeCurve.fit(tried), sorted({count for count, _ in tried})
@@ -211,7 +211,7 @@ class SizePredictor:
     """Predict margins (quality minus target, dB) of full runs from the record of a target search.
 
     Attributes:
-        steps: function that returns the steps of a full run for a number of primitives.
+        steps: function (number of primitives) -> training steps of a full run.
     """
 
     target: SearchTarget
@@ -224,7 +224,7 @@ class SizePredictor:
         return tuple(self.target.quality) or ("psnr",)
 
     def margin(self, values: Mapping[str, float]) -> float:
-        """Return the smallest excess over the target, dB; the PSNR itself if the target has no quality."""
+        """Return the smallest excess of ``values`` over the target, dB; if the target sets no quality, the PSNR."""
         wanted = self.target.quality
         if not wanted:
             return values["psnr"]
@@ -265,7 +265,7 @@ class SizePredictor:
         return forecasts | {n: Forecast(value, ALLOWANCE) for n, value in full.items()}
 
     def _relevant(self, *purposes: Purpose) -> list[Attempt]:
-        """Return trainings that have, for every changed setting, the current value or an earlier one."""
+        """Return finished trainings whose changed settings all have the current value or one adopted earlier."""
         history = self.record.history
         finished = self.record.finished(*purposes)
         return [a for a in finished if all(value in history(key) for key, value in a.words.items())]
@@ -283,10 +283,10 @@ class SizePredictor:
         return to_forecast_decibels(name, attempt.measured(name)) - loss
 
     def margins(self) -> list[tuple[int, float]]:
-        """Return (primitives, margin) for every size that was trained.
+        """Return a pair (primitives, margin) for every number of primitives that was trained.
 
-        The forecast of a size is limited to the margins of smaller and larger full runs. Between a full run that misses
-        the target and one that meets it, only full runs are returned.
+        A forecast is limited to the margins of smaller and larger full runs. Between a full run that misses the target
+        and one that meets it, only full runs are returned.
         """
         margins = {
             n: self.margin({name: from_forecast_decibels(name, f.value) for name, f in values.items()})
@@ -307,11 +307,11 @@ class SizePredictor:
 
     @property
     def doubt(self) -> float:
-        """Uncertainty of a margin, dB, at the size where it is smallest."""
+        """Uncertainty of the margins, dB: the smallest over all sizes."""
         return min((max(f.doubt for f in values.values()) for values in self.forecasts().values()), default=1.0)
 
     def predict(self, primitives: int) -> dict[str, list[float]]:
-        """Return measure -> [value, uncertainty in dB] of a full run with this number of primitives."""
+        """Predict a full run with this number of primitives: quality measure -> [value, uncertainty in dB]."""
         forecasts = self.forecasts()
         nearest = min(forecasts, key=lambda n: abs(math.log2(n / primitives)))
         predicted = {}
@@ -321,7 +321,7 @@ class SizePredictor:
         return predicted
 
     def limit(self) -> int | None:
-        """Return the most primitives within the limits of bytes and speed; None without limits or trials."""
+        """Return the most primitives that the limits of bytes and speed allow; None without a limit or a trial."""
         trials = [a for a in self._relevant("size", "full") if a.packed]
         limits: list[tuple[list[tuple[int, float]], float]] = []
         if self.target.megabytes is not None:
@@ -347,7 +347,7 @@ def format_target_forecast(name: str, value: float, doubt: float) -> str:
 
 
 def exceeded_limit(target: SearchTarget, attempt: Attempt, packed: int | None = None) -> str | None:
-    """Return a message that says which limit of a target a trained model exceeds; None if none."""
+    """Return a message that says which limit of a target a trained model exceeds; None if it exceeds none."""
     size = attempt.packed if packed is None else packed
     if target.megabytes is not None and size > 1e6 * target.megabytes:
         return f"{size / 1e6:.3f} MB are more than target.megabytes={target.megabytes:g}"

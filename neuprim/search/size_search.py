@@ -66,10 +66,9 @@ _MAX_REFUSED = 2  # values of a setting that may fail before the search leaves i
 
 
 def list_smaller_settings(config: RunConfig, task: TaskSpec, dataset: Dataset) -> dict[str, tuple[SettingValue, ...]]:
-    """Return setting -> values that need fewer parameter values per primitive, the smallest first, the current value
-    last.
+    """Return setting -> values, for settings that can reduce the number of parameters per primitive.
 
-    The setting that can save most comes first.
+    Values are sorted by the number of parameters; the current one is last. The setting that can save most is first.
     """
 
     def count_numbers(config: RunConfig) -> int:
@@ -98,8 +97,8 @@ def propose_setting_trial(
 ) -> tuple[str, SettingValue, SettingValue] | None:
     """Return (setting, current value, value to try) of the next trial; None if no trial is left.
 
-    The trial takes the middle of the remaining smaller values. If it was refused, the next trial is closer to the
-    current value.
+    The trial takes the middle of the remaining smaller ``values`` (:func:`list_smaller_settings`). If the changes tried
+    so far (``turns``) were not adopted, the trial is closer to the current value.
     """
     for key, ladder in values.items():
         own = [turn for turn in turns if turn.key == key]
@@ -115,8 +114,8 @@ def setting_change_pays(loss: float, size: float, slope: float) -> bool:
     """Return whether a changed setting makes a model of equal quality smaller.
 
     Args:
-        loss: loss of quality at equal primitives, dB.
-        size: bytes per primitive, divided by those before the change.
+        loss: loss of quality by the change, at an equal number of primitives, dB.
+        size: bytes per primitive after the change, divided by those before.
         slope: gain of quality by twice as many primitives, dB.
     """
     return bool(size * 2 ** (max(loss, 0.0) / slope) < _PAYS)
@@ -140,7 +139,7 @@ class SizeSearch:
         return self.config.train.iterations or math.inf
 
     def full_steps(self, primitives: int) -> float:
-        """Return the number of steps for which a full run of this size fits into its part of the budget."""
+        """Return how many training steps of this many primitives fit into a full run's share of the budget."""
         return min(self.max_steps, max(_FULL * self.record.asked["budget"] / self.runner.pace(primitives), 1.0))
 
     @property
@@ -159,7 +158,7 @@ class SizeSearch:
                 self.record.stage = number
 
     def _measure_pace(self) -> None:
-        """Measure the time per step in a few steps; from it, choose the number of steps of a trial."""
+        """Measure the time per step in a short training, and choose the number of training steps of a trial."""
         if self.record.length:
             return
         (first,) = self.runner.run(Attempt("pace", {}, self.config.model.count, int(min(_PACE_STEPS, self.max_steps))))
@@ -193,7 +192,7 @@ class SizeSearch:
         return max(1, min([low, *saturated, *([] if limit is None else [limit])]))
 
     def _try_size(self, primitives: int) -> None:
-        """Train a size for two lengths, to measure the gain by more steps."""
+        """Run two trials with this number of primitives, one twice as long, to measure the gain by more steps."""
         length, words = self.record.length, self.record.words
         attempts = [Attempt("size", words, primitives, steps) for steps in (length // 2, length)]
         for several in [attempts] if self.runner.parallel else [[attempt] for attempt in attempts]:
@@ -203,7 +202,7 @@ class SizeSearch:
                     self.runner.notify(_describe_attempt(done, self.predictor.predict(done.count)))
 
     def _try_sizes(self) -> None:
-        """Try sizes until the one for the target is known, the time for trials is used, or no size promises more."""
+        """Run trials of different numbers of primitives until the best number is known or the time for them is used."""
         first = min(self.config.model.count, self._highest())
         self._try_size(first)
         lengthened = False
@@ -261,9 +260,9 @@ class SizeSearch:
         return max(found, 1)
 
     def _least_useful(self) -> int:
-        """Return the smallest number of primitives worth another full run, while all full runs exceed the target.
+        """Return the least number of primitives for the next full run; 1 unless all full runs so far exceed the target.
 
-        Short trials of different sizes often have similar quality, unlike full runs.
+        Trials alone would propose too few: short trials of different sizes often have similar quality.
         """
         full = [(a.count, self.predictor.margin_of(a)) for a in self.record.finished("full")]
         if not full or min(margin for _, margin in full) < MIN_MARGIN:
@@ -272,7 +271,7 @@ class SizeSearch:
         return round(count / 2 ** ((margin - MIN_MARGIN) / _MIN_SLOPE))
 
     def _report_reach(self) -> None:
-        """Report that the target cannot be reached, as soon as trials show it."""
+        """If the trials show that the target cannot be reached, tell the user and store the message in the record."""
         if not self.target.quality:
             return
         predictor, best = self.predictor, self._wanted()
@@ -288,7 +287,7 @@ class SizeSearch:
         self.runner.notify(self.record.out_of_reach)
 
     def _change_settings(self) -> None:
-        """Try settings that save bytes, at the size tried that is closest to :meth:`_wanted`."""
+        """Try changes of settings that save bytes, with the number of primitives tried closest to :meth:`_wanted`."""
         if self.record.out_of_reach or not (self.target.quality or self.target.megabytes is not None):
             return
         values = list_smaller_settings(self.config, load_config_task(self.config), self.dataset)
@@ -324,7 +323,7 @@ class SizeSearch:
     # ------------------------------------------------------------ full runs
 
     def _run_full(self) -> None:
-        """Train full runs while the target is missed or exceeded by too much, and time is left."""
+        """Train full runs until one meets the target without exceeding it by much, or until time is up."""
         for _ in range(_MAX_FULL - (len(self.record.finished("full")) - self.record.before)):
             unfinished = [a for a in self.record.attempts if a.purpose == "full" and a.outcome is None]
             if not unfinished and any(self._is_good(a) for a in self.record.finished("full")):

@@ -74,11 +74,11 @@ def run_target(
     The directory of ``config`` becomes a run directory with ``target.json`` and ``model.neuprim``.
 
     Args:
-        config: the run. Its number of primitives is the first size to try; its iterations are the largest number.
+        config: settings of the run. Its number of primitives is the first to try; its iterations limit a full run.
         target: quality to reach, and limits of size and speed.
         budget: seconds for search, training and measuring; compiling kernels does not count.
         clock: function that returns monotonic seconds.
-        launcher: where to train.
+        launcher: settings of the launcher that runs the trainings.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C; the same call with ``resume`` continues.
@@ -112,7 +112,7 @@ def run_target(
 
 
 def choose_target_hold_out(dataset: Dataset) -> int:
-    """Return n to hold out every n-th training view: 8, or fewer (at least 2) below 64 training views."""
+    """Return n if every n-th training view is to be held out: 8, or 2 to 7 for fewer than 64 training views."""
     count = len(dataset.train)
     if count < 4:
         raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out")
@@ -135,8 +135,8 @@ def _check_target_config(config: RunConfig) -> None:
 
 
 def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetRecord:
-    """Return the record of the earlier search. With another target or budget its trainings are reused, and the time
-    used restarts at 0.
+    """Return the record of an earlier search in the run's directory, or a new record. If the target or the budget has
+    changed, the new record has the finished trainings, and its used time is 0.
     """
     folder, own = config.output_dir, (*NOT_TRAINED_WITH, "made_by")
     same: dict[str, Any] = json.loads(json.dumps({k: v for k, v in config.to_dict().items() if k not in own}))
@@ -166,7 +166,7 @@ class _TargetResult:
         run_dir: the run directory, or the directory of the pruned model in it.
         held, test: PSNR and SSIM of held-out training views and of test views.
         packed: bytes of the smallest model file.
-        facts: entries that these steps add to the record.
+        facts: entries that pruning and quantization add to :attr:`TargetRecord.achieved`.
     """
 
     run_dir: Path
@@ -177,8 +177,8 @@ class _TargetResult:
 
 
 def choose_full_run(predictor: SizePredictor) -> Attempt:
-    """Return the full run with the smallest file that meets the target, with room for quantization if possible; else
-    the best.
+    """Return the full run with the smallest file of those that meet the target; if none does, the best full run. Full
+    runs that leave room for the loss by quantization are preferred.
     """
     finished = predictor.record.finished("full")
     within = [a for a in finished if exceeded_limit(predictor.target, a) is None] or finished
@@ -250,7 +250,7 @@ def _measure_target_held_out(runner: TrialRunner, model: Primitives) -> dict[str
 def _prune_full_run(
     runner: TrialRunner, predictor: SizePredictor, attempt: Attempt, before: _TargetResult
 ) -> _TargetResult:
-    """Prune the model as far as the target allows, in half of the time left; return ``before`` if useless."""
+    """Return the result after pruning as far as the target allows, in half of the time left; else ``before``."""
     record, margin = runner.record, predictor.margin(before.held)
     if not predictor.target.quality or margin < 0:
         return before
@@ -281,8 +281,8 @@ def _prune_full_run(
 
 
 def _quantize_target_model(runner: TrialRunner, predictor: SizePredictor, before: _TargetResult) -> _TargetResult:
-    """Quantize the model as coarsely as the target allows. If the target is missed anyway, lose at most
-    :data:`ALLOWANCE` dB more. If there is only a limit of bytes, quantize as finely as the limit allows.
+    """Quantize the model as coarsely as the target allows. If the model misses the target already, lose at most
+    :data:`ALLOWANCE` dB more. If the target is only a limit of bytes, quantize as finely as the limit allows.
     """
     target, task, file = predictor.target, load_config_task(runner.config), before.run_dir / COMPRESSED
     model, header = load_model_checkpoint(before.run_dir / "model.safetensors", task)

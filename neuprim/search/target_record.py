@@ -37,12 +37,13 @@ class Attempt:
     """One training of a target search.
 
     Attributes:
-        purpose: what the training measures; "full" is a candidate for the result.
-        words: changed settings except the number of primitives, e.g. {"model.sh_degree": 1}.
+        purpose: "pace" measures the time per step, "size" a number of primitives, "knob" a changed setting. "full" is a
+            full run: a candidate for the result. The others are trials.
+        words: setting -> changed value, except the number of primitives, e.g. {"model.sh_degree": 1}.
         primitives, steps: requested numbers of primitives and training steps.
         max_seconds: time limit of a full run; None for trials.
-        predicted: measure -> [value, uncertainty in dB], predicted before a full run.
-        outcome: fields of :class:`neuprim.search.trials.Outcome`, on held-out training views.
+        predicted: quality measure -> [predicted value, uncertainty in dB], for full runs.
+        outcome: fields of :class:`neuprim.search.trials.Outcome`, on held-out training views; None until finished.
         packed: bytes of the model when compressed at the default level.
         seconds: time of training and evaluation together, by the search's clock.
     """
@@ -82,12 +83,12 @@ class Attempt:
 
 @dataclass
 class SettingChange:
-    """A setting that a target search changed to save bytes.
+    """A change of one setting that a target search tried, to save bytes.
 
     Attributes:
-        loss: measure -> loss by the change at equal primitives, dB.
-        size: bytes per primitive, divided by those before the change.
-        adopted: whether the change makes a model of equal quality smaller.
+        loss: quality measure -> loss in dB, at an equal number of primitives.
+        size: bytes per primitive after the change, divided by those before.
+        adopted: whether the search keeps the change, because it makes a model of equal quality smaller.
     """
 
     key: str
@@ -103,17 +104,17 @@ class TargetRecord:
     """Content of ``target.json``.
 
     Attributes:
-        asked: the requested target and budget in seconds.
-        same: configuration that must be equal to reuse the trainings.
-        hold_out: n: every n-th training view is held out and used to evaluate trainings.
+        asked: requested values of the target, and the "budget" in seconds.
+        same: settings that must be equal to reuse the trainings.
+        hold_out: n if every n-th training view is held out. The held-out views evaluate the trainings.
         stage: number of finished stages of the search.
-        length: steps of a trial; 0 until the time per step is known.
+        length: training steps of a trial; 0 until the time per step is known.
         spent: seconds of the budget used so far.
         before: number of full runs made for an earlier target.
-        turns: settings that were tried to save bytes.
-        chosen: folder of the chosen full run.
-        achieved: result: quality of test and held-out views, bytes, frames per second.
-        out_of_reach: the message that the target is out of reach, if trials show it.
+        turns: changes of settings that were tried to save bytes.
+        chosen: name of the folder of the full run that was chosen as the result.
+        achieved: measurements of the result: quality of test and held-out views, bytes, frames per second.
+        out_of_reach: message that the target cannot be reached; None unless trials show this.
         why: reasons why the search ended; warning: message that the target was missed.
     """
 
@@ -134,11 +135,11 @@ class TargetRecord:
 
     @property
     def words(self) -> dict[str, SettingValue]:
-        """Setting -> value of the changes adopted so far."""
+        """Setting -> new value, of the changes adopted so far."""
         return {turn.key: turn.after for turn in self.turns if turn.adopted}
 
     def history(self, key: str) -> list[SettingValue]:
-        """Return the adopted values of a setting, from the first to the current one."""
+        """Return all values that a changed setting has had, the current one last; [] if it was never changed."""
         own = [turn for turn in self.turns if turn.adopted and turn.key == key]
         return [own[0].before, *(turn.after for turn in own)] if own else []
 
@@ -156,7 +157,7 @@ class TargetRecord:
 
 
 def read_target_record(folder: Path) -> TargetRecord | None:
-    """Read the record of a target search from its run directory; None if there is none.
+    """Read ``target.json`` in a run directory; return None if there is no such file.
 
     Raises:
         DataError: the file is damaged.
@@ -179,9 +180,9 @@ def _parse_target_record(data: Mapping[str, Any]) -> TargetRecord:
 
 
 def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> float:
-    """Predict the time for a number of primitives from (primitives, time) pairs, by a least-squares line.
+    """Predict a time for a number of primitives by a least-squares line through known (primitives, time) pairs.
 
-    The line neither decreases nor is negative at 0 primitives.
+    The line never decreases, and is not negative at 0 primitives.
     """
     counts, times = [float(n) for n, _ in known], [t for _, t in known]
     mean_n, mean_t = sum(counts) / len(counts), sum(times) / len(times)
@@ -195,7 +196,7 @@ def forecast_time(known: Sequence[tuple[int, float]], primitives: float) -> floa
 
 @dataclass
 class TrialRunner:
-    """Runs the trainings that a target search requests, except those whose outcome is in the record.
+    """Run the trainings that a target search requests. A training whose outcome is in the record is not repeated.
 
     Attributes:
         config: configuration from which the search starts; dataset: the whole scene.
@@ -231,9 +232,9 @@ class TrialRunner:
         self.events(Note(text))
 
     def configure(self, attempt: Attempt) -> RunConfig:
-        """Return the configuration of a training, with the training's own folder.
+        """Return the configuration of a training, which writes to a folder of its own.
 
-        Population control intervenes as often as in a full run: with fewer interventions short trials lose 0.5 dB.
+        Population control intervenes as often as in a full run. With fewer interventions, short trials lose 0.5 dB.
         """
         whole, every = self.config.train.iterations, self.config.train.population.every
         if whole is not None and attempt.steps < whole:
@@ -252,9 +253,9 @@ class TrialRunner:
         return any(a.repeats(attempt) and a.outcome is not None for a in self.record.attempts)
 
     def run(self, *wanted: Attempt) -> list[Attempt]:
-        """Train the attempts that the record does not have; return all attempts with their outcomes.
+        """Train the requested attempts that have no outcome in the record; return all of them with their outcomes.
 
-        After KeyboardInterrupt an attempt is unfinished in the record; the same call resumes it from its checkpoint.
+        A KeyboardInterrupt leaves an unfinished attempt in the record. The same call resumes it from its checkpoint.
         """
         attempts = [next((a for a in self.record.attempts if a.repeats(one)), one) for one in wanted]
         todo = [attempt for attempt in attempts if attempt.outcome is None]
@@ -308,7 +309,7 @@ class TrialRunner:
         return forecast_time(list({a.count: a.measured("pace") for a in trained}.items()), primitives)
 
     def overhead(self) -> float:
-        """Return the seconds of a trial besides its training steps: initialization and evaluation."""
+        """Return the seconds that a trial needs in addition to its training steps, to initialize and evaluate."""
         finished = self.record.finished("size") or self.record.finished("pace")
         return max([0.0, *(a.seconds - a.measured("pace") * a.steps for a in finished[-3:])])
 

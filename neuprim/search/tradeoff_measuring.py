@@ -111,7 +111,7 @@ def load_tradeoff_setup(
 
     Args:
         overrides: render settings of the reference configuration, on top of the run's.
-        views: number of evaluation views, evenly spread over the test views.
+        views: limit on the number of evaluation views, which are evenly spread over the test views.
         lpips: weights for LPIPS; None for those of the run.
         loaded: data set and evaluation views, if they are loaded already.
 
@@ -165,8 +165,8 @@ def describe_tradeoff_setup(setup: TradeoffSetup) -> dict[str, Any]:
 
 
 def measure_point(setup: TradeoffSetup, knob: str, config: RenderConfig) -> TradeoffPoint:
-    """Measure a render configuration, which changes the setting ``knob``: mean image metrics over the views, and bytes
-    of the model file.
+    """Measure a render configuration that changes the setting ``knob``. Return a point with the mean image metrics over
+    the views and the bytes of the model file.
     """
     model, draw = setup.prepare_model(config), setup.renderer(config)
     rows: list[dict[str, float]] = []
@@ -203,13 +203,15 @@ def time_tradeoff_points(
 ) -> None:
     """Measure frame times of points in rounds. The first point is the reference, rendered several times in every round.
 
-    In a round, every point that lacks rounds renders every view, in random order. Each frame is rendered twice and
-    the second time counts, with the model in the caches. A round adds to a point its mean milliseconds per frame, and
-    a ratio: the median over views of its time divided by the reference's. Brief load of the machine has no effect.
+    In a round, every point that lacks rounds renders every view, in random order. Each frame is rendered twice. Only
+    the second time counts, because the model is then in the caches. A round adds to each point the mean milliseconds
+    per frame, and the frame time divided by the reference's. The latter is a median over views, so brief load of the
+    machine has no effect.
 
     Args:
         repeats: number of rounds that each point should have, including earlier ones.
-        deadline: value of :func:`time.monotonic`; a round after the first only starts if it should end before.
+        deadline: value of :func:`time.monotonic` at which to end. The first round always runs; another one only if it
+            is expected to end in time.
         done: called with (round, number of rounds) after each round.
     """
     order = torch.Generator().manual_seed(len(timed[0].point.ms))
@@ -251,10 +253,10 @@ class TradeoffRequest:
     """Request for a trade-off, with the arguments of ``neuprim tradeoff``.
 
     Attributes:
-        words: overrides of the reference: render settings of a finished run, or settings of ``neuprim run`` for models
-            to train.
-        budget: approximate seconds; measurements that do not fit are left out.
-        views: number of held-out views to measure, evenly spread.
+        words: overrides of the reference. For a finished run they are render settings; to train models, they are
+            overrides of ``neuprim run``.
+        budget: approximate time in seconds; measurements that do not fit are left out.
+        views: limit on the number of held-out views to measure; they are evenly spread.
         repeats: number of rounds of timing.
         knobs: names of the settings to vary; empty for all.
         lpips: weights for LPIPS; None for those of the run.
@@ -271,10 +273,11 @@ class TradeoffRequest:
 
 
 class TradeoffSession:
-    """Measure the points of a trade-off within a budget, find the Pareto fronts, and write record and page.
+    """Measure the points of a trade-off within a budget, find the Pareto fronts, and write the record and a page.
 
     Args:
         folder: folder for ``tradeoff.json`` and its page.
+        progress: called with (text, done fraction 0..1).
     """
 
     def __init__(self, folder: Path, request: TradeoffRequest, record: TradeoffRecord, progress: Progress) -> None:
@@ -291,14 +294,14 @@ class TradeoffSession:
 
     @property
     def no_time(self) -> str:
-        """Reason, for the record, why a point is not measured when no time is left."""
+        """Text for the record that says why a point was not measured when no time was left."""
         return f"no time left of the budget of {self.request.budget:g} s"
 
     def write_record(self) -> None:
         self.record.write(self.folder / TRADEOFF_FILE)
 
     def choose_knobs(self, knobs: Mapping[str, list[T]]) -> dict[str, list[T]]:
-        """Return the values of the settings that the request names; record settings without another value."""
+        """Return setting -> values for the settings that the request names; record those without another value."""
         chosen = {name: own for name, own in knobs.items() if not self.request.knobs or name in self.request.knobs}
         for name, own in chosen.items():
             if not own:
@@ -306,7 +309,7 @@ class TradeoffSession:
         return chosen
 
     def take_times(self, part: float) -> None:
-        """Measure frame times of all points that lack rounds, until the fraction ``part`` of the budget is used."""
+        """Measure frame times of all points with too few rounds, until the fraction ``part`` of the budget is used."""
         timed = []
         for number, point in enumerate(self.record.points):
             setup, config = self.point_setup(number)
@@ -320,13 +323,13 @@ class TradeoffSession:
         time_tradeoff_points(timed, self.request.repeats, views, deadline, note_round)
 
     def write_results(self, command: Callable[[Sequence[str]], str]) -> None:
-        """Write record, page and chart of the fronts; ``command`` returns the command that reproduces a point."""
+        """Write record, page and chart of the fronts; ``command`` makes a point's command line from its overrides."""
         self.write_record()
         self.progress("pictures of the front", 0.0)
         write_tradeoff_page(self.folder, self.record.to_dict(), self._render_front_pictures(), command)
 
     def _render_front_pictures(self) -> dict[int, TradeoffPicture]:
-        """Return point number -> picture of the points on the fronts, in the view with most contrast; -1: truth."""
+        """Return pictures of the points on the fronts by number, in the view with most contrast; -1: ground truth."""
         setup, _ = self.point_setup(0)
         view = max(setup.views, key=lambda one: float(setup.channels.display(one.image).var()))
         truth = setup.display(view.image)
@@ -341,7 +344,7 @@ class TradeoffSession:
 
 
 def check_knobs(request: TradeoffRequest, known: Iterable[str], owner: str) -> None:
-    """Raise ConfigError if the request names a setting that is not ``known``; ``owner`` is for the message."""
+    """Raise ConfigError if the request names a setting that is not ``known``, i.e. that ``owner`` does not have."""
     for name in request.knobs:
         if name not in (names := list(known)):
             raise ConfigError(f"--vary {name}: no such setting of {owner}{nearest(name, names)}")

@@ -79,8 +79,8 @@ class ParetoStep(NamedTuple):
 def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> list[tuple[str, ...]]:
     """Return combinations of overrides that are expected on the Pareto front: two or more settings, one override each.
 
-    Gains and losses are assumed to add up; the combinations are measured later. Each combination adds to the previous
-    one the step with the least loss per gain, which changes another setting or changes the same setting further.
+    Gains and losses are assumed to add up; the combinations are measured later. Each combination extends the previous
+    one by the step with the least loss per gain. A step changes one more setting, or changes a setting further.
     """
     state: dict[str, ParetoStep] = {}
     chain: list[tuple[str, ...]] = []
@@ -101,7 +101,9 @@ def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> l
 def combine_pareto_steps(
     directions: Sequence[Sequence[ParetoStep]], known: Sequence[Sequence[str]], most: int
 ) -> list[tuple[str, ...]]:
-    """Return at most ``most`` new combinations, evenly spread along each direction's chain, taken in turn."""
+    """Return at most ``most`` combinations that are not ``known``. A direction is a list of steps with one goal, e.g.
+    fewer bytes. The combinations are evenly spread along the directions' chains (:func:`chain_pareto_steps`).
+    """
     taken = {frozenset(overrides) for overrides in known}
     chains = [[way for way in chain_pareto_steps(steps) if frozenset(way) not in taken] for steps in directions]
     chosen: dict[frozenset[str], tuple[str, ...]] = {}
@@ -133,7 +135,7 @@ class TradeoffPoint:
         quality: psnr, ssim, ssim_3dgs; lpips and lpips_3dgs if there are weights.
         bytes: size of the model file.
         ms: mean milliseconds per frame in each round; ratios: frame time divided by the reference's in each round.
-        turned, length: for trained models: overrides on top of the centre's, and fraction of the full training.
+        turned, length: for trained models: overrides on top of the centre's, and fraction of the full training length.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         run_dir: run directory, relative to the record's folder; empty unless trained.
     """
@@ -166,7 +168,7 @@ class TradeoffPoint:
 
     @property
     def time(self) -> float:
-        """Milliseconds per frame; for trained models the centre's times the ratio, because load varies by round."""
+        """Milliseconds per frame. For trained models they are ``ratio * centre_ms``, because load varies by round."""
         if self.centre_ms:
             return self.ratio * self.centre_ms
         return statistics.median(self.ms) if self.ms else float("nan")

@@ -39,11 +39,11 @@ _FEW_STEPS = 64  # with fewer steps, a single slow one would spoil the mean of t
 
 @dataclass(frozen=True)
 class Trial:
-    """Request for a short training, in the ``output_dir`` of its configuration.
+    """Request for a trial: a short training in the ``output_dir`` of ``config``.
 
     Attributes:
         hold_out: n > 1: hold out every n-th training view for evaluation; 0: evaluate on the test views.
-        views: evaluate at most this many views, evenly spread.
+        views: limit on the number of views to evaluate; they are evenly spread.
     """
 
     config: RunConfig
@@ -53,12 +53,12 @@ class Trial:
 
 @dataclass(frozen=True)
 class Outcome:
-    """Result of a trial, a short training.
+    """Measured result of a trial.
 
     Attributes:
         psnr, ssim: means over the evaluation views, in the data set's colour space.
         bytes: size of ``model.safetensors``.
-        seconds: time of training; pace: seconds per step.
+        seconds: time of the training. pace: seconds per training step.
         ms_per_frame: median render time over the evaluation views.
     """
 
@@ -75,7 +75,13 @@ class Outcome:
 
 @dataclass(frozen=True)
 class TrialRecord:
-    """Content of ``trial.json``: requested settings, largest number of evaluation views, outcome if finished."""
+    """Content of ``trial.json``.
+
+    Attributes:
+        asked: settings of the requested trial.
+        views: limit on the number of views to evaluate.
+        outcome: result of the trial; None until the trial is finished.
+    """
 
     asked: dict[str, Any]
     views: int
@@ -87,7 +93,7 @@ class TrialFailed(NeuprimError):
 
 
 def read_trial(folder: Path) -> TrialRecord | None:
-    """Read the record of the trial in a folder; None if there is none.
+    """Read ``trial.json`` in a trial's folder; return None if there is no such file.
 
     Raises:
         DataError: ``trial.json`` is damaged.
@@ -101,12 +107,12 @@ def read_trial(folder: Path) -> TrialRecord | None:
 
 
 def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ignore_run_event) -> Outcome:
-    """Train and evaluate a trial, or read its stored outcome; return the outcome.
+    """Train and evaluate a trial; return its outcome. If the trial is finished already, return the stored outcome.
 
-    Ctrl-C finishes the step, writes a checkpoint and raises KeyboardInterrupt; the same call resumes.
+    Ctrl-C finishes the training step, writes a checkpoint and raises KeyboardInterrupt. The same call then resumes.
 
     Args:
-        dataset: the whole scene of the configuration, if it is loaded already.
+        dataset: data of the whole scene, if they are loaded already.
 
     Raises:
         DataError: the folder holds another run, or a damaged ``trial.json``.
@@ -164,7 +170,7 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
 
 
 def _trial_request(trial: Trial) -> dict[str, Any]:
-    """Return the settings that must be equal to reuse a trial's folder, as they look after reading them from JSON."""
+    """Return the settings that must be equal to reuse a trial's folder, converted to JSON and back."""
     config = replace(trial.config, made_by=current_config_provenance(trial.config, load_config_task(trial.config)))
     settings = {name: value for name, value in config.to_dict().items() if name not in NOT_TRAINED_WITH}
     request: dict[str, Any] = json.loads(json.dumps({**settings, "hold_out": trial.hold_out}))
@@ -177,7 +183,7 @@ _trial_datasets: dict[str, Dataset] = {}  # scene of this worker's last trial; a
 
 
 def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outcome:
-    """Run a trial as a launcher's job. The trial resumes if its ``trial.json`` has the same request."""
+    """Run a trial in a launcher's worker. Resume the trial if ``trial.json`` in its folder has the same settings."""
     config = RunConfig.from_dict(data["config"])
     key = json.dumps([config.task, config.scene_name, config.scene, config.seed], sort_keys=True)
     if key not in _trial_datasets:
@@ -189,10 +195,10 @@ def run_trial_job(data: Mapping[str, Any], attempt: int, events: Events) -> Outc
 def launch_trials(
     trials: Sequence[Trial], settings: LauncherSettings, folder: Path, progress: Callable[[float], None]
 ) -> list[JobResult]:
-    """Run trials as launcher jobs in the folder of a search; return for each its outcome, or why it failed.
+    """Run trials as jobs of a launcher; return a result for each trial: its outcome, or why it failed.
 
     Args:
-        progress: called with the finished fraction.
+        progress: called with the finished fraction of all trials, 0..1.
 
     Raises:
         KeyboardInterrupt: after Ctrl-C; finished trials stay on disk, unfinished ones have checkpoints.
@@ -222,7 +228,7 @@ def launch_trials(
 
 
 def get_trial_setting(config: RunConfig, key: str) -> Any:
-    """Return the value of a setting by its key on the command line; None if the configuration lacks it."""
+    """Return the value of the setting ``key``, e.g. ``model.sh_degree``; None if the configuration lacks it."""
     node: Any = config.to_dict()
     for part in key.split("."):
         node = node.get(part) if isinstance(node, Mapping) else None

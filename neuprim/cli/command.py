@@ -54,10 +54,10 @@ class Command:
         call: runs the command with the parsed arguments and returns the exit status.
         add_arguments: adds the command's own arguments to its parser.
         epilog: text below the arguments in ``neuprim NAME --help``, or a function that makes it from the typed words.
-        settings: for the help: what ``KEY=VALUE`` sets; empty if a command has no settings. Settings may be anywhere on
-            the command line, and become ``arguments.overrides``.
-        take_rest: function (arguments, words that argparse does not know, parser) that stores words which the command
-            accepts, and returns the others, which are refused.
+        settings: help text that says what ``KEY=VALUE`` sets; empty if the command has no settings. Settings may be
+            anywhere on the command line, and become ``arguments.overrides``.
+        take_rest: function (arguments, rest, parser) for ``rest``, the words that argparse does not know. It stores the
+            words that the command accepts, and returns the others, which are then refused.
         opens_run: whether the command takes an existing run directory; if so, ``RUN_DIR`` and ``--trust`` are added.
     """
 
@@ -102,8 +102,8 @@ class Command:
 
 
 def add_trust_flag(parser: argparse.ArgumentParser) -> None:
-    """Add ``--trust``, with which a stored configuration may name addresses and folders outside its run
-    (:mod:`neuprim.config.stored_run`).
+    """Add the flag ``--trust``. It allows a stored configuration to name network addresses, and folders outside its run
+    directory (:mod:`neuprim.config.stored_run`).
     """
     text = "allow what a stored config.yaml names: network addresses, and folders outside of the run to write to"
     parser.add_argument(FLAG, action="store_true", help=text)
@@ -145,9 +145,9 @@ def split_settings(words: Sequence[str], parser: argparse.ArgumentParser) -> tup
 def take_condition_arguments(
     arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser
 ) -> list[str]:
-    """Set ``arguments.conditions``, name -> text, from the flags that the run's task defines.
+    """Parse ``rest``, the words that argparse does not know, as conditions of the run's task; refuse other words.
 
-    Other words are refused. ``arguments.run`` becomes the loaded run, or its directory if ``rest`` is empty.
+    Set ``arguments.conditions``, name -> text, and ``arguments.run``: the run directory, or the run if it was loaded.
     """
     arguments.conditions, arguments.run = {}, arguments.run_dir
     if not rest:

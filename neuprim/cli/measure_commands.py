@@ -320,7 +320,7 @@ def _print_fronts(folder: Path, record: TradeoffRecord, commands: Sequence[str])
 
 
 def _list_front_rows(record: TradeoffRecord, numbers: Sequence[int]) -> list[Sequence[str]]:
-    """Return table rows for the reference and the points of a Pareto front, numbered like the printed commands."""
+    """Return a table with the reference and the points ``numbers`` of a Pareto front, numbered like the commands."""
     trained = bool(record.points[0].run_dir)
     names = ["#", "time", "ms", "frames/s", "PSNR", "SSIM", "bytes", *(["ms/step"] if trained else [])]
     first = ("centre" if trained else "ref.", *_format_printed_point(record.points[0]))

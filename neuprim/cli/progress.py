@@ -51,7 +51,9 @@ class RunProgress(_ProgressBar):
     """Progress display of one run: a context manager, and a listener that is called with the run's events.
 
     Args:
-        search: whether the run is a search with many short trainings. Without a terminal it only shows notes.
+        title: text at the beginning of every line, e.g. ``static/solids``.
+        search: whether the run is a search with many short trainings. Output that is not a terminal then gets only the
+            texts of :class:`~neuprim.runs.fit.Note` events.
     """
 
     def __init__(self, title: str, console: Console | None = None, search: bool = False) -> None:
@@ -114,7 +116,7 @@ class RunProgress(_ProgressBar):
 
 
 def _format_time_left(seconds: float, fraction: float) -> str:
-    """Return ", about 40 s left", estimated from the done ``fraction`` and its time; empty below 1 % done."""
+    """Return e.g. ", about 40 s left" if ``fraction`` of the work took ``seconds``; "" below 1 % and at the end."""
     if not 0.01 <= fraction < 1.0:
         return ""
     left = seconds * (1.0 - fraction) / fraction
@@ -141,7 +143,7 @@ class DrawProgress(_ProgressBar):
 
 
 def print_notes(event: Event) -> None:
-    """Print an event if it is a note, for commands whose result is their notes."""
+    """Print the text of an event if it is a :class:`~neuprim.runs.fit.Note`; ignore all other events."""
     if isinstance(event, Note):
         print(event.text)
 
@@ -153,7 +155,7 @@ _LINE_INTERVAL = 0.25
 
 
 class RunLaunchProgress:
-    """Progress display of several runs, called with their statuses: a table on a terminal, else occasional lines."""
+    """Progress display of several runs, called with (index of a run, status): a table on a terminal, else some text."""
 
     def __init__(self, configs: Sequence[RunConfig]) -> None:
         self.console = plain_console(stderr=True)
@@ -194,7 +196,7 @@ class RunLaunchProgress:
         self.console.print(f"{self._directories[number].name}: {' '.join(filter(None, cells))}")
 
     def _print_change(self, number: int, before: JobStatus, status: JobStatus) -> None:
-        """Print on standard output that a run has started or ended."""
+        """Print that a run of several has started or ended, or that a run has failed."""
         directory, many = self._directories[number], len(self._directories)
         if many > 1 and before.state == "waiting" and status.state == "starting" and not status.attempt:
             print(f"[{number + 1}/{many}] {directory}", flush=True)

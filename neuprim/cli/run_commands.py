@@ -1,4 +1,4 @@
-"""``neuprim run`` and ``truth``: train a run, a sweep of runs, with several processes, or until a target is reached."""
+"""``neuprim run`` and ``truth``: train one run, a sweep, or a search for a target; render ground truth for runs."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ def _add_run_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def _refuse_bare_words(arguments: argparse.Namespace, rest: list[str], parser: argparse.ArgumentParser) -> list[str]:
-    """Refuse words other than KEY=VALUE and suggest settings that they may mean. Return ``rest`` if it has flags."""
+    """Refuse words other than KEY=VALUE and suggest what they mean. If ``rest`` has flags, return it unchanged."""
     if not rest or any(word.startswith("-") for word in rest):
         return rest
     from neuprim.plugins.registry import TASKS, list_scene_names
@@ -169,7 +169,7 @@ def _run_command_with_target(
 
 
 def _list_printed_target_lines(record: TargetRecord) -> list[str]:
-    """Return the printed result of a search: predicted and achieved values, and why the search ended."""
+    """Return the lines that report a search: predicted and achieved values, and why the search ended."""
     from neuprim.search.size_forecast import format_target_forecast
     from neuprim.search.target_record import TARGET_FILE
 
@@ -228,8 +228,8 @@ def run_command_with_launcher(
 def _report_launched_runs(
     configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
 ) -> int:
-    """Print failed runs; return the exit status: 2 for bad input, 1 for a bug, else 0. After Ctrl-C, raise
-    KeyboardInterrupt with the command that continues."""
+    """Print failed runs; return the exit status: 1 for a bug, else 2 for bad input, else 0. After Ctrl-C, raise
+    KeyboardInterrupt with the command that continues. ``live``: a table showed the progress, so no run was printed."""
     status, left = 0, []
     for config, result in zip(configs, results, strict=True):
         if result is None or result.state == "interrupted":
@@ -312,7 +312,7 @@ def run_command_as_rank(place: TorchrunRank, words: list[str], more: bool) -> in
 
     Args:
         words: the overrides.
-        more: whether the user asked for more than one plain run, e.g. a sweep; this is refused.
+        more: whether the user typed ``-m``, ``--config`` or ``--print-config``, which are refused.
     """
     from neuprim.core.compute.threads import limit_process_threads, machine_cores
     from neuprim.core.train.process_group import ProcessGroup

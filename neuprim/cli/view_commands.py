@@ -270,8 +270,8 @@ def _vdb_info_command(arguments: argparse.Namespace) -> int:
 
 
 def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str], bool]:
-    """Return the OpenVDB files at ``path``, frames in their order, notes on the folder, and whether it holds one
-    sequence.
+    """Return the OpenVDB files at ``path`` in the order of their frames, texts that describe the folder, and whether
+    the files are one sequence.
     """
     if not path.is_dir():
         return [path], [], False
@@ -291,8 +291,8 @@ def _find_vdb_command_files(path: Path) -> tuple[list[Path], list[str], bool]:
 
 
 def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
-    """Return the contents of an OpenVDB file as JSON-ready values: lengths in world units, bounds in voxel indices
-    (upper ones excluded).
+    """Return the contents of an OpenVDB file as JSON-ready values. Lengths are in world units. Bounds are voxel
+    indices; the upper bound is excluded.
     """
     from neuprim.core.io.vdb import read_grids, read_header
 
@@ -308,8 +308,8 @@ def _describe_vdb_command_file(path: Path) -> dict[str, Any]:
 
 
 def _describe_grid(header: GridHeader, grid: VdbGrid | None) -> dict[str, Any]:
-    """Return a description of one OpenVDB grid as JSON-ready values. A grid that cannot be decoded has a ``reason``,
-    and no values computed from voxels.
+    """Return a description of one OpenVDB grid as JSON-ready values. If the grid cannot be decoded, ``reason`` says
+    why, and values computed from voxels are missing.
     """
     entry: dict[str, Any] = {
         "name": header.name,
@@ -373,7 +373,7 @@ def _print_vdb_file(console: Console, file: dict[str, Any]) -> None:
 
 
 def _print_vdb_sequence(console: Console, files: Sequence[dict[str, Any]]) -> None:
-    """Print a row per grid of a sequence: what all frames together hold."""
+    """Print a table of an OpenVDB sequence. Each row summarizes one grid over all frames."""
     from rich import box
     from rich.table import Table
     from rich.text import Text

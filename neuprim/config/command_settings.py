@@ -120,8 +120,8 @@ def take_launcher_overrides(overrides: Sequence[str]) -> tuple[LauncherSettings,
 
 
 def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | None, list[str]]:
-    """Split overrides into viewer settings and the other overrides. The settings are None without a viewer; a host or
-    port alone also asks for a viewer.
+    """Split overrides into viewer settings and the other overrides. The settings are None if no viewer is requested. A
+    host or port alone requests a viewer.
     """
     shown, settings, others = take_settings(overrides, "viewer", ViewerSettings)
     if shown is None:
@@ -130,7 +130,7 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
 
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
-    """Split overrides into (target, budget in seconds), None if neither is given, and the other overrides."""
+    """Split overrides into a pair (target, budget in seconds), or None if neither is given, and the other overrides."""
     budget, rest = take_budget_override(overrides)
     whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
@@ -147,7 +147,7 @@ def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget,
 
 
 def take_budget_override(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Split overrides into the text of ``budget=TIME``, None without it, and the other overrides."""
+    """Split overrides into the text after ``budget=``, or None if there is no budget, and the other overrides."""
     budget, _, others = take_settings(overrides, "budget", _Budget)
     return (None if budget is None else str(budget)), others
 

@@ -93,7 +93,7 @@ _REQUIRED = "???"
 
 @dataclass(frozen=True)
 class _Selection:
-    """Task, scene, preset and level of effort of a configuration, loaded, and the default name of its run directory."""
+    """Loaded task, scene, preset and level of effort of a configuration, and default name of the run directory."""
 
     task_info: PluginInfo
     spec: TaskSpec
@@ -107,7 +107,7 @@ class _Selection:
 
 @dataclass(frozen=True)
 class _BaseConfig:
-    """Settings without the user's overrides, ``${...}`` unresolved, and names of the scene settings that are paths."""
+    """Settings before overrides and before ``${...}`` is resolved, and names of the scene settings that are paths."""
 
     tree: dict[str, Any]
     paths: list[str]
@@ -158,7 +158,7 @@ def compose(overrides: Sequence[str], check_output: bool = True, stored: RunConf
 def compose_all(
     overrides: Sequence[str], check_output: bool = True, stored: RunConfig | None = None
 ) -> list[RunConfig]:
-    """Return the configurations of all runs of a sweep, each with its own folder in one directory (:func:`compose`)."""
+    """Return the configurations of all runs of a sweep, each with its own folder. Arguments: see :func:`compose`."""
     swept = set(swept_override_keys(overrides))
     if not swept:
         return [compose(overrides, check_output, stored)]
@@ -190,8 +190,8 @@ def compose_all(
 
 
 def _uses_own_stored_config(directory: Path, own: Sequence[str], recorded: bool) -> bool:
-    """Return whether a sweep's run resumes with the configuration in its directory. Other overrides are refused later,
-    when they are compared with the sweep's record.
+    """Return whether a run of a sweep resumes with the configuration in its directory. If the sweep has a record, the
+    stored overrides must equal ``own``. Other overrides are refused later, by comparison with the record.
     """
     if not (directory / "config.yaml").is_file():
         return False
@@ -249,7 +249,8 @@ def _compose_run_config(
 ) -> tuple[RunConfig, list[str]]:
     """Return a validated configuration, and the names of the scene settings that are paths.
 
-    Settings of ``earlier`` runs replace the defaults. The field ``overrides`` of the configuration is not set yet.
+    Settings of ``earlier`` runs replace the defaults; with ``new_launch``, all except ``train.views_per_step``. The
+    field ``overrides`` of the configuration is not set yet.
     """
     spec, scene = chosen.spec, chosen.scene
     base = _read_base(spec, scene.spec.name, scene.config_package, chosen.preset, chosen.options)
@@ -349,7 +350,9 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
 def _resolve_config(
     base: _BaseConfig, earlier: Mapping[str, Any], level: Level | None = None, values: Sequence[Assignment] = ()
 ) -> dict[str, Any]:
-    """Return the resolved configuration as nested values. Settings of ``earlier`` runs replace those of ``base``."""
+    """Return the configuration as nested values, with ``${...}`` resolved. Each of these sources replaces values of the
+    one before: ``base``, ``earlier`` runs, ``level``, overrides (``values``).
+    """
     from omegaconf import OmegaConf
     from omegaconf.errors import OmegaConfBaseException
 
@@ -419,7 +422,7 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
 
 
 def _flatten_config_settings(tree: Mapping[str, Any], settings: RunSettings) -> dict[str, Any]:
-    """Return dotted key -> value, with the types of the settings classes, so that 1 and 1.0 are the same rate."""
+    """Return dotted key -> value of all settings. The settings classes convert values, e.g. a rate of 1 to 1.0."""
     values = {**dataclasses.asdict(settings), "scene": tree["scene"], "task": tree["task"]}
     return flatten({key: value for key, value in values.items() if key not in ("output_dir", "resume")})
 

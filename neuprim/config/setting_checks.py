@@ -64,7 +64,7 @@ def _setting_names(cls: type, where: str = "") -> Iterator[str]:
 
 
 def _is_setting(path: list[str]) -> bool:
-    """Return whether field names, starting at :class:`RunSettings`, lead to a setting or into a free dictionary."""
+    """Return whether field names, beginning in :class:`RunSettings`, end at a setting or in a dictionary of options."""
     hint: Any = RunSettings
     for part in path:
         if get_origin(hint) is dict or hint is Any:
@@ -93,7 +93,7 @@ def task_and_loss_options(spec: TaskSpec, loss: LossExtension | None) -> Mapping
 def complete_task_options(
     declared: Mapping[str, Option], given: Any, owner: str, where: str = "task.options"
 ) -> dict[str, Any]:
-    """Return a value for every declared option, given or default. Errors name ``owner`` and ``where``."""
+    """Return option -> given or default value, for every declared option. Errors name ``owner`` and ``where``."""
     if not isinstance(given, Mapping):
         raise ConfigError(f"{where}={format_setting_value(given)}: expected entries, each as {where}.KEY=VALUE")
     for key in given:

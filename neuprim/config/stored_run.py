@@ -68,8 +68,8 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
 def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
     """Return key -> value of a stored run's settings, with ``$`` replaced so that OmegaConf resolves no ``${...}``.
 
-    Each value replaces the key's whole value. Only overrides and packages may use references ``${...}``; a stored file
-    may not. :func:`restore_config_references` restores ``$``.
+    A value replaces the whole value of its key; dictionaries are not merged. Only overrides and packages may use
+    references ``${...}``; a stored file may not. :func:`restore_config_references` restores ``$``.
     """
     tree = stored.to_dict()
     found = {key: tree[key] for key in ("model", "train", "renderer", "metrics", "seed")}
@@ -80,7 +80,7 @@ def stored_settings(stored: RunConfig, same_scene: bool) -> dict[str, Any]:
 
 
 def restore_config_references(value: Any) -> Any:
-    """Restore the ``$`` that :func:`stored_settings` replaced by the character 0, which no YAML text has."""
+    """Remove the character 0 that :func:`stored_settings` inserts after every ``$``. YAML text cannot contain it."""
     return _replace_config_text(value, "$\0", "$")
 
 
@@ -112,7 +112,7 @@ def _stored_choices_of(stored: RunConfig) -> dict[str, str | None]:
 
 
 def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bool) -> RunConfig | None:
-    """Return the configuration of the run that ``resume=true`` continues; None if no run was begun there yet.
+    """Return the configuration of the run that ``resume=true`` continues; None without ``resume=true`` or such a run.
 
     Args:
         typed: key -> value of the overrides.
@@ -187,7 +187,7 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
 
     Args:
         config: the configuration; it is trusted if it was not read from a file (no ``source``).
-        typed: dotted keys that the user typed in addition to the file; None if the command takes no settings.
+        typed: dotted keys of the settings that the user typed and so allows; None if the command takes no settings.
     """
     if config.source is None or trusted():
         return
@@ -242,7 +242,7 @@ def _list_config_texts(key: str, value: Any) -> Iterator[tuple[str, str]]:
 
 
 def config_output_name(task: str, scene: str) -> str:
-    """Return the default name of a run's directory, ``<task>-<scene>``; ``PACKAGE:NAME`` becomes a file name."""
+    """Return the default name of a run's directory, ``<task>-<scene>``; ``PACKAGE:NAME`` becomes ``PACKAGE-NAME``."""
     return "-".join(part for word in (task, scene) for part in split_plugin_name(word) if part)
 
 

@@ -176,8 +176,8 @@ def _open_config_package(name: str, who: str) -> Traversable:
 def choose_config_effort_level(
     spec: TaskSpec, chosen: str | None, preset: str | None, presets: Sequence[str]
 ) -> Level | None:
-    """Return the level that ``effort=N`` names, None without it. Raise ConfigError if the user typed a ``preset`` other
-    than the level's.
+    """Return the level of effort that the user chose; None if ``chosen`` is None. Raise ConfigError if the user typed a
+    ``preset`` other than the level's.
     """
     if chosen is None:
         return None

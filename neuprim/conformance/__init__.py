@@ -226,7 +226,7 @@ def check_loss_conformance(t: TaskUnderTest) -> None:
 
 
 def check_channels_conformance(t: TaskUnderTest) -> None:
-    """Check data of one and of five channels: ``build`` returns a colour field with as many, or refuses the data."""
+    """Check that ``build``, for data of 1 and of 5 channels, returns a colour field with as many or raises an error."""
     if t.task.example is not None or t.task.channels:
         return  # only the task knows what data of other channels would look like, or there are no others
     declared = {}
@@ -251,7 +251,7 @@ def check_channels_conformance(t: TaskUnderTest) -> None:
 
 
 def check_resume_conformance(t: TaskUnderTest) -> None:
-    """Check resuming: N steps, a checkpoint on disk and N more steps equal 2N steps, bit for bit."""
+    """Check that N training steps, a checkpoint on disk and N more steps give the same bits as 2N steps."""
     whole, first, second = (t.trainer(2 * _STEPS) for _ in range(3))
     for _ in range(_STEPS):
         whole.train_step()
@@ -270,7 +270,7 @@ def check_resume_conformance(t: TaskUnderTest) -> None:
 
 
 def check_save_load_conformance(t: TaskUnderTest) -> None:
-    """Check that a saved model loads with equal bits and images, and that compressing it again changes nothing."""
+    """Check that a saved model loads with equal bits and images, and that compressing a model twice changes nothing."""
     model = t.perturbed_model(torch.float32)
     canonical = canonical_model(model)
     with tempfile.TemporaryDirectory() as folder, torch.no_grad():

@@ -47,7 +47,7 @@ def _integrate_under_test(active: ActivePrimitives, prim: Tensor, ray: tuple[Ten
 def conformance_points_inside(
     geometry: Geometry, rows: Tensor, generator: torch.Generator, reach: float = 0.95
 ) -> Tensor:
-    """Draw (M, 3) float64 points, one per entry of ``rows`` (M,), uniform in that ellipsoid scaled by ``reach``."""
+    """Draw M float64 points, (M, 3). Point i is uniform in the ellipsoid ``rows[i]``, scaled by ``reach``."""
     direction = _random_directions(len(rows), generator)
     radius = reach * torch.rand(len(rows), 1, generator=generator, dtype=torch.float64) ** (1 / 3)
     local = geometry.scales.double()[rows] * direction * radius
@@ -97,7 +97,7 @@ def check_activity_conformance(t: TaskUnderTest) -> None:
 
 
 def check_integral_conformance(t: TaskUnderTest) -> None:
-    """Check that optical depths of ``density.lower`` equal integrals of ``density.density`` over (partial) chords."""
+    """Check that ``density.lower`` gives the integrals of ``density.density`` over chords and over parts of chords."""
     model = t.perturbed_model()
     generator = torch.Generator().manual_seed(4)
     count = 0
@@ -235,7 +235,7 @@ def check_scaling_conformance(t: TaskUnderTest) -> None:
 
 
 def check_split_conformance(t: TaskUnderTest) -> None:
-    """Check ``on_split``: children have their parent's density inside them, or its mass if not ``exact_split``."""
+    """Check ``on_split``: each child has its parent's density; without ``exact_split``, both together have its mass."""
     model = t.perturbed_model()
     old, parents, colours = model.geometry, model.of(model.density), model.of(model.colour)
     axis = torch.nn.functional.one_hot(old.log_scales.argmax(-1), 3).double()
@@ -264,7 +264,7 @@ def check_split_conformance(t: TaskUnderTest) -> None:
 def _require_conforming_masses(
     t: TaskUnderTest, model: Primitives, children: list[tuple[dict[str, Tensor], Geometry]]
 ) -> None:
-    """Require that two children together have their parent's integral of |sigma|.
+    """Require that two children together have their parent's mass, the integral of |sigma|.
 
     The tolerance is larger for one pair than for the mean over all pairs, since sigma can vary within a primitive.
     """

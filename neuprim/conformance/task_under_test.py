@@ -160,7 +160,7 @@ class TaskUnderTest:
         return initial_model_to_train(density, colour, self.dataset, self.settings.model, seed)
 
     def perturbed_model(self, dtype: torch.dtype = torch.float64) -> Primitives:
-        """Return a model with randomly perturbed parameters: none is zero, and no two are equal, by chance."""
+        """Return a model with randomly perturbed parameters, so that none is zero and no two are equal."""
         model = self.initial_model()
         generator = torch.Generator().manual_seed(11)
         for name, value in model.params.items():
@@ -192,7 +192,7 @@ _NEAR_ZERO = 3.0
 
 
 def conformance_range(spec: ConditionSpec) -> tuple[float, float]:
-    """Return the interval of a condition's range that checks draw from: within -3..3 if the range allows it."""
+    """Return the interval from which checks draw a condition: the part of its range within -3..3, or else the range."""
     low, high = max(spec.range[0], -_NEAR_ZERO), min(spec.range[1], _NEAR_ZERO)
     return (low, high) if low < high else spec.range
 

@@ -196,7 +196,7 @@ def check_loss_returns(value: Any, parts: Any, rendered: Tensor) -> None:
 
 
 def call_task_mask(task: TaskSpec, dataset: Dataset, index: int) -> Tensor | None:
-    """Return the task's mask of a test view, (H, W) bool, where the error is also reported alone; None without one."""
+    """Return the task's mask of a test view, (H, W) bool, for metrics of masked pixels; None if there is no mask."""
     mask = task.mask(dataset, index)
     if mask is not None:
         try:

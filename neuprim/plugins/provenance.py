@@ -58,7 +58,7 @@ class PluginVersion:
 
     @classmethod
     def of(cls, info: PluginInfo, name: str | None = None) -> PluginVersion:
-        """Record an installed plugin's version; pass ``name`` if it differs from the entry point's, as for a scene."""
+        """Return the version of an installed plugin; ``name`` replaces the entry point's name, as for a scene."""
         version = "".join(c for c in info.version if c.isprintable())[:_LONGEST]  # so that it can be read again
         return cls(info.name if name is None else name, info.distribution, version)
 
@@ -96,7 +96,7 @@ class Provenance:
 
     @property
     def plugins(self) -> dict[str, PluginVersion]:
-        """Kind ("task", "scene", "loss") -> plugin, without the kinds for which there is none."""
+        """Kind ("task", "scene", "loss") -> plugin. Kinds without a plugin are left out."""
         found = {"task": self.task, "scene": self.scene, "loss": self.loss}
         return {kind: plugin for kind, plugin in found.items() if plugin is not None}
 
@@ -121,7 +121,7 @@ def load_recorded_plugin(
 
     Args:
         plugin: the package and version that made the run.
-        file: file that stores the record, for messages.
+        file: file that ``plugin`` was read from, for messages.
         entry: name of the entry point, if it differs from the plugin's name.
 
     Raises:
@@ -148,8 +148,8 @@ def warn_of_other_provenance(made_by: Provenance, file: Path | None = None) -> N
 
 
 def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> None:
-    """Raise CheckpointError if a checkpoint with the record ``stored`` cannot continue in the run ``now``; warn if only
-    versions differ.
+    """Raise CheckpointError if another package's task made the checkpoint than makes the run ``now``; warn if only
+    versions differ. ``stored`` is the provenance in the checkpoint.
     """
     try:
         before = Provenance.from_dict(stored)

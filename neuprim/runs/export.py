@@ -140,7 +140,8 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
     """Create a run directory from a file written by a lossless exporter or by ``neuprim compress``; return its path.
 
     The new directory holds ``config.yaml``, and the model as ``model.safetensors``, or compressed as
-    ``model.neuprim``. Commands accept it like the original run.
+    ``model.neuprim``. Commands accept it like the original run. ``name`` is the format of the file; None for the format
+    that its suffix names.
 
     Raises:
         ConfigError: ``out`` exists and is not empty, or no format reads such files.

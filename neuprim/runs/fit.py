@@ -76,7 +76,7 @@ class Evaluated:
 
 @dataclass(frozen=True)
 class Finishing:
-    """Event: work after the training loop has started, such as measuring held-out views."""
+    """Event: the training loop has ended, and other work begins, such as measuring held-out views."""
 
     text: str
 
@@ -124,7 +124,7 @@ class Fitted(Job):
         return {"iterations": self.trainer.step, "train_seconds": self.trainer.elapsed}
 
     def unlock_bands(self) -> None:
-        """Set the fields' progress to the end of the budget, where they use all bands of spherical harmonics."""
+        """Make the fields use all bands of spherical harmonics, as at the end of the budget."""
         for field in (self.model.density, self.model.colour):
             field.set_progress(1.0)
 
@@ -169,11 +169,11 @@ def prepare_training(
     make: TrainerFactory | None = None,
     group: ProcessGroup | None = None,
 ) -> Fitted:
-    """Load the data and create loss, model and trainer; run no step. Raises the errors of :func:`fit`.
+    """Load the data and create loss, model and trainer, without training. Raises the errors of :func:`fit`.
 
     Args:
-        hold_out: n > 1: every n-th training view is held out and replaces the test views; 0: use the splits unchanged.
-        make: function that makes the trainer; None: :func:`make_run_trainer`, which creates an untrained model.
+        hold_out: n > 1: hold out every n-th training view; these replace the test views. 0: use the splits unchanged.
+        make: function that makes the trainer; None for :func:`make_run_trainer`, which creates an untrained model.
         group: the ranks that train the model together; None for one process.
     """
     if make is None:
@@ -217,7 +217,8 @@ def prepare_training(
 def train_run_steps(trainer: Trainer, events: Events = ignore_run_event) -> Iterator[tuple[StepReport, float | None]]:
     """Train until the budget is used; yield (report, held-out PSNR) after each step.
 
-    The PSNR is None except every ``eval_every``. Between two steps the caller may save the state or leave the loop.
+    The PSNR is None unless held-out views were measured after the step (``train.eval_every``). Between two steps the
+    caller may save the state or leave the loop.
     """
     next_point = _next_run_curve_progress(trainer)
     for report in trainer.run():
@@ -320,9 +321,7 @@ def _starting_count_of_run(config: RunConfig) -> int:
 
 
 def _choose_run_size(job: Job, dataset: Dataset, loss: Loss, events: Events) -> int:
-    """Return the number of primitives that can be trained in ``train.max_seconds``, for ``model.primitives=auto``. A
-    few steps of a trial model give the time per step.
-    """
+    """Measure in a short training how many primitives ``train.max_seconds`` allows, for ``model.primitives=auto``."""
     config = job.config
     whole = replace(config.train, population=replace(config.train.population, grow_from=1.0))
     trial = replace(config, model=replace(config.model, primitives=_TRIAL_PRIMITIVES), train=whole)
@@ -366,7 +365,7 @@ def use_one_torch_thread_for_run() -> Iterator[None]:
 
 
 def is_chunked(config: RunConfig) -> bool:
-    """Return whether the scene is trained in chunks. Some scenes use a setting ``chunks`` otherwise."""
+    """Return whether the scene is trained in chunks. In some scenes, the setting ``chunks`` means something else."""
     return config.scene.get("chunks") not in (None, 1) and Job.of(config).scene.spec.chunks is not None
 
 

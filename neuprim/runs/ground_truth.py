@@ -32,6 +32,8 @@ def load_run_ground_truth(
 ) -> DatasetImages | None:
     """Return the ground-truth images of a configuration's scene; None if the scene does not render them frame by frame.
 
+    ``known`` are values that another process has already computed (:class:`~neuprim.core.data.dataset.DatasetImages`).
+
     Raises:
         NeuprimError: the scene refuses its files or settings, or its loader crashed.
     """
@@ -46,11 +48,11 @@ def load_run_ground_truth(
 def launch_ground_truth_jobs(
     config: RunConfig, settings: LauncherSettings, events: Events = ignore_run_event
 ) -> DatasetImages | None:
-    """Render the missing frames of a scene's ground truth with a launcher; return the images, None if there are none
-    to render.
+    """Render the missing frames of a scene's ground truth with a launcher. Return the ground-truth images; None if the
+    scene does not render them frame by frame.
 
-    Existing frames are not rendered again. Each new frame is stored at once. The first frame that fails stops the
-    others, because a run needs all frames. The launcher's temporary files are in the run directory's parent.
+    Each new frame is stored at once. The first frame that fails stops the others, because a run needs all frames. The
+    launcher's temporary files are in the run directory's parent.
 
     Raises:
         KeyboardInterrupt: Ctrl-C came.
@@ -69,8 +71,8 @@ def launch_ground_truth_jobs(
 
 
 def render_ground_truth_of_runs(configs: Sequence[RunConfig], settings: LauncherSettings, on_status: OnStatus) -> None:
-    """Render the ground truth of runs before they are launched, once per scene. With ``launcher=inline`` do nothing:
-    the runs render it themselves.
+    """Render the ground truth of runs before they are launched, once per scene. With ``launcher=inline`` do nothing,
+    because each run then renders its ground truth.
 
     Errors are ignored here. The run that needs the ground truth reports them; other runs continue.
 
@@ -118,7 +120,7 @@ def split_frames_into_jobs(missing: Sequence[int], workers: int) -> Iterator[lis
 
 
 def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> int:
-    """Render a job's ground-truth frames in a worker; return how many."""
+    """Render a job's ground-truth frames in a worker; return the number of frames."""
     config = RunConfig.from_dict(data["config"])
     key = _run_scene_key(config)
     if key not in _loaded:

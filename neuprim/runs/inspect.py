@@ -217,7 +217,7 @@ class _RunFrames:
         return numbers
 
     def _find_scale(self, box: np.ndarray) -> tuple[float, float, tuple[float, ...]]:
-        """Return the end of the extinction scale, the factor on opacities of volumes, and the extinction's centroid."""
+        """Return the top of the extinction scale, a factor on the opacity of volumes, and the extinction's centroid."""
         matrix, shape = box_lattice(box, _SCALE_POINTS)
         most, depth, total = 0.0, 0.0, np.zeros(shape)
         for conditions, number in self.pairs:

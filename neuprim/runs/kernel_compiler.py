@@ -10,6 +10,7 @@ import atexit
 import json
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -31,7 +32,7 @@ _SIZE, _PRIMITIVES, _POINTS = 32, 64, 64  # of the noise: pixels a side, primiti
 
 
 class KernelCompiler:
-    """The second process for one run, if no run of its task has compiled kernels yet.
+    """Second process that compiles the kernels of a run. It starts only if no run of the task has compiled them yet.
 
     Args:
         config: configuration of the run.
@@ -48,11 +49,11 @@ class KernelCompiler:
         self._process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=quiet, stderr=quiet)
         atexit.register(self._process.terminate)
         assert self._process.stdin is not None
-        with self._process.stdin as pipe:
+        with suppress(BrokenPipeError), self._process.stdin as pipe:  # it may have failed already
             pipe.write(json.dumps(config.to_dict()).encode())
 
     def wait(self, events: Events) -> None:
-        """Wait for the second process, which the first would otherwise repeat."""
+        """Wait until the second process has ended; otherwise this process would compile the same kernels."""
         if self._process is not None and self._process.poll() is None:
             events(Preparing("compiling kernels; once per installation this takes about a minute"))
             self._process.wait()
@@ -71,7 +72,7 @@ def _marker(task: str) -> Path:
 
 
 class _NoiseViews(ViewSet):
-    """Two views of noise from a distance of 3."""
+    """Two views, 3 units from the origin, whose images are noise."""
 
     def __init__(self, channels: int, conditions: dict[str, torch.Tensor]) -> None:
         eyes = [torch.tensor([3.0, 0.0, 0.5]), torch.tensor([0.0, 3.0, 0.5])]
@@ -104,7 +105,7 @@ class _NoisePoints(PointSupervision):
 
 
 def _noise_dataset(conditions: list[ConditionSpec], channels: int, voxels: bool) -> Dataset:
-    """Return data of noise with the conditions in the middle of their ranges."""
+    """Return a data set of noise images, and of points if ``voxels``; conditions are in the middle of their ranges."""
     values = {spec.name: torch.full(spec.shape, 0.5 * sum(spec.range), dtype=torch.float64) for spec in conditions}
     views = _NoiseViews(channels, values)
 

@@ -87,8 +87,8 @@ def render_light_sum(
 ) -> Tensor:
     """Render a view under several lights at once, as the sum of one image per light: (H, W, C) on the CPU.
 
-    Exact for models that are linear in light, because opacity does not depend on light. The sum is computed in float64,
-    and the background is added once.
+    The sum is exact for models that are linear in light, because opacity does not depend on light. It is computed in
+    float64, and the background is added once.
 
     Args:
         lights: conditions of each light, which replace the view's conditions of the same names.
@@ -317,7 +317,7 @@ def _run_lpips_entries(views: Sequence[ViewMetrics], lpips: Lpips | None) -> dic
 
 
 def _run_frame_means(clips: Sequence[Clip], views: Sequence[ViewMetrics]) -> dict[str, Any]:
-    """Return each metric's mean per frame over the clips of the test views, if all clips have the same length."""
+    """Return the mean of each metric at each frame over all clips of test views; {} if the clips differ in length."""
     own = [[views[i] for i in clip.views] for clip in clips if clip.source is None]
     if not own or len({len(clip) for clip in own}) != 1:
         return {}

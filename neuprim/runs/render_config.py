@@ -53,10 +53,10 @@ _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # sRGB primaries: x
 
 
 def estimate_run_file_bytes(path: Path, full: Primitives, reduced: Primitives) -> int:
-    """Return the bytes of a run's model file if it held ``reduced`` instead of the ``full`` model.
+    """Estimate the bytes of a run's model file if it held the model ``reduced`` instead of ``full``.
 
-    If both models have equally many values, this is the size of the file. For a smaller model, a compressed or sparse
-    file counts as uncompressed float32 tensors.
+    If both models have equally many values, the result is the size of the file. For a smaller model, a compressed or
+    sparse file counts as uncompressed float32 tensors.
     """
     before, after = (4 * model.count * model.parameters_per_primitive for model in (full, reduced))
     size = path.stat().st_size

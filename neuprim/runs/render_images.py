@@ -54,8 +54,8 @@ class RenderRequest:
         out: file or folder to write; None for a folder in the run's ``frames``.
         frames: number of views of an orbit.
         conditions: name -> text, e.g. ``{"time": "0:1"}``.
-        fps: frames per second of an animation, and in the headers of OpenEXR files; None for the rate in the file of
-            cameras. Without any rate, an animation takes about four seconds, and headers have none.
+        fps: frames per second of an animation, also written to OpenEXR headers; None for the rate in the file of
+            cameras. Without any rate, an animation takes about four seconds, and headers state no rate.
         environment: environment map that replaces the task's light.
         overrides: render settings, see :class:`~neuprim.runs.render_config.RenderConfig`.
         layers: layers of an OpenEXR file, separated by commas; None for all layers except those of single lights.
@@ -214,7 +214,7 @@ class _RunRenderSession:
         return _view_file_names([Path(self.request.camera.partition("#")[0]).resolve().stem])[0]
 
     def _choose_frames(self) -> tuple[list[int], Mapping[str, str]]:
-        """Return the frame numbers of ``--frame`` and the conditions with their times."""
+        """Return the frame numbers of ``--frame``, and the conditions with the times of these frames."""
         text, conditions = self.request.frame, self.request.conditions
         if text is None:
             return [], conditions
@@ -356,7 +356,7 @@ def set_run_view_conditions(
 
 
 def _name_views_by_frame(views: Sequence[View], numbers: Sequence[int], name: str) -> list[View]:
-    """Name views ``NAME.1001`` after the frames that they show, as compositing programs expect it of a sequence."""
+    """Name views after the frames that they show, e.g. ``NAME.1001``, as compositing programs expect."""
     shown = (numbers[i * len(numbers) // len(views)] for i in range(len(views)))
     return [replace(view, name=f"{name}.{number:04d}") for view, number in zip(views, shown, strict=True)]
 

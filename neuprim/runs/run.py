@@ -72,7 +72,7 @@ def run(
     Args:
         config: the configuration.
         events: function that is called with every event.
-        between: function (training, stop event) to call between steps; setting the event stops the run like Ctrl-C.
+        between: function (training, event) to call between steps. If it sets the event, the run stops as by Ctrl-C.
         group: processes that train this model together. Each of them calls this function; the first one writes files.
         launcher: where to train the chunks, if the scene is trained in chunks.
 
@@ -109,9 +109,7 @@ def summarize_run(run_dir: Path) -> str:
 
 
 def fit_job(data: Mapping[str, Any], attempt: int, events: Events) -> str:
-    """Run a configuration as a launcher's job; return its directory. After a worker died, the retry resumes from the
-    checkpoint.
-    """
+    """Run a configuration in a launcher's worker; return its directory. If ``attempt`` > 0, resume the checkpoint."""
     config = RunConfig.from_dict(data)
     return str(run(replace(config, resume=config.resume or attempt > 0), events))
 
@@ -182,10 +180,10 @@ def train_in_chunks(
     launcher: LauncherSettings = LauncherSettings(),  # noqa: B008 (frozen)
     between: BetweenSteps = lambda fitted, stop: None,
 ) -> tuple[Fitted, bool]:
-    """Train the chunks of ``scene.chunks``, join their models, and train the joined model. If the scene finds that one
-    run is better, call :func:`~neuprim.runs.training.train_in_directory` instead.
+    """Train the chunks of ``scene.chunks``, join their models, and train the joined model.
 
-    Finished chunks are not repeated: the same command with ``resume=true`` trains the missing ones.
+    If the scene finds that one run is better, train without chunks. Finished chunks are not repeated: the same command
+    with ``resume=true`` trains the missing ones. Returns as :func:`~neuprim.runs.training.train_in_directory`.
 
     Args:
         launcher: where chunks are trained and their ground truth is rendered. This process trains the joined model.

@@ -92,8 +92,7 @@ class LaunchRecord:
         return replace(self, runs=tuple(runs))
 
     def resume(self, before: LaunchRecord | None, more: bool) -> LaunchRecord:
-        """Return this record with the run states of an earlier one (``before``), and with runs that only the latter
-        has.
+        """Return this record with the run states of an earlier record, ``before``, and with further runs of ``before``.
 
         Args:
             more: whether the two records may have different runs.
@@ -151,11 +150,11 @@ def launch_missing_runs(
 ) -> tuple[LaunchRecord, list[JobResult | None]]:
     """Render the ground truth of a record's unfinished runs, then launch these runs, each in its own directory.
 
-    The record is written at the first status and whenever a run ends. A launcher that fails to start leaves no file.
+    The record is written at the first status and whenever a run ends. If the launcher fails to start, no file is left.
 
     Args:
         configs: configurations of the record's runs, in the same order; the record may have further runs.
-        on_status: called with (index in ``configs``, status) at every change; once for each finished run.
+        on_status: called with (index in ``configs``, status) at every change, and once for each run finished earlier.
 
     Returns:
         The updated record, and a result for each configuration; None for runs that did not start because of Ctrl-C.

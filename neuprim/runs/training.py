@@ -223,7 +223,7 @@ def _train_run_as_follower(trainer: Trainer) -> bool:
 
 @contextmanager
 def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
-    """Context manager during the training: only warn, once, if ``file`` cannot be written, e.g. on a full disk."""
+    """Context manager that turns an error in writing ``file``, e.g. on a full disk, into a single warning."""
     try:
         yield
     except (CheckpointError, OSError) as error:
@@ -245,7 +245,7 @@ def cut_run_curve(path: Path, step: int) -> None:
 
 
 def add_run_curve_line(path: Path, line: str) -> None:
-    """Append a line to a file, completely or not at all. Raises OSError; the lines before it stay intact."""
+    """Append a line to a file, completely or not at all. Raises OSError if that fails; earlier lines stay intact."""
     with open(path, "ab", buffering=0) as file:
         data, end = line.encode(), os.fstat(file.fileno()).st_size
         try:

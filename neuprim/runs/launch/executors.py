@@ -63,8 +63,8 @@ def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int,
 def count_parallel_jobs(settings: LauncherSettings, jobs: int) -> tuple[int, int]:
     """Return the expected (parallel jobs, threads per job) of a launcher; 0 threads means all cores.
 
-    On a cluster, whose free resources are unknown, these are the user's settings. Their defaults are as many jobs as
-    this machine has cores, and one thread per job. Raises the errors of :func:`divide_cores_among_jobs`.
+    On a cluster, whose free resources are unknown, both numbers are the user's settings. The defaults are as many jobs
+    as this machine has cores, and one thread per job. Raises the errors of :func:`divide_cores_among_jobs`.
     """
     if settings.name == "inline":
         return 1, settings.threads or 0
@@ -79,7 +79,7 @@ def _one_line(error: BaseException) -> str:
 
 
 def _cannot_begin(error: BaseException) -> JobResult:
-    """Return the failed result of a job whose worker lacks a package. Errors inside a job are results already."""
+    """Return the result of a job that a worker could not start, e.g. because it lacks a package."""
     return JobResult("failed", line=f"the worker cannot do it: {str(error).strip().splitlines()[-1]}", trace=str(error))
 
 

@@ -56,8 +56,8 @@ class LaunchJob:
 
     Attributes:
         name: unique name among the jobs launched together, valid as a file name.
-        call: ``module:function``. The function is called with ``data``, the number of times that the job's worker died
-            before, and a listener of events. After a worker died, it should continue where the worker stopped.
+        call: ``module:function``. The function has the parameters (data, attempt, events). ``attempt`` counts earlier
+            calls whose worker died; the function should continue their work. ``events`` is called with events.
         data: numbers, texts, lists, dictionaries and paths. Plugins are passed by name.
     """
 

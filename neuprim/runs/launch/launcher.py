@@ -66,7 +66,7 @@ def check_launcher(settings: LauncherSettings, jobs: int) -> None:
 
 
 def use_launcher_threads_for_runs(settings: LauncherSettings) -> AbstractContextManager[None]:
-    """Limit this process to ``launcher.threads`` threads if runs work in it (``launcher=inline``); else do nothing."""
+    """Context manager that limits this process to ``launcher.threads`` threads, if ``launcher=inline``."""
     own = settings.name == "inline" and settings.threads is not None
     return limit_process_threads(settings.threads or 1) if own else nullcontext()
 
@@ -82,6 +82,7 @@ def launch_jobs(
     """Perform all jobs with a launcher.
 
     At the first Ctrl-C every run finishes its step and writes a checkpoint. A second Ctrl-C ends the processes.
+    ``on_status`` and ``on_result`` are called with (index of a job, its status or result).
 
     Args:
         folder: shared folder of launcher and workers, under the same path on all machines. It is removed afterwards,

@@ -61,6 +61,13 @@ def _add_render_arguments(parser: argparse.ArgumentParser) -> None:
     numbers = "frames of the .vdb files by number, instead of --time: 1001-1048x2,1060; images are named NAME.1001.exr"
     parser.add_argument("--frame", metavar="NUMBERS", help=numbers)
     parser.add_argument("--frames", type=parse_count, default=60, metavar="N", help="frames of an orbit (default: 60)")
+    shutter = (
+        "motion blur: part of the interval between two frames, above 0 and at most 1, in which the shutter is open; "
+        "the interval is centred on the frame and ends with the sequence (default: no motion blur)"
+    )
+    parser.add_argument("--shutter", type=_parse_shutter, metavar="S", help=shutter)
+    samples = "images that are averaged for each image with motion blur (default: 8)"
+    parser.add_argument("--shutter-samples", type=parse_count, metavar="N", help=samples)
     parser.add_argument("--force", action="store_true", help="replace existing pictures of the run's report")
     group = parser.add_argument_group("environment light, for tasks with a light")
     image = "equirectangular radiance, twice as wide as high"
@@ -83,7 +90,9 @@ def _render_command(arguments: argparse.Namespace) -> int:
     from neuprim.cli.progress import DrawProgress
     from neuprim.runs.render_images import RenderRequest, render_run
 
-    names = ("size", "format", "out", "frame", "frames", "conditions", "fps", "space", "layers", "datatype")
+    if arguments.shutter is None and arguments.shutter_samples is not None:
+        raise ConfigError("--shutter-samples: found without --shutter; expected both. Pass --shutter 0.5.")
+    names = "size format out frame frames conditions fps space layers datatype shutter shutter_samples".split()
     given = {name: value for name in names if (value := getattr(arguments, name)) is not None}
     request = RenderRequest(
         camera, environment=environment, overrides=arguments.overrides, overwrite=arguments.force, **given
@@ -113,6 +122,10 @@ def _parse_light_count_argument(text: str) -> int:
 
 def _parse_degrees(text: str) -> float:
     return parse_number(text, -1e6, 1e6, "an angle in degrees")
+
+
+def _parse_shutter(text: str) -> float:
+    return parse_number(text, 1e-6, 1.0, "a part of the frame interval, above 0 and at most 1")
 
 
 def _parse_factor(text: str) -> float:

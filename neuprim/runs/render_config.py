@@ -42,6 +42,7 @@ from neuprim.core.render.output import mean_depth
 from neuprim.core.task import TaskSpec
 from neuprim.core.validation import Range, validate_settings, validate_value
 from neuprim.plugins.attribution import draw_task_layer
+from neuprim.runs.shutter import Shutter
 from neuprim.version import __version__
 
 _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0, at most 1")]
@@ -49,6 +50,7 @@ _Resolution = Annotated[float, Range(above=0, at_most=1, says="a factor above 0,
 __all__ = ["RenderConfig", "parse_run_rendering"]
 
 _MOST_LIGHTS = 128
+_COVERAGE = "(alpha)"  # no name of a layer
 _REC709 = (0.64, 0.33, 0.3, 0.6, 0.15, 0.06, 0.3127, 0.329)  # sRGB primaries: x and y of red, green, blue, white
 
 
@@ -180,6 +182,7 @@ class RunExrLayers:
         lights: conditions of the lights of an environment map, whose images are summed; empty: the view's own light.
         world: coordinates and units of cameras, positions and depths in the file.
         fps: frames per second of the sequence that the images belong to; None if unknown.
+        shutter: motion blur: all layers are means over its sub-frames, of depth weighted by alpha; None for none.
 
     Raises:
         ConfigError: a layer is unknown, or holds light although the model's colours are not linear light.
@@ -195,6 +198,7 @@ class RunExrLayers:
     lights: Sequence[Conditions] = ()
     world: World = field(default_factory=World)
     fps: float | None = None
+    shutter: Shutter | None = None
 
     def __post_init__(self) -> None:
         self._layer_specs()
@@ -224,15 +228,30 @@ class RunExrLayers:
     def write(
         self, path: Path, model: Primitives, view: View, on_alpha: Callable[[Tensor], None] = lambda alpha: None
     ) -> None:
-        """Render one view and write its layers; ``on_alpha`` is called with the alpha of the image of each light.
+        """Render one view and write its layers; ``on_alpha`` is called with the alpha of each rendered image.
 
         Raises:
             ConfigError: the user named a layer that the model does not have.
             DataError: the file cannot hold the values, or it cannot be written.
         """
+        present = {spec.name: spec for spec in self._layer_specs()}
+        mean: dict[str, Tensor] = {}
+        sub_frames = [view] if self.shutter is None else self.shutter.sub_frames(view)
+        for moment in sub_frames:
+            for name, image in self._draw_layers(model, moment, present, on_alpha).items():
+                mean[name] = mean.get(name, 0.0) + image.double() / len(sub_frames)
+        channels, summaries = self._exr_channels(mean, present)
+        write_exr_layers(path, channels, {**self._exr_attributes(model, view), **summaries})
+
+    def _draw_layers(
+        self, model: Primitives, view: View, present: dict[str, LayerSpec], on_alpha: Callable[[Tensor], None]
+    ) -> dict[str, Tensor]:
+        """Return layer name -> (H, W, C) values that can be averaged over time: linear light, depth times alpha.
+
+        The entry ``_COVERAGE`` is alpha. Layers that the model does not have are removed from ``present``.
+        """
         small, settings = self.point.scale_view(view), self.point.settings
         found: dict[str, Tensor] = {}
-        present = {spec.name: spec for spec in self._layer_specs()}
         for i, light in enumerate(self.lights or ({},)):
             conditions = {**small.conditions, **light}
             frame = LayerFrame(model, small.camera, conditions, settings, self.channels.color_space)
@@ -250,28 +269,32 @@ class RunExrLayers:
             if self._splits_lights:
                 found[f"light_{i:03d}"] = frame.drawn.rgb.cpu()
             on_alpha(frame.drawn.alpha)
-        channels, summaries = self._exr_channels(found, present, frame.drawn.alpha.cpu(), view)
-        write_exr_layers(path, channels, {**self._exr_attributes(model, view), **summaries})
+        alpha = frame.drawn.alpha.cpu()[..., None]
+        if "depth" in found:  # so that the 0 outside a silhouette has no effect
+            found["depth"] = found["depth"] * alpha
+        large = {name: self.point.upsample(image.float(), view.camera) for name, image in found.items()}
+        coverage = self.point.upsample(alpha, view.camera)
+        if "beauty" in large:
+            image, space = large["beauty"], self.channels.color_space
+            if "alpha" in large:
+                large["beauty"] = _linear_light_of_run_layer(image, space, coverage[..., 0])
+            else:
+                large["beauty"] = _linear_light_of_run_layer(image + (1 - coverage) * self.background.to(image), space)
+        return {**large, _COVERAGE: coverage}
 
     def _exr_channels(
-        self, found: Mapping[str, Tensor], specs: Mapping[str, LayerSpec], alpha: Tensor, view: View
+        self, found: Mapping[str, Tensor], specs: Mapping[str, LayerSpec]
     ) -> tuple[dict[str, ExrChannel], dict[str, str]]:
-        """Return channel name -> values at the view's full resolution, and header attributes for each layer."""
+        """Return channel name -> values, and header attributes for each layer, from means of :meth:`_draw_layers`."""
         channels: dict[str, ExrChannel] = {}
         summaries: dict[str, str] = {}
-        large_alpha = self.point.upsample(alpha[..., None], view.camera)
-        for name, image in found.items():
-            spec, image = specs.get(name), image.float()
-            if name == "depth":  # alpha-weighted, so that the 0 outside a silhouette has no effect
-                weighted = self.point.upsample(image * alpha[..., None], view.camera)
-                image = mean_depth(weighted, large_alpha) / self.world.scale
-            else:
-                image = self.point.upsample(image, view.camera)
-            if name == "beauty" and "alpha" in found:
-                image = _linear_light_of_run_layer(image, self.channels.color_space, large_alpha[..., 0])
-            elif name == "beauty":
-                image = image + (1.0 - large_alpha) * self.background.to(image)
-                image = _linear_light_of_run_layer(image, self.channels.color_space)
+        for name, values in found.items():
+            if name == _COVERAGE:
+                continue
+            spec, image = specs.get(name), values
+            if name == "depth":
+                image = mean_depth(image, found[_COVERAGE]) / self.world.scale
+            image = image.float()
             half = self.half and (spec is None or spec.light or name == "alpha")
             names = self.channels.names if spec is None or not spec.channels else spec.channels
             prefix = "" if name in ("beauty", "alpha") else f"{name}."
@@ -303,6 +326,8 @@ class RunExrLayers:
             broadcast = Fraction(round(1.001 * self.fps) * 1000, 1001)  # 23.976 means 24000/1001
             close = abs(broadcast - self.fps) < 0.002
             found["framesPerSecond"] = broadcast if close else Fraction(self.fps).limit_denominator(1000)
+        if self.shutter is not None:
+            found["neuprim:shutter"] = self.shutter.fraction
         replaced = {name for light in self.lights for name in light}
         for name, value in self._condition_values(view.conditions):
             if name not in replaced:

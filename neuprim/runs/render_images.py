@@ -27,6 +27,7 @@ from neuprim.plugins.attribution import call_task_facts, call_task_orbit
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import StoredRun, load_dataset, load_run, move_to_render_device, refuse_run_results
 from neuprim.runs.render_config import RunExrLayers, parse_run_rendering
+from neuprim.runs.shutter import choose_shutter, mean_in_linear_light
 
 __all__ = ["RenderRequest", "render_run"]
 
@@ -65,6 +66,9 @@ class RenderRequest:
         overwrite: whether to replace pictures of the run's report.
         frame: numbers of source frames to render, e.g. "1001-1048x2", for volumes; they replace the condition "time"
             and appear in file names.
+        shutter: motion blur: part of the interval between two frames in which the shutter is open, centred on each
+            frame; None for none. See :class:`~neuprim.runs.shutter.Shutter`.
+        shutter_samples: number of sub-frames of each image with motion blur.
     """
 
     camera: str
@@ -81,6 +85,8 @@ class RenderRequest:
     space: str = WORLD
     overwrite: bool = False
     frame: str | None = None
+    shutter: float | None = None
+    shutter_samples: int = 8
 
 
 def render_run(
@@ -140,6 +146,9 @@ class _RunRenderSession:
             if numbers:
                 self.views = _name_views_by_frame(self.views, numbers, self._camera_name())
             model = self.render_config.prepare_model(run.model)
+        blur, sub_frames, specs = request.shutter, request.shutter_samples, self.task.conditions
+        known = self._source_frames()
+        self.shutter = None if blur is None else choose_shutter(blur, sub_frames, specs, known, self.views)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
         suffix = "" if request.out is None else request.out.suffix.lower().removeprefix(".")
         usual = suffix if suffix in FORMATS else "webp" if animated else "png"
@@ -150,10 +159,11 @@ class _RunRenderSession:
                 raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
         half, drawn = request.datatype == "half", (self.channels, self.render_config, self.background)
         layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world, self.fps)
+        layers = replace(layers, shutter=self.shutter)
         self.layers = layers if self.format == "exr" else None
         if self.channels.hides_channels and self.format not in ("exr", "npy"):
             notify(f"shown: {self.channels.display_text}; --format exr and npy hold all channels")
-        self._passes, self._visible = 0, False  # images so far, one per view and light; any shows the model
+        self._passes, self._visible = 0, False  # images so far, as _count_pass counts them; any shows the model
 
     def _load_lights(self, environment: EnvironmentFile) -> Sequence[Conditions]:
         """Return the conditions of the lights that together replace an environment map."""
@@ -218,17 +228,25 @@ class _RunRenderSession:
         text, conditions = self.request.frame, self.request.conditions
         if text is None:
             return [], conditions
-        numbers, facts = parse_frame_numbers(text), self.run.header.get("data")
-        if not isinstance(facts, dict) or "frames" not in facts:
+        numbers, known = parse_frame_numbers(text), self._source_frames()
+        if known is None:
             raise ConfigError(f"--frame {text}: this model has no numbered frames; expected one of .vdb files")
         if "time" in conditions:
             raise ConfigError("--frame and --time: give one of them")
-        data = JsonReader(facts, "the model's header: data")
-        first, last = (int(x) for x in data.array("frames", (2,), "2 numbers").tolist())
+        first, last = known
         if min(numbers) < first or max(numbers) > last:
             raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
         times = ",".join(repr((number - first) / max(last - first, 1)) for number in numbers)
         return numbers, {**conditions, "time": times}
+
+    def _source_frames(self) -> tuple[int, int] | None:
+        """Return the numbers of the first and the last source frame; None for a model without numbered frames."""
+        facts = self.run.header.get("data")
+        if not isinstance(facts, dict) or "frames" not in facts:
+            return None
+        data = JsonReader(facts, "the model's header: data")
+        first, last = (int(x) for x in data.array("frames", (2,), "2 numbers").tolist())
+        return first, last
 
     def choose_targets(self) -> list[Path]:
         """Return the files to write, one per view or one for an animation."""
@@ -278,6 +296,12 @@ class _RunRenderSession:
             write_animation(path, [shown], self.fps or 12.0)
 
     def _render_pixels(self, view: View) -> Tensor:
+        if self.shutter is None:
+            return self._render_sub_frame(view)
+        sub_frames = (self._render_sub_frame(moment) for moment in self.shutter.sub_frames(view))
+        return mean_in_linear_light(sub_frames, self.channels.color_space)
+
+    def _render_sub_frame(self, view: View) -> Tensor:
         config = self.render_config
         with self.run.plugins.attribute_errors():
             if not self.lights:
@@ -287,11 +311,11 @@ class _RunRenderSession:
             return config.upsample(image, view.camera)
 
     def _count_pass(self, alpha: Tensor) -> None:
-        """Count a rendered image (one per view and light) with this alpha, and report the progress."""
-        lights, count = max(len(self.lights), 1), len(self.views)
+        """Count a rendered image (one per view, sub-frame and light) with this alpha, and report the progress."""
+        each, count = max(len(self.lights), 1) * (self.shutter.samples if self.shutter else 1), len(self.views)
         self._visible |= bool((alpha > 0).any())
         self._passes += 1
-        self.progress(f"view {-(-self._passes // lights)} of {count}", self._passes / (lights * count))
+        self.progress(f"view {-(-self._passes // each)} of {count}", self._passes / (each * count))
 
     def _refuse_empty_images(self) -> None:
         """Raise DataError if no image shows the model; say where the model is and where the first camera looks."""

@@ -75,7 +75,7 @@ CORE: dict[str, set[str]] = {
     "volumes": {"compute", "errors", "model"},
     "data": {"cameras", "validation", "compute", "errors", "io", "model", "volumes"},
     "task": {"validation", "data", "environment", "model", "render", "volumes"},
-    "conditions": {"errors", "model"},
+    "conditions": {"errors", "io", "model"},
     "light_conditions": {"cameras", "data", "environment", "errors", "io", "model"},
     "channels": {"data", "errors", "io", "task"},
     "checkpoint": {"compression", "errors", "io", "model", "task"},

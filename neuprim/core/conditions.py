@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from neuprim.core.errors import ConfigError, NeuprimError
+from neuprim.core.io.json_reader import JsonReader
 from neuprim.core.model.fields import ConditionSpec
 
 FRAMES = 60
@@ -87,6 +89,31 @@ def parse_frame_numbers(text: str) -> list[int]:
             raise ConfigError(f"--frame {text}: expected numbers and ranges such as 1001-1048x2,1060")
         numbers += range(first, last + 1, step)
     return numbers
+
+
+def source_frames(header: Mapping[str, Any]) -> tuple[int, int] | None:
+    """Return the numbers of the first and the last frame of the files that a model was fitted to, at times 0 and 1.
+
+    Returns None if the header of the model names no numbered frames; raises DataError if it is invalid.
+    """
+    facts = header.get("data")
+    if not isinstance(facts, dict) or "frames" not in facts:
+        return None
+    first, last = JsonReader(facts, "the model's header: data").array("frames", (2,), "2 numbers").tolist()
+    return int(first), int(last)
+
+
+def frame_interval(header: Mapping[str, Any], times: Iterable[float]) -> float | None:
+    """Return the time between two frames, in units of the condition "time"; None if it is unknown.
+
+    Args:
+        header: header of the model. If it names no source frames, the result is the mean distance of ``times``.
+        times: times of the frames that are rendered or exported.
+    """
+    frames, ordered = source_frames(header), sorted(set(times))
+    if frames is not None and frames[1] > frames[0]:
+        return 1 / (frames[1] - frames[0])
+    return (ordered[-1] - ordered[0]) / (len(ordered) - 1) if len(ordered) > 1 else None
 
 
 # ---------------------------------------------------------------- values

@@ -13,6 +13,8 @@ Units (metadata ``neuprim_units``):
 * ``source``: sigma divided by the extinction per unit of the source's grid
 * ``world``: extinction per world unit, which a volume shader multiplies by a length
 * ``scene``: extinction per scene unit, i.e. sigma
+
+``velocity=true`` adds the grid ``vel`` (:mod:`neuprim.export.velocity`).
 """
 
 from __future__ import annotations
@@ -41,6 +43,7 @@ from neuprim.core.volumes.density_truth import (
     measure_density_errors,
 )
 from neuprim.export.shared import find_export_box
+from neuprim.export.velocity import choose_velocity
 
 OPTIONS = {
     "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
@@ -49,6 +52,8 @@ OPTIONS = {
     "threshold": (None, "values below it are not stored (default: an optical depth of 0.001 along the box)"),
     "half": (False, "16-bit floats"),
     "name": ("density", "name of the grid"),
+    "velocity": (False, "also write the grid vel: velocities of the primitives, in world units per frame"),
+    "fps": (None, "frames per second; with it, vel is in world units per second"),
 }
 _SLAB_BYTES = 64 * 2**20
 _MOST_VOXELS = 2**34
@@ -83,6 +88,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     origin = np.zeros(3) if placement else job.run.world.world_from_scene[:3, 3].numpy()
     fallback = _export_voxel_transform(job, box, scene_from_world, origin)
     sampler = _VdbExportSampler(job, _exported_component(job, placement), scene_from_world, name, factor, threshold)
+    moving = choose_velocity(job, sampler.model, [f.conditions for f in frames], scene_from_world)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -97,10 +103,13 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
             grid = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
-        write_vdb(path, [grid])
+        velocity = [] if moving is None else [moving.sample_grid(sampler.model, frame.conditions, grid)]
+        write_vdb(path, [grid, *velocity])
         if source is not None and frame.source is not None:
             errors |= _measure_vdb_errors(job, source, frame.source, frame.conditions)
     notes.append(f"grid {name!r} in {units} units: extinction per scene unit = value x {1 / factor:g}")
+    if moving is not None:
+        notes.append(f"grid 'vel' in {moving.unit}, mean of the primitives weighted by extinction")
     if placement is not None and not placement.exact:
         notes.append(f"flames absorb, too: written is the part that comes from {placement.grid!r} alone")
     world = "the source's world" if placement else "the coordinates of the run's data"

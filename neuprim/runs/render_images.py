@@ -13,7 +13,13 @@ from neuprim.core.cameras.camera_files import read_camera_file
 from neuprim.core.cameras.pinhole import CameraViews
 from neuprim.core.cameras.world import World
 from neuprim.core.channels import read_stored_channels
-from neuprim.core.conditions import condition_flag, count_condition_frames, parse_frame_numbers, read_conditions
+from neuprim.core.conditions import (
+    condition_flag,
+    count_condition_frames,
+    parse_frame_numbers,
+    read_conditions,
+    source_frames,
+)
 from neuprim.core.data import View
 from neuprim.core.environment import EnvironmentFile, Illumination, read_environment
 from neuprim.core.errors import ConfigError, DataError
@@ -146,9 +152,10 @@ class _RunRenderSession:
             if numbers:
                 self.views = _name_views_by_frame(self.views, numbers, self._camera_name())
             model = self.render_config.prepare_model(run.model)
-        blur, sub_frames, specs = request.shutter, request.shutter_samples, self.task.conditions
-        known = self._source_frames()
-        self.shutter = None if blur is None else choose_shutter(blur, sub_frames, specs, known, self.views)
+        self.shutter = None
+        if request.shutter is not None:
+            blur = (request.shutter, request.shutter_samples)
+            self.shutter = choose_shutter(*blur, self.task.conditions, run.header, self.views)
         self.model = move_to_render_device(model, self.render_config.settings, self.views[0])
         suffix = "" if request.out is None else request.out.suffix.lower().removeprefix(".")
         usual = suffix if suffix in FORMATS else "webp" if animated else "png"
@@ -228,7 +235,7 @@ class _RunRenderSession:
         text, conditions = self.request.frame, self.request.conditions
         if text is None:
             return [], conditions
-        numbers, known = parse_frame_numbers(text), self._source_frames()
+        numbers, known = parse_frame_numbers(text), source_frames(self.run.header)
         if known is None:
             raise ConfigError(f"--frame {text}: this model has no numbered frames; expected one of .vdb files")
         if "time" in conditions:
@@ -238,15 +245,6 @@ class _RunRenderSession:
             raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
         times = ",".join(repr((number - first) / max(last - first, 1)) for number in numbers)
         return numbers, {**conditions, "time": times}
-
-    def _source_frames(self) -> tuple[int, int] | None:
-        """Return the numbers of the first and the last source frame; None for a model without numbered frames."""
-        facts = self.run.header.get("data")
-        if not isinstance(facts, dict) or "frames" not in facts:
-            return None
-        data = JsonReader(facts, "the model's header: data")
-        first, last = (int(x) for x in data.array("frames", (2,), "2 numbers").tolist())
-        return first, last
 
     def choose_targets(self) -> list[Path]:
         """Return the files to write, one per view or one for an animation."""

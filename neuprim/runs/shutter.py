@@ -6,12 +6,14 @@ it. The camera and the lights of an image do not move while the shutter is open.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
+from neuprim.core.conditions import frame_interval
 from neuprim.core.data import View
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.images import linear_to_srgb, srgb_to_linear
@@ -43,37 +45,28 @@ class Shutter:
 
 
 def choose_shutter(
-    fraction: float,
-    samples: int,
-    conditions: Sequence[ConditionSpec],
-    frames: tuple[int, int] | None,
-    views: Sequence[View],
+    fraction: float, samples: int, specs: Sequence[ConditionSpec], header: Mapping[str, Any], views: Sequence[View]
 ) -> Shutter:
     """Return the shutter of ``--shutter`` for the views of a model.
 
     Args:
-        conditions: conditions of the task.
-        frames: numbers of the first and the last source frame, at times 0 and 1; None: the mean distance of the views'
-            times is the interval.
+        specs: conditions of the task.
+        header: header of the model, see :func:`~neuprim.core.conditions.frame_interval`.
         views: the views to render, with their conditions.
 
     Raises:
         ConfigError: the model has no time, the fraction is out of range, or the interval between frames is unknown.
     """
     where = f"--shutter {fraction:g}"
-    time = next((spec for spec in conditions if spec.name == "time" and not spec.shape), None)
+    time = next((spec for spec in specs if spec.name == "time" and not spec.shape), None)
     if time is None:
         raise ConfigError(f"{where}: the model does not vary in time; expected one of a moving scene. Omit --shutter.")
     if not 0 < fraction <= 1:
         raise ConfigError(f"{where}: expected a part of the frame interval, above 0 and at most 1")
-    times = sorted({float(view.conditions["time"]) for view in views})
-    if frames is not None and frames[1] > frames[0]:
-        interval = 1 / (frames[1] - frames[0])
-    elif len(times) > 1:
-        interval = (times[-1] - times[0]) / (len(times) - 1)
-    else:
-        found = f"all images show time {times[0]:g}, and the model has no numbered frames"
-        raise ConfigError(f"{where}: {found}; expected the interval of frames. Pass a range, such as --time 0:1:48.")
+    interval = frame_interval(header, (float(view.conditions["time"]) for view in views))
+    if interval is None:
+        found = "all images show one time, and the model has no numbered frames"
+        raise ConfigError(f"{where}: {found}; expected an interval between frames. Pass a range, as --time 0:1:48.")
     return Shutter(fraction, samples, interval, time.range)
 
 

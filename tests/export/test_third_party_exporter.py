@@ -211,8 +211,8 @@ def test_help_shows_the_options_of_any_format(site: Path, run_dir: Path, capsys:
     assert call("export", "--format", "vdb", "--help") == 0
     out = capsys.readouterr().out
     assert (
-        "\n  units=auto    source, world or scene" in out
-        and "\n  voxel_size=   edge of a voxel" in out
+        "\n  units=auto      source, world or scene" in out
+        and "\n  voxel_size=     edge of a voxel" in out
         and "--time 0.5" in out
     )
     assert call("export", "--format", "npz", "--help") == 0

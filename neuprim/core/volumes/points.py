@@ -95,18 +95,42 @@ def volume_values_at(
 
         values = cosine_point_values(geometry, form, points, weights, shares)
         return _point_values(values, width, active.rows, shares, tuple(named))
-    cells = sort_points_into_cells(points.detach().double().cpu().contiguous().numpy())
     try:
-        if isinstance(form, Cosine) and device.on_numba(geometry.means):
-            shape = (geometry.means, geometry.log_scales, geometry.quats)
-            neurons = (form.W1, form.b1, form.w2, form.b2.reshape(-1))
-            values = CosinePointValues.apply(cells, form.omega0, form.edge, shares, threads, *shape, *neurons, weights)
-        else:
-            values = _torch_density_point_values(active, form, cells, weights, shares)
+        values = weighted_extinctions_at(active, form, points, weights, shares, threads)
     except NonFiniteError:
         model.check_finite()  # names the parameter, if it is one
         raise
     return _point_values(values, width, active.rows, shares, tuple(named))
+
+
+def weighted_extinctions_at(
+    active: ActivePrimitives,
+    form: LoweredDensity,
+    points: Tensor,
+    weights: Tensor,
+    shares: PointShares | None = None,
+    threads: int = 0,
+) -> Tensor:
+    """Return (M, 1 + C) float32: sigma at ``points`` (M, 3), and sums of sigma_i times the rows of ``weights`` (N, C).
+
+    Args:
+        active: the N primitives of a frame.
+        form: closed form of their density.
+        shares: filled by the backward pass.
+        threads: number of threads, 0 for all cores; the result does not depend on it.
+
+    Raises:
+        NonFiniteError: a value is not finite.
+    """
+    geometry = active.geometry
+    shares = PointShares(geometry.count, geometry.means.device) if shares is None else shares
+    cells = sort_points_into_cells(points.detach().double().cpu().contiguous().numpy())
+    if not isinstance(form, Cosine) or not device.on_numba(geometry.means):
+        return _torch_density_point_values(active, form, cells, weights, shares)
+    shape = (geometry.means, geometry.log_scales, geometry.quats)
+    neurons = (form.W1, form.b1, form.w2, form.b2.reshape(-1))
+    values: Tensor = CosinePointValues.apply(cells, form.omega0, form.edge, shares, threads, *shape, *neurons, weights)
+    return values
 
 
 def _point_values(

@@ -166,9 +166,9 @@ def _check_primitives(
     for name, value in t.items():
         _check_tensor(name, value)
         if value.dtype != t["means"].dtype:
-            raise _wrong(name, f"dtype {value.dtype}", f"{t['means'].dtype}, as means has")
+            raise _wrong(name, f"dtype {value.dtype}", f"{t['means'].dtype}, the dtype of means")
         if value.device != t["means"].device:
-            raise _wrong(name, f"device {value.device}", f"{t['means'].device}, as means has")
+            raise _wrong(name, f"device {value.device}", f"{t['means'].device}, the device of means")
     sizes: Sizes = {}
     geometry = Geometry(t["means"], t["log_scales"], t["quats"])
     for form in (geometry, Cosine(t["W1"], t["b1"], t["w2"], t["b2"], omega0, edge)):

@@ -201,7 +201,7 @@ BAD: dict[str, tuple[Any, type[NeuprimError], str]] = {
     "colors views": (put("colors", lambda v: v.expand(2, 30, 3)), DataError,
         r"colors has shape \(2, 30, 3\); expected \(3, 30, channels\)"),
     "mixed": (put("w2", lambda v: v.double()), DataError,
-        r"w2 has dtype torch\.float64; expected torch\.float32, as means has"),
+        r"w2 has dtype torch\.float64; expected torch\.float32, the dtype of means"),
     "device": (put("colors", lambda v: v.to("meta")), DataError, r"colors has device meta; expected cpu"),
     "nan": (changed("b1", (13, 2), NAN), NonFiniteError, r"b1 of primitive 13 is not finite"),
     "zero quat": (changed("quats", (9,), 0.0), NonFiniteError, r"quats of primitive 9 is zero"),

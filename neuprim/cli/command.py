@@ -113,7 +113,7 @@ def check_run_dir_argument(path: Path) -> None:
     """Raise ConfigError unless ``path`` is a folder."""
     if not path.is_dir():
         model = path.is_file() and path.suffix in (".neuprim", ".npz", ".ply")
-        hint = f"; `neuprim import {path} --out RUN_DIR` makes one of this file" if model else ""
+        hint = f"; `neuprim import {path} --out RUN_DIR` makes a run directory from this file" if model else ""
         raise ConfigError(f"{path}: no such run directory{hint}")
 
 
@@ -134,8 +134,8 @@ def split_settings(words: Sequence[str], parser: argparse.ArgumentParser) -> tup
         if "=" not in word or word.startswith("-") or value_follows or (opens_run and os.path.isdir(word)):
             others.append(word)
         elif word.lstrip("+").startswith("output_dir="):
-            expected = f"expected {'--out DIR' if '--out' in flags else 'no output_dir'}"
-            raise ConfigError(f"{word}: no setting of `{parser.prog}`; {expected}")
+            expected = "expected --out DIR" if "--out" in flags else "leave it out"
+            raise ConfigError(f"{word}: `{parser.prog}` does not take output_dir; {expected}")
         else:
             settings.append(word)
         value_follows = word in flags and flags[word].nargs != 0
@@ -197,8 +197,8 @@ def print_columns(rows: Sequence[Sequence[str]]) -> None:
 def describe_interrupted_command(directory: Path, typed: CommandLine) -> str:
     """Return text for the user that says what an interrupted run has saved, and the command that continues it."""
     begun = any((directory / file).exists() for file in ("checkpoint.safetensors", "chunks.json"))
-    state = "has the run up to here" if begun else "has no checkpoint yet"
-    return f"; {directory} {state}; to go on:\n  {typed.resume_command(directory)}"
+    state = "contains a checkpoint of the run" if begun else "has no checkpoint yet"
+    return f"; {directory} {state}; to continue:\n  {typed.resume_command(directory)}"
 
 
 # ---------------------------------------------------------------- values of flags

@@ -143,7 +143,7 @@ def parse_table_numbers(text: str) -> set[int]:
         match = re.fullmatch(r"([3-7])(?:-([3-7]))?", part.strip())
         numbers = range(int(match[1]), int(match[2] or match[1]) + 1) if match else ()
         if not numbers:
-            raise ConfigError(f"--tables {text}: expected numbers from 3 to 7, such as 3-5 or 6,7")
+            raise ConfigError(f"--tables {text}: expected table numbers from 3 to 7, such as 3-5 or 6,7")
         found |= set(numbers)
     return found
 
@@ -279,7 +279,7 @@ def _render_tradeoff_command(run_dir: Path, request: TradeoffRequest) -> int:
     except KeyboardInterrupt:
         if not (folder / "tradeoff.json").exists():
             raise
-        kept = f"; {folder / 'tradeoff.json'} has the points up to here; the same command goes on"
+        kept = f"; {folder / 'tradeoff.json'} has the points measured so far; repeat the command to continue"
         raise KeyboardInterrupt(kept) from None
     commands = [format_tradeoff_render_command(str(run_dir), point.words) for point in record.points]
     _print_fronts(folder, record, commands)
@@ -297,7 +297,7 @@ def _train_tradeoff_command(request: TradeoffRequest) -> int:
             request = replace(request, words=settings)
             folder, record = run_ablation(request, launcher, progress.print_note, progress.show)
     except KeyboardInterrupt:
-        raise KeyboardInterrupt("; what is trained is kept, and the same command goes on") from None
+        raise KeyboardInterrupt("; trained models are kept; repeat the command to continue") from None
     _print_fronts(folder, record, [format_ablation_run_command(point.words) for point in record.points])
     return 0
 

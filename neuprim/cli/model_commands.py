@@ -160,7 +160,7 @@ def _compress_command(args: argparse.Namespace) -> int:
 
     for word in args.overrides:
         if not word.startswith("bits."):
-            raise ConfigError(f"{word}: no setting of `neuprim compress`; expected bits.NAME=BITS, as bits.means=16")
+            raise ConfigError(f"{word}: no setting of `neuprim compress`; expected bits.NAME=BITS, e.g. bits.means=16")
     bits = [word.removeprefix("bits.") for word in args.overrides]
     request = CompressRequest(
         args.run_dir, args.level, bits, args.out, args.force, args.seconds, args.steps, args.tolerance

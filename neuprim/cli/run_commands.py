@@ -123,9 +123,9 @@ def _run_command(args: argparse.Namespace) -> int:
     launched = launcher != LauncherSettings()
     for name, given in (("-m", args.multirun), ("target", wanted is not None), ("launcher", launched)):
         if viewer is not None and given:
-            raise ConfigError(f"viewer=true: shows one run; expected no {name} beside it")
+            raise ConfigError(f"viewer=true: the viewer shows a single run and cannot be combined with {name}")
     if wanted is not None and args.multirun:
-        raise ConfigError(f"{wanted[0]}: a target is for one run; expected no -m beside it")
+        raise ConfigError(f"{wanted[0]}: a run with a target cannot be combined with -m; leave one of them out")
     if args.multirun and not drop_output_overrides(overrides):
         from neuprim.runs.sweep import read_sweep_overrides
 
@@ -161,7 +161,7 @@ def _run_command_with_target(
             record = run_target(config, target, budget, events, launcher=launcher)
     except KeyboardInterrupt:
         command = typed.resume_command(config.output_dir)
-        raise KeyboardInterrupt(f"; {config.output_dir} has the trials up to here; to go on:\n  {command}") from None
+        raise KeyboardInterrupt(f"; {config.output_dir} has the trials so far; to continue:\n  {command}") from None
     for line in _list_printed_target_lines(record):
         events.console.print(line)
     print_run_summary(Path(record.achieved["run_dir"]))
@@ -246,10 +246,10 @@ def _report_launched_runs(
     if left and len(configs) == 1:
         raise KeyboardInterrupt(describe_interrupted_command(left[0], typed))
     if left:
-        over = f"{left[0].parent} has {len(configs) - len(left)} of {len(configs)} runs"
+        over = f"{left[0].parent} has {len(configs) - len(left)} of {len(configs)} finished runs"
         begun = sum((directory / "checkpoint.safetensors").exists() for directory in left)
         command = typed.resume_command(left[0])
-        raise KeyboardInterrupt(f"; {over}, and {begun} of the others up to here; to go on:\n  {command}")
+        raise KeyboardInterrupt(f"; {over}, and checkpoints of {begun} others; to continue:\n  {command}")
     return status
 
 
@@ -282,12 +282,12 @@ def _truth_command(args: argparse.Namespace) -> int:
             if made is None:
                 raise ConfigError(
                     f"scene={config.scene_name}: its images are not rendered frame by frame; expected "
-                    "a scene of volumes, as task=dynamic scene=vdb"
+                    "a scene of volumes, for example task=dynamic scene=vdb"
                 )
             print(made.place, flush=True)
     except KeyboardInterrupt:
         command = shlex.join(["neuprim", "truth", *(["-m"] if args.multirun else []), *args.overrides])
-        raise KeyboardInterrupt(f"; frames made so far are kept; to go on:\n  {command}") from None
+        raise KeyboardInterrupt(f"; frames rendered so far are kept; to continue:\n  {command}") from None
     return 0
 
 
@@ -364,8 +364,8 @@ def _compose_rank_arguments(words: list[str], more: bool, group: ProcessGroup) -
     )
     if group.is_first and more:
         raise ConfigError(
-            f"{group.size} processes of torchrun fit one scene together; expected neither -m, --config, "
-            "--print-config, a target, a launcher, nor a viewer"
+            f"the {group.size} processes of torchrun train one run together; leave out -m, --config, "
+            "--print-config, targets, launchers and the viewer"
         )
     config = compose(words) if group.is_first else None
     directory = group.gather(None if config is None else str(config.output_dir))[0]
@@ -391,8 +391,8 @@ def _select_rank_gpu(config: RunConfig, place: TorchrunRank) -> None:
         return
     if gpus < place.local_size:
         raise BackendUnavailable(
-            f"renderer.device={config.renderer.device}: {gpus} GPUs for {place.local_size} ranks of this machine; "
-            f"expected one for each, or renderer.device={CPU}"
+            f"renderer.device={config.renderer.device}: this machine has {gpus} GPUs for {place.local_size} ranks; "
+            f"expected one GPU for each rank, or renderer.device={CPU}"
         )
     torch.cuda.set_device(place.local_rank)
 
@@ -417,7 +417,7 @@ def _fit_with_rank_progress(config: RunConfig, overrides: Sequence[str], group: 
         print_run_summary(run_dir)
     except RankError as error:
         command = f"torchrun {ranks} -m {typed.resume_command(config.output_dir)}"
-        raise RankError(f"{error}; to go on: {command}", error.reported) from error
+        raise RankError(f"{error}; to continue: {command}", error.reported) from error
     except KeyboardInterrupt:
         # torchrun takes any other status than 0 for a failure, and ends rank 0, which still has to write
         if group.is_first:

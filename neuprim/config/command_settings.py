@@ -114,7 +114,7 @@ def take_launcher_overrides(overrides: Sequence[str]) -> tuple[LauncherSettings,
     for key, launchers in users.items():
         if key in given and settings.name not in launchers:
             raise ConfigError(
-                f"launcher.{key}: launcher={settings.name} does not use it; expected it with launcher={launchers}"
+                f"launcher.{key}: launcher={settings.name} does not use this setting; expected launcher={launchers}"
             )
     return settings, others
 
@@ -139,9 +139,9 @@ def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget,
         raise ConfigError(f"target={format_setting_value(whole)}: expected one of {_TARGETS}")
     asked = "target" if budget is None else f"budget={budget}"
     if not target.given_settings():
-        raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}, or train.max_seconds=S without a target")
+        raise ConfigError(f"{asked}: no target; expected one of {_TARGETS}; for a run without one, train.max_seconds=S")
     if budget is None:
-        expected = "a budget beside it, the time for search and training together, such as budget=10m"
+        expected = "a budget, the time for search and training together, such as budget=10m"
         raise ConfigError(f"{target}: expected {expected}")
     return (target, parse_duration_setting(budget, asked)), others
 

@@ -323,7 +323,7 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
     place = f"preset/{spec.name}/{preset}.yaml"
     for name, value in (preset_node.pop("scene", None) or {}).items():
         if name not in scene_node or name == _PATHS:
-            raise ConfigError(f"preset={preset}: sets scene.{name}, which scene={scene} does not have")
+            raise ConfigError(f"preset={preset}: the preset sets scene.{name}, which scene={scene} does not have")
         scene_node[name] = value
     for key in preset_node:
         if key not in PRESET_GROUPS:
@@ -331,7 +331,7 @@ def _read_base(spec: TaskSpec, scene: str, package: str, preset: str, options: d
     paths = scene_node.pop(_PATHS, None) or []
     if not isinstance(paths, list) or any(name not in scene_node for name in paths) or "name" in scene_node:
         raise ConfigError(
-            f"scene/{spec.name}/{scene}.yaml: {_PATHS} must list keys of the file, and name is no setting"
+            f"scene/{spec.name}/{scene}.yaml: {_PATHS} may only list keys of the file, and no key may be called name"
         )
     merged = OmegaConf.merge(dataclasses.asdict(RunSettings()), preset_node)
     base = _BaseConfig(
@@ -411,7 +411,7 @@ def _validate_scene(node: Mapping[str, Any], declared: Mapping[str, Any], paths:
     for key, value in node.items():
         where, default = f"scene.{key}", declared[key]
         if default == _REQUIRED and value in (None, _REQUIRED):
-            expected = f"a directory or file, as {where}=PATH" if key in paths else f"{where}=VALUE"
+            expected = f"{where}=PATH, a directory or file" if key in paths else f"{where}=VALUE"
             raise ConfigError(f"{where}: required and not given; expected {expected}")
         if key in paths and value is not None:
             if not isinstance(value, (str, int)) or isinstance(value, bool) or not str(value).strip():

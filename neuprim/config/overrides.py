@@ -61,7 +61,7 @@ def parse_overrides(overrides: Sequence[str]) -> list[Assignment]:
                 f"{_quote_override_for_shell(text)}"
             )
         if override.package is not None:
-            raise ConfigError(f"{text}: packages (@) are not used here; expected KEY=VALUE")
+            raise ConfigError(f"{text}: Hydra packages (@) are not supported; expected KEY=VALUE")
         found.append(Assignment(override.key_or_group, override.value(), text))
     return found
 
@@ -111,11 +111,11 @@ def expand_sweep_overrides(overrides: Sequence[str]) -> list[list[str]]:
             reason = " ".join(str(error).split()) or type(error).__name__
             raise ConfigError(f"{text}: cannot be swept ({reason}); list the values: {key}=A,B,C") from error
         if not values:
-            raise ConfigError(f"{text}: no values to sweep")
+            raise ConfigError(f"{text}: no values to sweep; expected {key}=A,B,C")
         choices.append(values)
         count *= len(values)
         if count > MAX_RUNS:
-            raise ConfigError(f"{text}: more than {MAX_RUNS} runs in one sweep")
+            raise ConfigError(f"{text}: the sweep has more than {MAX_RUNS} runs; expected fewer values")
     return [list(combination) for combination in itertools.product(*choices)]
 
 

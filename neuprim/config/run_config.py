@@ -174,7 +174,7 @@ class RunConfig:
         for kind, plugin in stored.made_by.plugins.items():
             key, name = names[kind]
             if plugin.name != name:
-                raise ConfigError(f"made_by.{kind}.name: found {plugin.name!r}; expected {name!r}, as {key} says")
+                raise ConfigError(f"made_by.{kind}.name: found {plugin.name!r}; expected {name!r}, the value of {key}")
         same = "preset model train renderer metrics seed resume overrides non_default made_by".split()
         return cls(
             task=stored.task.name,

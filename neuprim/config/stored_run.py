@@ -60,7 +60,7 @@ def stored_choices(stored: RunConfig, typed: Choices, resumed: bool = False) -> 
             raise _resumed_config_error(stored, key, typed[key], own[key])
         has = "the level" if own[key] is None else f"{key} {own[key]}"
         raise ConfigError(
-            f"{key}={typed[key]}: the file of --config says every setting of {has}; expected no {key}= beside it"
+            f"{key}={typed[key]}: the file of --config already has all settings of {has}; leave {key}= out"
         )
     return {key: typed[key] or own[key] for key in CHOICES}
 
@@ -141,12 +141,12 @@ def find_resumed_config(typed: Mapping[str, Any], choices: Choices, has_file: bo
         except ConfigError as error:  # as of a version with other settings
             if bare:
                 raise
-            warn_once(f"{error}; the run goes on with what was typed alone")
+            warn_once(f"{error}; the stored settings are ignored, only those of the command line are used")
             return None
     if bare:
-        hint = ", or -m for the sweep there" if (directory / _SWEEP).is_file() else ""
+        hint = ", or -m to continue the sweep there" if (directory / _SWEEP).is_file() else ""
         raise ConfigError(
-            f"--out {directory} resume=true: no run was begun there (no config.yaml); expected a run's directory{hint}"
+            f"--out {directory} resume=true: no run to continue (no config.yaml); expected a run directory{hint}"
         )
     return None
 
@@ -165,9 +165,9 @@ def refuse_contradictions(begun: RunConfig, now: RunConfig, paths: Iterable[str]
 
 def _resumed_config_error(begun: RunConfig, key: str, typed: Any, was: Any) -> ConfigError:
     return ConfigError(
-        f"{key}={format_setting_value(typed)}: the run to resume was begun with "
+        f"{key}={format_setting_value(typed)}: the run to resume was started with "
         f"{key}={format_setting_value(was)} ({begun.source}); "
-        f"expected that, no {key}, or another --out DIR"
+        f"expected the same value, no {key}, or another --out DIR"
     )
 
 
@@ -203,12 +203,12 @@ def refuse_untrusted_settings(config: RunConfig, typed: Mapping[str, Any] | None
             continue
         share = value.startswith("\\\\" if os.name != "nt" else ("\\\\", "//"))
         if share or "://" in value or "::" in value:  # a URL, a chain of them, or a Windows share
-            what = "an address, which would be contacted"
+            what = "a network address that neuprim would contact"
         elif key == "scene.cache" and not Path(value).expanduser().resolve().is_relative_to(run_dir):
-            what = "a folder outside of the run, which would be written to"
+            what = "a folder outside of the run that neuprim would write to"
         else:
             continue
-        allow = f"type {key}=..." if typed is not None else f"add {FLAG}"
+        allow = f"add {key}=... to the command" if typed is not None else f"add {FLAG}"
         raise ConfigError(
             f"{config.source}: {key} is {cut_error_text(value)!r}, {what}; to allow it, {allow} or, for all runs, set "
             f"{ENVIRONMENT}=1"
@@ -223,7 +223,7 @@ def refuse_untrusted_run_links(run_dir: Path) -> None:
     for entry in os.scandir(run_dir):
         if entry.is_symlink() and entry.is_dir() and whole not in (there := Path(entry.path).resolve()).parents:
             raise ConfigError(
-                f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to write there"
+                f"{entry.path}: is a link to {there}, outside of the run; expected a folder, or {FLAG} to follow it"
             )
 
 

@@ -124,11 +124,11 @@ def _read_with_defaults(
 
     place = f"{folder}/{name}.yaml"
     if name in readers:
-        raise ConfigError(f"{who}{place}: defaults: starts from itself")
+        raise ConfigError(f"{who}{place}: defaults: the file includes itself; expected no cycle")
     own = read_task_yaml(root / folder / f"{name}.yaml", f"{who}{place}")
     names = own.pop("defaults", ["_self_"])
     if not isinstance(names, list) or not all(isinstance(entry, str) for entry in names):
-        raise ConfigError(f"{who}{place}: defaults={format_setting_value(names)}: expected a list of names of files")
+        raise ConfigError(f"{who}{place}: defaults={format_setting_value(names)}: expected a list of file names")
     names += [] if "_self_" in names else ["_self_"]
     parts = [own if n == "_self_" else _read_with_defaults(root, folder, n, who, (*readers, name)) for n in names]
     return omegaconf_to_plain(OmegaConf.merge(*parts), resolve=False)
@@ -187,11 +187,11 @@ def choose_config_effort_level(
     typed = f"{EFFORT}={chosen}"
     if levels is None:
         instead = "set model.primitives=N and train.iterations=N instead"
-        raise ConfigError(f"{typed}: task {spec.name!r} has no levels; {instead}")
+        raise ConfigError(f"{typed}: task {spec.name!r} has no effort levels; {instead}")
     level = levels[int(chosen)]
     if preset not in (None, level.preset):
-        found = f"levels of task {spec.name!r} are of preset={level.preset}, found preset={preset}"
-        raise ConfigError(f"{typed}: {found}; expected one of the two")
+        found = f"this level of task {spec.name!r} uses preset={level.preset}, found preset={preset}"
+        raise ConfigError(f"{typed}: {found}; leave one of the two out")
     return level
 
 

@@ -113,12 +113,12 @@ class Channels:
         if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
             what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
             raise ConfigError(
-                f"task {self.task!r}: display gave {what} for {tuple(image.shape)}; expected floats of shape {expected}"
+                f"task {self.task!r}: display returned {what} for {tuple(image.shape)}; expected floats {expected}"
             )
         bad = int((~torch.isfinite(found)).sum())
         if bad:
             raise ConfigError(
-                f"task {self.task!r}: display gave {bad} NaN or infinite values; expected numbers from 0 to 1"
+                f"task {self.task!r}: display returned {bad} NaN or infinite values; expected numbers from 0 to 1"
             )
         return found.clamp(0.0, 1.0)
 
@@ -127,10 +127,10 @@ def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
     """Return the channels of a task's data set; raises DataError if the data set has another number of channels than
     the task, or a background that does not fit the channels."""
     if task.channels and len(task.channels) != dataset.channels:
-        named = f"{len(task.channels)}, which task {task.name!r} names: {', '.join(task.channels)}"
+        named = f"{len(task.channels)}, the channels of task {task.name!r}: {', '.join(task.channels)}"
         raise DataError(f"{dataset.name}: {dataset.channels} channels; expected {named}")
     if (shape := tuple(dataset.background.shape)) != (dataset.channels,):
-        expected = f"({dataset.channels},), a number per channel"
+        expected = f"({dataset.channels},), one number per channel"
         raise DataError(f"{dataset.name}: the background has shape {shape}; expected {expected}")
     names = tuple(task.channels) or default_exr_channel_names(dataset.channels)
     return Channels(names, dataset.color_space, task.display, task.name)

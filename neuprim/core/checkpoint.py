@@ -85,7 +85,7 @@ def read_header(path: Path, kind: str) -> dict[str, Any]:
 def _check_model_header(path: Path, header: Any, kind: str) -> dict[str, Any]:
     if not isinstance(header, dict) or header.get("kind") != kind:
         found = header.get("kind") if isinstance(header, dict) else type(header).__name__
-        raise CheckpointError(f"{path}: kind is {cut_error_text(repr(found))}; expected {kind!r}")
+        raise CheckpointError(f"{path}: the header states kind {cut_error_text(repr(found))}; expected {kind!r}")
     if header.get("format") != FORMAT:
         raise CheckpointError(
             f"{path}: format version is {cut_error_text(repr(header.get('format')))}; this neuprim reads {FORMAT}"
@@ -212,8 +212,8 @@ def load_model_checkpoint(path: Path, task: TaskSpec) -> tuple[Primitives, dict[
     density, colour = (_read_checkpoint_field(path, header, task, kind) for kind in ("density", "colour"))
     _, tensors = read_tensors(path, "model")
     if not isinstance(density, DensityField) or not isinstance(colour, ColourField):
-        found = f"{type(density).__name__} and {type(colour).__name__}"
-        raise CheckpointError(f"{path}: density and colour fields are {found}; expected one of each")
+        found = f"density field {type(density).__name__} and colour field {type(colour).__name__}"
+        raise CheckpointError(f"{path}: {found}; expected a subclass of DensityField and one of ColourField")
     own = (*density.parameters(), *colour.parameters())
     if "sparse" in header:
         tensors = dense_primitive_parameters(tensors, header.pop("sparse"), own, str(path))
@@ -242,7 +242,8 @@ def _read_checkpoint_field(path: Path, header: Mapping[str, Any], task: TaskSpec
         plain = isinstance(value, int | float | str | list | None)
         if not plain or (isinstance(value, int) and abs(value) > 10_000):
             raise CheckpointError(
-                f"{path}: {kind} setting {cut_error_text(key)}={cut_error_text(repr(value))} is not plausible"
+                f"{path}: {kind} setting {cut_error_text(key)}={cut_error_text(repr(value))} is refused; "
+                "expected text, a list or a number, and integers of at most 10000"
             )
     try:
         return known[name](**settings)

@@ -156,7 +156,7 @@ def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequenc
         each = " and ".join(
             f"{condition_flag(name)} {texts[name]} has {count} frames" for name, count in counts.items()
         )
-        raise ConfigError(f"{each}; expected as many of each, or one of them without a number of its own")
+        raise ConfigError(f"{each}; expected equal numbers of frames, or only one condition with a number of frames")
     return max(counts.values(), default=1)
 
 
@@ -175,7 +175,7 @@ def _read_condition(spec: ConditionSpec, text: str, warn: Warn) -> list[Tensor]:
         values += _read_condition_number_or_range(spec, part)
         if len(values) > _MOST:  # before the next part takes more memory
             shown = f"{condition_flag(spec.name)} {text[:40]}..."
-            raise ConfigError(f"{shown}: {len(values)} values and more; expected at most {_MOST}")
+            raise ConfigError(f"{shown}: at least {len(values)} values; expected at most {_MOST}")
     _check_condition_range(spec, text, values, warn)
     return values
 
@@ -216,7 +216,7 @@ def _condition_values_from_text(spec: ConditionSpec, text: str) -> list[Tensor]:
             f"{condition_flag(spec.name)} {text}: cannot be read ({' '.join(str(error).split())})"
         ) from error
     if not values:
-        raise ConfigError(f"{condition_flag(spec.name)} {text}: stands for no value; expected at least one")
+        raise ConfigError(f"{condition_flag(spec.name)} {text}: contains no value; expected at least one")
     return list(values)
 
 
@@ -241,7 +241,7 @@ def _check_condition_range(spec: ConditionSpec, text: str, values: Sequence[Tens
         if bool(outside.any()):
             line = f"{shown}: {_first_where(value, outside):g} is outside its range, {low:g} to {high:g} ({spec.unit})"
             if spec.strict:
-                raise ConfigError(f"{line}; expected values within it")
+                raise ConfigError(f"{line}; expected values in this range")
             warn(f"warning: {line}")
             return
 

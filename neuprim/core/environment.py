@@ -92,7 +92,7 @@ class Environment:
     ) -> None:
         if radiance.dim() != 3 or radiance.shape[1:] != (2 * len(radiance), 3) or not len(radiance):
             shape = tuple(radiance.shape)
-            raise DataError(f"{where}: image has shape {shape}; expected (H, 2 H, 3), latitude and longitude, RGB")
+            raise DataError(f"{where}: image has shape {shape}; expected (H, 2 H, 3), RGB in latitude and longitude")
         axes = _environment_axes(torch.tensor([0.0, 0.0, 1.0]) if up is None else up)
         self._flux, self._moment = _sum_texel_blocks(radiance, axes, math.radians(rotation), where)
 
@@ -164,7 +164,7 @@ def _environment_axes(up: Tensor) -> Array:
     top = up.detach().double().numpy()
     length = np.linalg.norm(top)
     if not (np.isfinite(length) and length > 0):
-        raise DataError(f"up is {top.tolist()}; expected a direction")
+        raise DataError(f"up is {top.tolist()}; expected a direction of non-zero length")
     top = top / length
     first = np.eye(3)[0 if abs(top[0]) < 0.9 else 1]
     first = first - (first @ top) * top

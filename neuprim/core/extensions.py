@@ -88,7 +88,7 @@ class ExportJob:
         specs = [spec for spec in self.run.task.conditions if names is None or spec.name in names]
         for name in self.conditions:
             if name not in [spec.name for spec in specs]:
-                raise ConfigError(f"{condition_flag(name)}: what is written does not depend on it; expected none")
+                raise ConfigError(f"{condition_flag(name)}: the export does not depend on this condition; leave it out")
         return conditions_per_frame(specs, self.conditions, several)
 
     def number(self, name: str, low: float = -math.inf, high: float = math.inf) -> float | None:

@@ -64,7 +64,7 @@ class RenderSettings:
     def near_plane(self) -> float:
         """``near`` as a number; raises ConfigError if it is "auto"."""
         if self.near == "auto":
-            raise ConfigError("renderer.near=auto: nothing has decided it here; expected a positive distance")
+            raise ConfigError("renderer.near=auto: no scene sets the distance here; expected a positive number")
         return self.near
 
 

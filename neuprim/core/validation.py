@@ -223,7 +223,7 @@ def validate_setting_names(values: Iterable[object], names: Iterable[str], where
     known = list(names)
     for key in values:
         if key not in known:
-            hint = nearest(str(key), known, prefix=join_setting_key(where, "")) or "; there is none"
+            hint = nearest(str(key), known, prefix=join_setting_key(where, "")) or "; this group has no settings"
             raise ConfigError(f"{cut_error_text(join_setting_key(where, str(key)))}: no such setting{hint}")
 
 

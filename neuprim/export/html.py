@@ -52,7 +52,7 @@ def _write_html_export(job: ExportJob) -> ExportReport:
     run = job.run
     if run.channels.own is not None:
         raise ConfigError(
-            f"{run.directory}: pictures show {run.channels.display_text}; a page shows red, green and blue"
+            f"{run.directory}: pictures show {run.channels.display_text}; an HTML page needs red, green and blue"
         )
     find_export_rgb_channels(run)
     level, limit = job.count("level", 0, 5) or 0, job.count("views", 0, 100) or 0

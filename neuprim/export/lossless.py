@@ -67,7 +67,7 @@ def _unpack_export_header(text: str, path: Path) -> tuple[dict[str, Any], dict[s
     for name, shape in shapes.items():
         valid = isinstance(shape, list) and len(shape) <= 4 and all(type(n) is int and 0 <= n <= 10_000 for n in shape)
         if not valid or math.prod(shape) > 10_000:
-            raise DataError(f"{path}: parameter {name[:40]!r} has shape {str(shape)[:60]}; expected up to 4 sizes")
+            raise DataError(f"{path}: parameter {name[:40]!r} has shape {str(shape)[:60]}; expected up to 4 integers")
     return header, {name: tuple(shape) for name, shape in shapes.items()}, config
 
 
@@ -86,12 +86,12 @@ def _read_npz_export(path: Path) -> StoredModel:
         with zipfile.ZipFile(path) as archive:
             entries = {i.filename: i for i in archive.infolist()}
             if len(entries) != len(archive.infolist()) or len(entries) > 1000:
-                raise DataError(f"{path}: entries repeat, or more than 1000 of them")
+                raise DataError(f"{path}: entries repeat or are more than 1000; expected an export of neuprim")
             if "header.npy" not in entries:
                 raise DataError(f"{path}: no array 'header'; expected a file written by `neuprim export --format npz`")
             text = _read_npz_export_array(archive, entries["header.npy"], path, _HEADER_BYTES)
             if text.dtype.kind != "U" or text.shape != ():
-                raise DataError(f"{path}: header is {text.dtype} of shape {text.shape}; expected one text")
+                raise DataError(f"{path}: header is {text.dtype} of shape {text.shape}; expected a single text")
             header, shapes, config = _unpack_export_header(str(text), path)
             tensors = {}
             for name, shape in shapes.items():
@@ -148,7 +148,7 @@ def _read_ply_export(path: Path) -> StoredModel:
     if len(headers) != 1:
         hint = "; a PLY of 3D Gaussians or points can start a model: neuprim run ... model.init.points=FILE.ply"
         expected = f"expected one{'' if headers else hint}"
-        raise DataError(f"{path}: {len(headers)} comments hold a neuprim header; {expected}")
+        raise DataError(f"{path}: found {len(headers)} comments with a neuprim header; {expected}")
     header, shapes, config = _unpack_export_header(headers[0], path)
     tensors = {}
     for name, shape in shapes.items():

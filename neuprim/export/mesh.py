@@ -96,8 +96,8 @@ def _write_mesh(job: ExportJob) -> ExportReport:
     image.point_data["sigma"] = field.ravel(order="F")
     surface = image.contour([level], scalars="sigma", method="flying_edges")
     if not surface.n_cells:
-        densest = f"the densest of the sampled points has {float(field.max()):.4g} per scene unit"
-        raise ConfigError(f"level={level:.4g}: no surface; {densest}")
+        densest = f"expected an extinction below {float(field.max()):.4g} per scene unit, the largest sampled"
+        raise ConfigError(f"level={level:.4g}: no surface at this extinction; {densest}")
     points = np.asarray(surface.points, np.float64)
     faces = np.asarray(surface.faces).reshape(-1, 4)[:, 1:].astype(np.int64)
     mesh = trimesh.Trimesh(points @ scene_from_index[:3, :3].T + scene_from_index[:3, 3], faces, process=False)
@@ -130,7 +130,7 @@ def _sample_exported_density(job: ExportJob, conditions: Conditions, count: int)
     step = float((high - low).max()) / count
     shape = tuple(math.ceil(n) + 7 for n in (high - low) / step)
     if math.prod(shape) > _MOST_VOXELS:
-        raise ConfigError(f"grid={count}: {math.prod(shape)} voxels; expected at most {_MOST_VOXELS}")
+        raise ConfigError(f"grid={count}: the grid has {math.prod(shape)} voxels; expected at most {_MOST_VOXELS}")
     matrix = np.diag([step, step, step, 1.0])
     matrix[:3, 3] = low - 3 * step
     size = (shape[0], shape[1], shape[2])

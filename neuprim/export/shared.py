@@ -68,8 +68,8 @@ def find_export_rgb_channels(run: TrainedModel, hint: str = "") -> tuple[int, in
     """
     channels = run.channels
     if channels.rgb is None:
-        found = f"{run.directory}: {channels.count} channels, {channels.name_list}"
-        expected = f"this format has red, green and blue{hint}; --format ply and npz hold all channels"
+        found = f"{run.directory}: the model has {channels.count} channels, {channels.name_list}"
+        expected = f"this format stores red, green and blue{hint}; --format ply and npz hold all channels"
         raise ConfigError(f"{found}; {expected}")
     return channels.rgb
 
@@ -107,7 +107,7 @@ def _export_colours_from_afar(run: TrainedModel, conditions: Conditions, directi
     lowered = run.model.lower(camera, conditions, run.settings)
     if not lowered.colour.per_primitive:
         form = type(lowered.colour).__name__
-        raise ConfigError(f"{run.directory}: colours of the form {form} have no value per primitive")
+        raise ConfigError(f"{run.directory}: colours of the form {form} have no value per primitive to export")
     return lowered.center_colors(camera.position).double()
 
 
@@ -161,5 +161,5 @@ def find_export_box(job: ExportJob, frames: Sequence[Conditions]) -> tuple[Tenso
                 lows.append((geometry.means.double() - reach).min(0).values)
                 highs.append((geometry.means.double() + reach).max(0).values)
     if not lows:
-        raise ConfigError(f"{job.run.directory}: no primitive is there under these conditions; nothing to export")
+        raise ConfigError(f"{job.run.directory}: no primitive is active under these conditions; nothing to export")
     return torch.stack(lows).min(0).values, torch.stack(highs).max(0).values

@@ -76,7 +76,7 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     if units == "auto":
         units = "source" if placement else "world"
     if units == "source" and placement is None:
-        raise ConfigError("units=source: the model's header names no .vdb files; expected world or scene")
+        raise ConfigError("units=source: the model's header names no .vdb files; expected units=world or units=scene")
     scene_from_world = job.run.world.scene_from_world.numpy() if placement is None else placement.scene_from_world
     per_world = abs(np.linalg.det(scene_from_world[:3, :3])) ** (1 / 3)
     factor = {"source": 1 / placement.sigma_per_unit if placement else 1.0, "world": per_world, "scene": 1.0}[units]
@@ -134,9 +134,8 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
         return model
     if placement.component not in model.density.components(model.params):
         raise ConfigError(
-            f"{job.run.directory}: flames absorb beside grid {placement.grid!r}, and the model has learned no share of "
-            "it in its extinction, so its density is not known; train again with voxels (train.supervision=both, "
-            "scene.optics.extinction above 0)"
+            f"{job.run.directory}: the model's extinction mixes flames with grid {placement.grid!r}, so the density of "
+            "this grid alone is unknown; train again with train.supervision=both and scene.optics.extinction above 0"
         )
     return model.component(placement.component)
 
@@ -213,7 +212,7 @@ def _name_vdb_files(job: ExportJob, frames: list[_GridFrame]) -> list[Path]:
     suffix = job.out.suffix.lower()
     if suffix == ".vdb":
         if len(frames) > 1:
-            raise ConfigError(f"--out {job.out}: {len(frames)} frames; expected a folder")
+            raise ConfigError(f"--out {job.out}: {len(frames)} frames need several files; expected a folder")
         return [job.out]
     if not job.run.task.conditions:
         if suffix:
@@ -229,7 +228,7 @@ def _export_voxel_transform(
     """Return (4, 4) world_from_index for the options ``grid`` or ``voxel_size``; index 0 is at ``origin`` (3,)."""
     count, size = job.count("grid", 8, 2048), job.number("voxel_size", 1e-9, 1e9)
     if count is not None and size is not None:
-        raise ConfigError("grid and voxel_size: expected one of them")
+        raise ConfigError("grid and voxel_size: both are given; expected one of them")
     corners = np.linalg.inv(scene_from_world)[:3, :3] @ (box[1] - box[0])
     return vdb_scale_transform(size or float(np.abs(corners).max()) / (count or 128), origin.tolist())
 
@@ -265,12 +264,14 @@ class _VdbExportSampler(NamedTuple):
         back = np.linalg.inv(scene_from_index)
         index = corners @ back[:3, :3].T + back[:3, 3]
         if not (np.abs(index) < 2**30).all():
-            raise ConfigError(f"the model reaches voxel {np.abs(index).max():.3g}; expected fewer (voxel_size, grid)")
+            raise ConfigError(
+                f"voxel index {np.abs(index).max():.3g} is too large; use a larger voxel_size or smaller grid"
+            )
         first = np.floor(index.min(0)).astype(np.int64) & ~7
         size = (np.ceil(index.max(0)).astype(np.int64) & ~7) + 8 - first
         if math.prod(size.tolist()) > _MOST_VOXELS:
             voxels = f"{' x '.join(map(str, size))} voxels around the model"
-            raise ConfigError(f"{voxels}; expected at most {_MOST_VOXELS:.0e} (voxel_size, grid)")
+            raise ConfigError(f"{voxels}; expected at most {_MOST_VOXELS:.0e}. Use a larger voxel_size or smaller grid")
         parts = [g for g in self._sample_blocks(conditions, scene_from_index, first, size) if len(g.origins)]
         leaves = (
             np.concatenate([np.zeros((0, 3), np.int32), *(g.origins for g in parts)]),

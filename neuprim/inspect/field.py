@@ -93,7 +93,7 @@ class InspectionFrame:
             if self.side == "model":
                 grid = density_grid(self.model, self.conditions, self.scene_from_index, self.shape).numpy()
             elif self.truth is None:
-                raise ConfigError("there is no ground truth to show; give --against")
+                raise ConfigError("there is no ground truth to show; give --against FILE.vdb, DIR or scene")
             else:
                 grid = self.truth()
             self._grids[self.side] = grid
@@ -149,7 +149,7 @@ class InspectionFrame:
             raise ConfigError(f"--primitive {wanted}: the model has {count} primitives, 0 to {count - 1}")
         found = np.flatnonzero(self.rows == wanted)
         if not len(found):
-            raise ConfigError(f"--primitive {wanted}: it absorbs nothing at {self.title}")
+            raise ConfigError(f"--primitive {wanted}: this primitive absorbs nothing at {self.title}")
         return int(found[0])
 
 
@@ -176,7 +176,7 @@ class GivenConditions(dict[str, Tensor]):
     """Conditions of a frame, as a dict. A missing condition raises a ConfigError that asks the user for it."""
 
     def __missing__(self, name: str) -> Tensor:
-        raise ConfigError(f"this needs the {name}; give {condition_flag(name)}")
+        raise ConfigError(f"the condition {name} is missing; give {condition_flag(name)}")
 
 
 def read_inspected_conditions(
@@ -214,7 +214,7 @@ def parse_inspection_box(numbers: Sequence[float]) -> np.ndarray:
     """Convert the six numbers of ``--box`` to a (2, 3) box; raise ConfigError if the box has no volume."""
     if len(numbers) != 6 or not all(a < b for a, b in zip(numbers[:3], numbers[3:], strict=True)):
         given = ",".join(f"{x:g}" for x in numbers)
-        raise ConfigError(f"--box {given}: expected the lower and the upper corner, as -1,-1,-1,1,1,1")
+        raise ConfigError(f"--box {given}: expected the lower and the upper corner, such as -1,-1,-1,1,1,1")
     return np.array(numbers, np.float64).reshape(2, 3)
 
 
@@ -236,7 +236,7 @@ def find_inspection_box(model: Primitives, frames: Sequence[Conditions]) -> np.n
         lows.append([_inspection_box_quantile(means[:, a] - reach[:, a], weights, _OUTSIDE) for a in range(3)])
         highs.append([_inspection_box_quantile(means[:, a] + reach[:, a], weights, 1 - _OUTSIDE) for a in range(3)])
     if not lows:
-        raise DataError("the model absorbs nothing in any of these frames; there is nothing to look at")
+        raise DataError("the model absorbs nothing in any of these frames; there is nothing to show")
     return np.stack([np.min(lows, 0), np.max(highs, 0)])
 
 
@@ -261,7 +261,7 @@ def open_inspection_truth(path: str, volume: Callable[[], DensityGridSource | No
     """
     place, scene = Path(path), volume()
     if scene is None:
-        raise DataError(f"--against {path}: the run's scene has no volumes, which say how files are placed and scaled")
+        raise DataError(f"--against {path}: the run's scene has no volumes, so the placement of the files is unknown")
     if path == "scene" and not place.exists():
         return scene, "ground truth: the scene's own volumes"
     if not place.exists():

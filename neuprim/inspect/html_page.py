@@ -69,8 +69,8 @@ def write_inspection_page(
         size += sum(map(len, frames[-1]["arrays"]))
         if size > _SIZE_LIMIT:
             raise ConfigError(
-                f"--out {path}: more than {_SIZE_LIMIT >> 20} MiB after {i + 1} of {count} frames; "
-                "expected fewer, or a smaller --grid"
+                f"--out {path}: the page exceeds {_SIZE_LIMIT >> 20} MiB after {i + 1} of {count} frames; "
+                "expected fewer frames or a smaller --grid"
             )
     layers = [x for one in frames for sides in one["layers"].values() for side in sides.values() for x in side]
     colours = sorted({layer["scale"]["colours"] for layer in layers if layer.get("scale")})

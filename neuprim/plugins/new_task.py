@@ -41,7 +41,7 @@ def write_plugin_package(name: str, out: Path | None = None) -> list[str]:
     }
     folder = Path(variables["distribution"]) if out is None else out
     if folder.exists() or folder.is_symlink():
-        raise ConfigError(f"{folder}: exists; expected a folder to make (--out DIR)")
+        raise ConfigError(f"{folder}: exists already; choose a new folder with --out DIR")
 
     template = resources.files("neuprim.plugins") / "template"
     publish_folder(folder, lambda draft: _write_template(template, draft, variables), lambda path: path.exists())

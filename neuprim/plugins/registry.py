@@ -161,7 +161,7 @@ class PluginGroup(Generic[T]):
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
         """Warn that the bare name of ``info`` means another plugin, and say how to choose ``info``."""
         what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
-        warn_once(f"{what} has the name of {by}, which is used; {self.choice(info)} chooses the other")
+        warn_once(f"{what} has the same name as {by}, which is used; give {self.choice(info)} to use the former")
 
     def _find(self, word: str) -> tuple[PluginInfo, metadata.EntryPoint]:
         entries = self._entries()
@@ -178,7 +178,7 @@ class PluginGroup(Generic[T]):
         if len(found) > 1:
             origins = " and ".join(f"{info.origin} ({info.target})" for info, _ in found)
             choices = list(dict.fromkeys(self.choice(info) for info, _ in found))
-            advice = f"choose {' or '.join(choices)}" if len(choices) > 1 else "a package may register a name once"
+            advice = f"choose {' or '.join(choices)}" if len(choices) > 1 else "a package may register a name only once"
             raise PluginError(f"{self.kind} {name!r} is registered by {origins}; {advice}")
         return found[0]
 
@@ -234,7 +234,7 @@ class PluginGroup(Generic[T]):
         if (problem := validate_spec(spec)) is not None:
             raise PluginError(f"{who}: {class_name}.{problem}")
         if (own := self.name_of(spec)) != info.name:
-            raise PluginError(f"{who}: its {class_name} is named {own!r}; expected the name of the entry point")
+            raise PluginError(f"{who}: its {class_name} is named {own!r}; expected {info.name!r}, as the entry point")
         return spec  # type: ignore[no-any-return]
 
 

@@ -66,7 +66,7 @@ def _check_spec(spec: Any) -> None:
                 for i, entry in enumerate(value):
                     _check_spec_member(entry, nested, f"{name}[{i}]")
                 names = [entry.name for entry in value]
-                _require_member(len(set(names)) == len(names), f"{name} has two of one name among {', '.join(names)}")
+                _require_member(len(set(names)) == len(names), f"{name} has a name twice: {', '.join(names)}")
     for kind_of_spec, check in _CHECKS.items():
         if isinstance(spec, kind_of_spec):
             check(spec)

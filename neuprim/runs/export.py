@@ -89,8 +89,8 @@ def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) ->
         final = output.final_path(path)
         if final is None:
             raise PluginError(
-                f"{exporter}: wrote {path} instead of {output.out}, past everything that keeps files from being "
-                f"replaced"
+                f"{exporter}: wrote {path} instead of {output.out}; expected only files below the given path, "
+                f"where existing files are protected"
             )
         if not path.exists():
             raise PluginError(f"{exporter}: reports {path}, which it did not write")
@@ -155,14 +155,14 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
     if name is None and is_compressed(path):
         config = checkpoint.checkpoint_config(path)
         if config is None:
-            raise DataError(f"{path}: holds no config.yaml; expected a file written by `neuprim compress`")
+            raise DataError(f"{path}: contains no config.yaml; expected a file written by `neuprim compress`")
         return _write_imported_run(path, out, config, lambda folder: shutil.copyfile(path, folder / COMPRESSED))
     name = name or path.suffix.lower().removeprefix(".")
     try:
         reader = EXPORTERS.load(name)
     except UnknownPlugin:
         raise ConfigError(
-            f"{path}: no format reads .{name} files; expected one of `neuprim compress`, or of --format ply or npz"
+            f"{path}: cannot import .{name} files; expected a file of `neuprim compress`, or of --format ply or npz"
         ) from None
     if reader.read is None:
         raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")

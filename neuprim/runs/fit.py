@@ -177,7 +177,7 @@ def prepare_training(
         group: the ranks that train the model together; None for one process.
     """
     if make is None:
-        refuse_chunks(config, "this trains one model at once, and only a whole run can be fitted in chunks")
+        refuse_chunks(config, "this function trains one model; only a whole run can train in chunks")
     backends.check_render_backend(config.renderer)
     task = Job.of(config).task
     config = replace(config, made_by=current_config_provenance(config, task))

@@ -131,8 +131,8 @@ def render_frames_job(data: Mapping[str, Any], attempt: int, events: Events) -> 
     truth = _loaded[key]
     if truth.key != data["key"]:
         raise DataError(
-            f"{truth.place}: a worker sees another scene; expected the launcher's files there, of the same names, "
-            f"sizes and times, and its neuprim"
+            f"{truth.place}: a worker has other scene files than the launcher; expected files of the same names, "
+            f"sizes and times, and the same neuprim"
         )
     for done, frame in enumerate(data["frames"]):
         events(Preparing(truth.frames[frame], done / len(data["frames"])))

@@ -131,8 +131,8 @@ def measure_views(
                 on_view(i, dataset.test.view(i), rendered, truth)
     if all(view.empty for view in result):
         warn_once(
-            f"{dataset.name}: the model is in none of {len(result)} test views, which show the background alone; "
-            f"expected starting points where the cameras look: {GIVE_POINTS}"
+            f"{dataset.name}: the model is invisible in all {len(result)} test views, which show only the background; "
+            f"expected starting points in view of the cameras: {GIVE_POINTS}"
         )
     return result
 

@@ -188,7 +188,7 @@ def read_metrics(run_dir: Path) -> dict[str, Any]:
     if not isinstance(data, dict) or any(
         finite_json_number(data[name]) is None for name in ("ssim", "train_seconds") if data.get(name) is not None
     ):
-        raise DataError(f"{path}: expected an object with metrics")
+        raise DataError(f"{path}: not a metrics file; expected an object with numbers for ssim and train_seconds")
     return data
 
 
@@ -229,8 +229,8 @@ def lock_run_directory(directory: Path, what: str = "run") -> Iterator[None]:
         lock.acquire(timeout=0)
     except Timeout:
         raise ConfigError(
-            f"{directory}: {_describe_lock_holder(file)} is at work on this {what}; expected that to end first, or "
-            f"another output_dir"
+            f"{directory}: {_describe_lock_holder(file)} is using this {what}; wait until it ends, or choose "
+            f"another --out DIR"
         ) from None
     owner = {"host": socket.gethostname(), "pid": os.getpid(), "since": time.strftime("%F %T")}
     try:

@@ -153,7 +153,7 @@ def parse_run_rendering(overrides: Sequence[str], defaults: RenderSettings, mode
                 "resolution",
                 *reduction_names(model.density, model.colour),
             ]
-            raise ConfigError(f"{assignment.key}: no setting of rendering{nearest(assignment.key, known)}")
+            raise ConfigError(f"{assignment.key}: no such rendering setting{nearest(assignment.key, known)}")
     settings = validate_settings(RenderSettings, values, "renderer")
     if settings.near == "auto":
         settings = dataclasses.replace(settings, near=defaults.near)  # resolved by the run's training
@@ -211,7 +211,7 @@ class RunExrLayers:
     def _layer_specs(self) -> tuple[LayerSpec, ...]:
         if self._splits_lights and len(self.lights) > _MOST_LIGHTS:
             raise ConfigError(
-                f"--layers {LIGHTS}: {len(self.lights)} lights; expected at most {_MOST_LIGHTS}, a layer each "
+                f"--layers {LIGHTS}: {len(self.lights)} lights, one layer each; expected at most {_MOST_LIGHTS} lights "
                 f"(--environment-samples)"
             )
         found = select_layers(self.names, self.task.layers, bool(self.lights))
@@ -220,8 +220,8 @@ class RunExrLayers:
         light = [spec.name for spec in found if spec.light and spec.name != "beauty"] + [LIGHTS] * self._splits_lights
         if self.names is not None and light:
             raise ConfigError(
-                f"--layers {light[0]}: the model's colours are sRGB values, which do not add up; expected a model in "
-                f"linear light"
+                f"--layers {light[0]}: layers of light need linear colours, but the model's are sRGB; expected a model "
+                f"in linear light"
             )
         return tuple(spec for spec in found if spec.name not in light)
 
@@ -261,7 +261,7 @@ class RunExrLayers:
                 image = draw_task_layer(spec, frame, self.channels.count)
                 if image is None:
                     if self.names is not None:
-                        raise ConfigError(f"--layers {spec.name}: this run's model has none ({spec.summary})")
+                        raise ConfigError(f"--layers {spec.name}: this run's model has no such layer ({spec.summary})")
                     del present[spec.name]
                     continue
                 image = image.cpu().double() if self.lights and spec.light else image.cpu()

@@ -163,7 +163,7 @@ class _RunRenderSession:
         self.animate = self.format in ANIMATIONS and len(self.views) > 1
         for option, value in (("--layers", request.layers), ("--datatype", request.datatype)):
             if value is not None and self.format != "exr":
-                raise ConfigError(f"{option} {value}: of OpenEXR files; expected --format exr, found {self.format}")
+                raise ConfigError(f"{option} {value}: only for OpenEXR; expected --format exr, found {self.format}")
         half, drawn = request.datatype == "half", (self.channels, self.render_config, self.background)
         layers = RunExrLayers(run.directory, self.task, *drawn, request.layers, half, self.lights, self.world, self.fps)
         layers = replace(layers, shutter=self.shutter)
@@ -179,7 +179,7 @@ class _RunRenderSession:
         lights = illumination.frames(environment.guesses)
         if not lights:
             raise ConfigError(
-                f"--environment-unseen drop: all light of {environment.path} comes from where the model never saw any"
+                f"--environment-unseen drop: all light of {environment.path} comes from directions unseen in training"
             )
         guessed = environment.guesses and any(illumination.guessed)
         hint = " (--environment-unseen drop leaves it out)" if guessed else ""
@@ -237,7 +237,7 @@ class _RunRenderSession:
             return [], conditions
         numbers, known = parse_frame_numbers(text), source_frames(self.run.header)
         if known is None:
-            raise ConfigError(f"--frame {text}: this model has no numbered frames; expected one of .vdb files")
+            raise ConfigError(f"--frame {text}: this model has no frame numbers; expected a model of .vdb files")
         if "time" in conditions:
             raise ConfigError("--frame and --time: give one of them")
         first, last = known
@@ -331,8 +331,8 @@ class _RunRenderSession:
             start, end, at, towards = ("(" + ", ".join(f"{x:.7g}" for x in point) + ")" for point in points)
             where = f"the model is within {start} to {end}, and {view.name} at {at} looks towards {towards}"
         raise DataError(
-            f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}; cameras of a file are "
-            f"in the units of the run's data, or of the model with --space scene"
+            f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}; expected cameras "
+            f"in the units of the run's data, or in those of the model with --space scene"
         )
 
 

@@ -253,7 +253,7 @@ def _fit_chunks(plan: ChunkPlan, record: LaunchRecord, events: Events, launcher:
     failed = [f"{own.output_dir}: {r.line}" for own, r in zip(plan.configs, results, strict=True) if r and r.line]
     if failed:
         raise ChunksMissing(
-            f"{'; '.join(failed)}; {count - len(failed)} of {count} chunks are done, and resume=true with "
-            f"--out {folder} makes the others"
+            f"{'; '.join(failed)}; {count - len(failed)} of {count} chunks are finished; run again with "
+            f"resume=true --out {folder} to train the others"
         )
     return record

@@ -105,14 +105,14 @@ class LaunchRecord:
         old, names = {run.name: run for run in before.runs}, [run.name for run in self.runs]
         if not more and list(old) != names:
             raise ConfigError(
-                f"{self.file}: begun with {', '.join(old)}; the settings now ask for {', '.join(names)}; expected "
+                f"{self.file}: contains the runs {', '.join(old)}; the settings now give {', '.join(names)}; expected "
                 f"the same settings, or another --out DIR"
             )
         for run in self.runs:
             if run.name in old and old[run.name].words != run.words:
                 was = " ".join(old[run.name].words)
                 raise ConfigError(
-                    f"{self.file}: {run.name} was begun with {was}; expected the same settings, or another --out DIR"
+                    f"{self.file}: {run.name} was started with {was}; expected the same settings, or another --out DIR"
                 )
         own = tuple(old.get(run.name, run) for run in self.runs)
         others = tuple(run for run in before.runs if run.name not in names)
@@ -217,14 +217,14 @@ def read_sweep_overrides(words: Sequence[str]) -> list[str]:
         before = read_launch_record(Path(str(given["output_dir"])).expanduser() / SWEEP_FILE)
     if before is None:
         raise ConfigError(
-            f"{' '.join(words) or 'nothing'}: no values to sweep; expected KEY=A,B,C, or --out DIR resume=true of "
-            f"a sweep ({SWEEP_FILE} in it)"
+            f"{' '.join(words) or 'nothing'}: no values to sweep; expected KEY=A,B,C, or resume=true with "
+            f"--out DIR of a sweep (it contains {SWEEP_FILE})"
         )
     for word in before.words:
         if "${" in word:  # a file must not read the environment; see neuprim.config.compose
             raise ConfigError(
-                f"{before.file}: {cut_error_text(word)} refers to something outside of the file; type the sweep's "
-                f"words again, with resume=true"
+                f"{before.file}: {cut_error_text(word)} refers to a value outside of the file, which is refused; "
+                f"type the settings of the sweep again, with resume=true"
             )
     return [*before.words, *words]
 

@@ -303,8 +303,8 @@ def reconstruct_room_points(
             break
     else:
         raise ConfigError(
-            f"scene.points={count}: only {len(directions)} points found that two of {len(poses)} training views see; "
-            "expected more views"
+            f"scene.points={count}: only {len(directions)} points are visible in two of {len(poses)} training views; "
+            "expected fewer points or more views"
         )
     random = np.random.default_rng([_POINTS_SEED, _ROUNDS])
     chosen = np.sort(random.permutation(len(directions))[:count])

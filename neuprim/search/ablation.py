@@ -113,7 +113,7 @@ def run_ablation(
         check_dataset_views(dataset, task.conditions)
         views = choose_trial_views(dataset, request.views)
         if not views:
-            raise DataError(f"{dataset.name} has no test views; expected some to measure on")
+            raise DataError(f"{dataset.name} has no test views; expected at least one")
         lpips = str(request.lpips or centre.metrics.lpips or "")
         identity = {"kind": "models", **models.identity(), "lpips": lpips, **describe_tradeoff_conditions(views)}
         record = _resume_ablation_set(folder, before, identity, tell)
@@ -350,12 +350,12 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
-            raise ConfigError(f"--out {folder}: holds something else; expected a new directory, or that of a set")
+            raise ConfigError(f"--out {folder}: has other files; expected a new directory, or one of trainings")
     elif before.same.get("kind") != "models":
-        raise DataError(f"{folder / TRADEOFF_FILE}: of a finished run; expected another --out DIR for trainings")
+        raise DataError(f"{folder / TRADEOFF_FILE}: is about a finished run; expected another --out DIR for trainings")
     elif changed := before.changes(models.identity()):
         expected = "expected the same settings, or another --out DIR"
-        raise ConfigError(f"{folder}: holds a set with another {' and '.join(changed)}; {expected}")
+        raise ConfigError(f"{folder}: has trainings with another {' and '.join(changed)}; {expected}")
 
 
 def _resume_ablation_set(
@@ -372,7 +372,7 @@ def _resume_ablation_set(
         return record
     points = [p for p in before.points if p.run_dir and (folder / p.run_dir / "model.safetensors").exists()]
     if points and points[0].name == CENTRE:
-        tell(f"{folder / TRADEOFF_FILE}: {len(points)} models are kept; delete the folder to train anew")
+        tell(f"{folder / TRADEOFF_FILE}: {len(points)} models are kept; delete the folder to train again")
         record.points = points
     return record
 
@@ -381,4 +381,4 @@ def _parse_ablation_plan(file: Path, record: TradeoffRecord) -> AblationPlan | N
     try:
         return validate_settings(AblationPlan, record.facts["plan"], "plan") if "plan" in record.facts else None
     except ConfigError as error:
-        raise DataError(f"{file}: damaged ({error}); delete the folder to train anew") from error
+        raise DataError(f"{file}: damaged ({error}); delete the folder to train again") from error

@@ -122,7 +122,9 @@ def compress_run(request: CompressRequest, progress: Progress = lambda text, fra
     run_dir = request.run_dir
     if request.tolerance is not None and request.by_level:
         other = "bits.NAME=BITS" if request.bits else "--level"
-        raise ConfigError(f"--tolerance {request.tolerance:g}: decides the bits of every number; expected no {other}")
+        raise ConfigError(
+            f"--tolerance {request.tolerance:g}: the tolerance determines the bits of all numbers; leave {other} out"
+        )
     final = request.out or run_dir / COMPRESSED
     if final.is_dir():
         raise ConfigError(f"--out {final}: is a folder; expected the name of a file")

@@ -165,11 +165,11 @@ class SizeSearch:
         possible, pace = self.full_steps(first.count), self.runner.pace(first.count)
         needed = 2 * _MIN_STEPS * _SHORTER
         if possible < needed:
-            enough = "" if self.max_steps < needed else f", or {needed * pace / _FULL:.0f} s"
+            enough = "" if self.max_steps < needed else f"a budget of {needed * pace / _FULL:.0f} s, "
             raise ConfigError(
-                f"budget={self.record.asked['budget']:g}s: a full run of {first.count:,} primitives would have "
-                f"{possible:.0f} steps; expected {needed} or more{enough}, fewer "
-                "primitives to begin with (model.primitives) or smaller images"
+                f"budget={self.record.asked['budget']:g}s: enough for {possible:.0f} steps of {first.count:,} "
+                f"primitives; expected at least {needed} steps. Give {enough}fewer "
+                "primitives (model.primitives) or smaller images"
             )
         self.record.length = round(possible / _SHORTER)
         self.runner.notify(

@@ -115,7 +115,7 @@ def choose_target_hold_out(dataset: Dataset) -> int:
     """Return n if every n-th training view is to be held out: 8, or 2 to 7 for fewer than 64 training views."""
     count = len(dataset.train)
     if count < 4:
-        raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, as some are held out")
+        raise DataError(f"{dataset.name}: {count} training views; a target needs 4 or more, because some are held out")
     return min(8, max(2, count // 8))
 
 
@@ -123,11 +123,11 @@ def _check_target_config(config: RunConfig) -> None:
     train, population = config.train, config.train.population
     if train.max_seconds is not None and "train.max_seconds" in config.non_default:
         raise ConfigError(
-            f"train.max_seconds={train.max_seconds:g}: a run with a target has its seconds from budget=; expected one"
+            f"train.max_seconds={train.max_seconds:g}: a run with a target takes its time from budget=; leave this out"
         )
     if train.iterations == 0:
-        raise ConfigError("train.iterations=0: a run with a target has to train; expected a positive number")
-    decides = "a target decides how many primitives there are"
+        raise ConfigError("train.iterations=0: a run with a target must train; expected a positive number")
+    decides = "a target determines the number of primitives"
     if population.strategy == "gradient":
         raise ConfigError(f"train.population.strategy=gradient: {decides}; expected relocate or fixed")
     if population.grow_to is not None:
@@ -143,12 +143,14 @@ def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetR
     before = read_target_record(folder) if config.resume else None
     if before is None:
         if (folder / "config.yaml").exists():
-            expected = "expected a new directory, or that of a target run"
-            raise ConfigError(f"--out {folder}: holds a run without a target; {expected}")
+            expected = "expected a new directory, or that of a run with a target"
+            raise ConfigError(f"--out {folder}: contains a run without a target; {expected}")
         return TargetRecord(asked, same)
     if different := [key for key in same if before.same.get(key) != same[key]]:
         expected = "expected the same settings, or a new --out DIR"
-        raise ConfigError(f"{folder / TARGET_FILE}: begun with another {', '.join(different)}; {expected}")
+        raise ConfigError(
+            f"{folder / TARGET_FILE}: the search was started with another {', '.join(different)}; {expected}"
+        )
     if before.asked == asked:
         return before
     finished = [a for a in before.attempts if a.outcome is not None]

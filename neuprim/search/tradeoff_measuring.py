@@ -128,7 +128,7 @@ def load_tradeoff_setup(
         loaded = dataset, choose_trial_views(dataset, views)
     dataset, chosen = loaded
     if not chosen:
-        raise DataError(f"{run_dir}: {dataset.name} has no test views; expected some to measure on")
+        raise DataError(f"{run_dir}: {dataset.name} has no test views; expected at least one")
     channels, file = find_channels(task, dataset), model_file(run_dir)
     return TradeoffSetup(config, model, dataset, channels, reference, chosen, file, distance)
 

@@ -320,8 +320,8 @@ class ViewerServer:
         if not (auth.installed and self.viser.get_port() == port):
             self.close()
             raise BackendUnavailable(
-                f"viser {viser.__version__} did not start behind the check of its visitors, or not on port {port}; "
-                "pip install -c constraints.txt 'neuprim[viewer]' has a version that does"
+                f"viser {viser.__version__} did not start with access control on port {port}; "
+                "install a supported version: pip install -c constraints.txt 'neuprim[viewer]'"
             )
         self.viser.gui.configure_theme(show_logo=False, show_share_button=False, dark_mode=True, control_width="large")
         # Even light, so that ellipsoids keep nearly their own colours.

@@ -173,9 +173,9 @@ def _field_script(kind: str, field: Field) -> str:
     """Return the script with which a browser evaluates the field, without its comment."""
     text = field.script()
     if text is None:
-        raise ConfigError(f"{kind} field {type(field).__name__} has no script for browsers; a page cannot show it")
+        raise ConfigError(f"{kind} field {type(field).__name__} has no JavaScript version, so a page cannot show it")
     if not isinstance(text, str) or "</script" in text.lower() or "<!--" in text:
-        expected = "script() must be a text of JavaScript without an end of its element"
+        expected = "script() must return JavaScript text without </script or <!--"
         raise ConfigError(f"{kind} field {type(field).__name__}: {expected}")
     return re.sub(r"^(//[^\n]*\n)+", "", text)
 
@@ -241,7 +241,7 @@ def scene_page(
     """
     if channels.own is not None or channels.rgb is None:
         raise ConfigError(
-            f"a page shows red, green and blue; this model has {channels.display_text or channels.name_list}"
+            f"an HTML page needs red, green and blue; this model has {channels.display_text or channels.name_list}"
         )
     still = ""
     if scene.views:

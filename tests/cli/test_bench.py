@@ -48,7 +48,7 @@ def test_without_data_it_lists(capsys: pytest.CaptureFixture[str]) -> None:
 def test_words() -> None:
     assert parse_table_numbers("3-5,7") == {3, 4, 5, 7}
     for wrong in ("2", "3-8", "5-3", "", "all"):
-        with pytest.raises(ConfigError, match=f"--tables {wrong}: .*expected numbers from 3 to 7"):
+        with pytest.raises(ConfigError, match=f"--tables {wrong}: .*expected table numbers from 3 to 7"):
             parse_table_numbers(wrong)
 
 

@@ -136,8 +136,11 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["rn"], "rn: no such command; did you mean 'run'"),
         (["--versoin"], "--help"),
         (["run", "--confg", "x"], "--confg: no such argument of `neuprim run`; did you mean '--config'"),
-        (["run", "task=toy", "output_dir=x"], "output_dir=x: no setting of `neuprim run`; expected --out DIR"),
-        (["truth", "output_dir=x"], "output_dir=x: no setting of `neuprim truth`; expected no output_dir"),
+        (
+            ["run", "task=toy", "output_dir=x"],
+            "output_dir=x: `neuprim run` does not take output_dir; expected --out DIR",
+        ),
+        (["truth", "output_dir=x"], "output_dir=x: `neuprim truth` does not take output_dir; leave it out"),
         (["run", "toy"], "toy: expected KEY=VALUE; did you mean: neuprim run task=toy?"),
         (["run", "bal"], "bal: expected KEY=VALUE (see neuprim run --help)"),
         (["run", "ball", "seed=2"], "ball: expected KEY=VALUE; did you mean: neuprim run task=toy scene=ball seed=2?"),
@@ -159,8 +162,14 @@ def test_a_failing_combination_does_not_lose_the_others(
         (["render", ".", "--camera", "orbit", "--time", "0"], "config.yaml: missing"),
         (["vdb", "info", "x" * 300], "File name too long"),
         (["tasks", "more"], "more: no such argument of `neuprim tasks`"),
-        (["run", "-m", "task=toy", "target.psnr=30", "budget=5m", "seed=1,2"], "expected no -m beside it"),
-        (["run", "-m", "viewer=true", "seed=1,2"], "viewer=true: shows one run; expected no -m beside it"),
+        (
+            ["run", "-m", "task=toy", "target.psnr=30", "budget=5m", "seed=1,2"],
+            "a run with a target cannot be combined with -m",
+        ),
+        (
+            ["run", "-m", "viewer=true", "seed=1,2"],
+            "viewer=true: the viewer shows a single run and cannot be combined with -m",
+        ),
         (["view", "."], "config.yaml: missing"),
         (["view", ".", "--port", "80000"], "--port 80000: expected a port, 1 to 65535, or 0 for any"),
     ],
@@ -221,19 +230,19 @@ def test_an_interrupted_run_says_where_it_is_and_how_to_go_on(
         (
             ["task=toy", "seed=3", "train.rates={means: 1e-3, other: 2}", "task.options.gain=2.5"],
             "outputs/toy-ball",
-            "outputs/toy-ball has the run up to here",
+            "outputs/toy-ball contains a checkpoint of the run",
         ),
         (["--out", nasty, "task=toy", "seed=4"], nasty, f"{nasty} has no checkpoint yet"),
-        (["task=toy", "seed=3", "resume=false", "--out=o"], "o", "o has the run up to here"),
+        (["task=toy", "seed=3", "resume=false", "--out=o"], "o", "o contains a checkpoint of the run"),
         (
             ["-m", "task=toy", "seed=3,4", "model.primitives=2,3"],
             "outputs/toy-ball-sweep/seed-3_model.primitives-2",
-            "outputs/toy-ball-sweep has 0 of 4 runs, and 1 of the others up to here",
+            "outputs/toy-ball-sweep has 0 of 4 finished runs, and checkpoints of 1 others",
         ),
     ):
         assert main(["run", *words]) == 130
         first, second = capsys.readouterr().err.splitlines()
-        assert first == f"neuprim: interrupted; {said}; to go on:"
+        assert first == f"neuprim: interrupted; {said}; to continue:"
         assert second.startswith("  neuprim run ")
         assert main(shlex.split(second)[1:]) == 130
         assert capsys.readouterr().err.splitlines()[1] == second, "the same words again"
@@ -274,7 +283,7 @@ def test_a_target_prints_what_came_of_it(
     shutil.rmtree("out")
     assert main(words) == 130
     first, second = capsys.readouterr().err.splitlines()
-    assert first == "neuprim: interrupted; out has the trials up to here; to go on:"
+    assert first == "neuprim: interrupted; out has the trials so far; to continue:"
     assert second == f"  neuprim {' '.join(words)} resume=true"
 
 

@@ -56,7 +56,7 @@ def test_what_the_first_rank_refuses_the_others_do_not_repeat(
 def test_one_run_alone_is_shared(tmp_path: Path) -> None:
     first, _ = run_ranks(2, lambda group: _compose_rank_arguments(WORDS, True, group))
     assert isinstance(first, ConfigError)
-    assert str(first).startswith("2 processes of torchrun fit one scene together; expected neither -m, --config")
+    assert str(first).startswith("the 2 processes of torchrun train one run together; leave out -m, --config")
 
 
 @pytest.mark.parametrize(
@@ -71,7 +71,9 @@ def test_a_gpu_for_each_rank(gpus: int, device: str, wrong: bool, monkeypatch: p
     config = compose(WORDS, check_output=False)
     config = replace(config, renderer=replace(config.renderer, device=device))
     if wrong:
-        with pytest.raises(BackendUnavailable, match=rf"renderer\.device={device}: 1 GPUs for 2 ranks"):
+        with pytest.raises(
+            BackendUnavailable, match=rf"renderer\.device={device}: this machine has 1 GPUs for 2 ranks"
+        ):
             _select_rank_gpu(config, TorchrunRank(1, 2, 1, 2, ""))
     else:
         _select_rank_gpu(config, TorchrunRank(1, 2, 1, 2, ""))

@@ -96,8 +96,8 @@ def test_two_ranks_of_which_one_is_killed_then_one_process_then_two_ranks_are_on
     assert len(errors(said)) == 1, said
     (line,) = errors(said)
     found = re.match(
-        r"neuprim: error: step (\d+): another rank ended without a message, .*; to go on: torchrun --nproc-per-node 2 "
-        r"-m neuprim run .*resume=true$",
+        r"neuprim: error: step (\d+): another rank ended without a message, .*; to continue: torchrun "
+        r"--nproc-per-node 2 -m neuprim run .*resume=true$",
         line,
     )
     assert found is not None, line

@@ -84,7 +84,7 @@ def test_typed_seconds_are_all_of_the_budget(toy: Path) -> None:
         (["preset=lng"], "preset=lng: task 'toy' has no such preset; did you mean 'long'?"),
         (["model=3"], "model is a group of settings"),
         (["scene.size=big"], "scene.size=big: expected a whole number"),
-        (["scene=files"], "scene.path: required and not given; expected a directory or file, as scene.path=PATH"),
+        (["scene=files"], "scene.path: required and not given; expected scene.path=PATH, a directory or file"),
         (["scene=files", "scene.path=[1]"], "expected a path"),
         (["seed=${nothing}"], "nothing"),
         (["~seed"], "cannot be deleted"),
@@ -120,7 +120,7 @@ def test_paths_are_made_absolute_and_survive_any_character(toy: Path) -> None:
         ("scene/toy/files.yaml", None, "task 'toy': toytask.conf has no scene/toy/files.yaml"),
         ("task/toy.yaml", "options: 3", "options=3: expected entries"),
         ("scene/toy/ball.yaml", "[1]", "scene/toy/ball.yaml: expected a mapping"),
-        ("scene/toy/ball.yaml", "_paths_: [nope]", "must list keys of the file"),
+        ("scene/toy/ball.yaml", "_paths_: [nope]", "may only list keys of the file"),
     ],
 )
 def test_a_plugins_broken_yaml_is_named(toy: Path, file: str, content: str | None, text: str) -> None:
@@ -253,7 +253,7 @@ def test_a_preset_starts_from_others(toy: Path) -> None:
     (folder / "longer.yaml").write_text("defaults: [long, _self_]\ntrain: {iterations: 800}\n")
     c = toys("preset=longer")
     assert (c.model.primitives, c.train.iterations) == (9, 800)
-    for names, text in (("[longer]", "starts from itself"), ("[nowhere]", "cannot be read"), ("3", "expected a list")):
+    for names, text in (("[longer]", "includes itself"), ("[nowhere]", "cannot be read"), ("3", "expected a list")):
         (folder / "longer.yaml").write_text(f"defaults: {names}\n")
         with pytest.raises(ConfigError, match=f"preset/toy/.*{text}"):
             toys("preset=longer")

@@ -65,7 +65,7 @@ def test_contradictions_are_refused_by_name(
     before = (run / "config.yaml").read_bytes()
     assert main(["run", *words, "--out", "run", "resume=true"]) == 2
     error = capsys.readouterr().err
-    assert error.startswith(f"neuprim: error: {key}") and "was begun with" in error and error.count("\n") == 1
+    assert error.startswith(f"neuprim: error: {key}") and "was started with" in error and error.count("\n") == 1
     assert (run / "config.yaml").read_bytes() == before
 
 
@@ -91,7 +91,7 @@ def test_what_may_change_does(run: Path) -> None:
 
 def test_nothing_begun_there_starts_only_what_is_said(run: Path) -> None:
     for place in ("nowhere", "."):
-        with pytest.raises(ConfigError, match=rf"--out {place} resume=true: no run was begun there"):
+        with pytest.raises(ConfigError, match=rf"--out {place} resume=true: no run to continue"):
             compose([f"output_dir={place}", "resume=true"])
     assert compose(["task=static", "output_dir=nowhere", "resume=true"]).scene_name == "solids"
 
@@ -107,6 +107,6 @@ def test_runs_of_a_sweep_go_on_as_they_were_begun(run: Path) -> None:
         (2, 7, True, "sweep/seed-2"),
     ]
     with pytest.raises(
-        ConfigError, match=r"^model\.primitives=8: the run to resume was begun with model\.primitives=9"
+        ConfigError, match=r"^model\.primitives=8: the run to resume was started with model\.primitives=9"
     ):
         compose_all([*words[:2], "model.primitives=8", "output_dir=sweep", "resume=true"])

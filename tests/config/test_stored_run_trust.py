@@ -40,7 +40,7 @@ def test_caches_elsewhere_need_the_users_word(tmp_path: Path, address: str, monk
         refuse_untrusted_settings(config)
     refuse_untrusted_settings(replace(config, source=None))  # of the user's own words
     new = f"output_dir={tmp_path / 'new'}"
-    with pytest.raises(ConfigError, match=r"to allow it, type scene\.cache=\.\.\. or"):
+    with pytest.raises(ConfigError, match=r"to allow it, add scene\.cache=\.\.\. to the command or"):
         compose([new], stored=config)
     assert compose(["scene.cache=null", new], stored=config).scene["cache"] is None
     monkeypatch.setenv(ENVIRONMENT, "1")
@@ -59,7 +59,7 @@ def test_any_setting_that_is_an_address_is_named(tmp_path: Path) -> None:
     config = stored(tmp_path / "run", *VOLUMES)
     config.model.init["points"] = "https://host/points.ply" + "x" * 10**5
     with pytest.raises(
-        ConfigError, match=r"model\.init\.points is 'https://host/points\.plyx+\.\.\.', an address"
+        ConfigError, match=r"model\.init\.points is 'https://host/points\.plyx+\.\.\.', a network address"
     ) as refused:
         refuse_untrusted_settings(config)
     assert len(str(refused.value)) < 400

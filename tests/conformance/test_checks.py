@@ -59,7 +59,7 @@ def test_relighting_takes_rgb_only(channels: int) -> None:
     """A light's intensity has three numbers."""
     with pytest.raises(
         ConfigError,
-        match=f"^conformance example: {channels} colour channels; task relight expects 3, as light_intensity has",
+        match=f"^conformance example: {channels} colour channels; task relight expects 3, like light_intensity",
     ):
         TaskUnderTest(RELIGHT).with_channels(channels).build_fields()
 

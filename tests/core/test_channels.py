@@ -64,9 +64,9 @@ def test_the_tasks_own_display_is_what_is_shown() -> None:
 @pytest.mark.parametrize(
     ("own", "words"),
     [
-        (lambda x: x, ("torch.float32 of shape (4, 6, 5) for (4, 6, 5)", "expected floats of shape (4, 6, 3)")),
+        (lambda x: x, ("torch.float32 of shape (4, 6, 5) for (4, 6, 5)", "expected floats (4, 6, 3)")),
         (lambda x: (255 * x[..., :3]).byte(), ("torch.uint8",)),
-        (lambda x: x[..., :3].numpy(), ("display gave ndarray",)),
+        (lambda x: x[..., :3].numpy(), ("display returned ndarray",)),
         (lambda x: x[..., :3] / 0, ("72 NaN or infinite values",)),
     ],
 )
@@ -74,7 +74,7 @@ def test_a_display_that_gives_no_picture_is_named(own: Any, words: Sequence[str]
     with pytest.raises(ConfigError) as caught:
         Channels(BANDS, own=own, task="bands").display(image(5))
     text = str(caught.value)
-    assert text.startswith("task 'bands': display gave") and all(w in text for w in words)
+    assert text.startswith("task 'bands': display returned") and all(w in text for w in words)
 
 
 # ---------------------------------------------------------------- where they come from
@@ -84,10 +84,10 @@ def test_a_data_set_must_have_the_channels_that_its_task_names() -> None:
     dataset = tiny.two_primitives()
     assert find_channels(TASK, dataset).names == ("R", "G", "B")
     assert find_channels(replace(TASK, channels=("a", "b", "c")), dataset).names == ("a", "b", "c")
-    with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, which task 'static' names: 450nm, 550 nm"):
+    with pytest.raises(DataError, match=r"^two: 3 channels; expected 5, the channels of task 'static': 450nm, 550 nm"):
         find_channels(replace(TASK, channels=BANDS), dataset)
     with pytest.raises(
-        DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), a number per channel"
+        DataError, match=r"^two: the background has shape \(3,\); expected \(5,\), one number per channel"
     ):
         find_channels(TASK, replace(dataset, channels=5))
 

@@ -31,7 +31,9 @@ def test_a_folder_that_others_may_write_is_not(tmp_path: Path, mode: int, monkey
     place.mkdir()
     place.chmod(mode)
     monkeypatch.setattr(errors, "_said", set())
-    with pytest.warns(NeuprimWarning, match=r"shared: others may write it; compiled code is not taken from there"):
+    with pytest.warns(
+        NeuprimWarning, match=r"shared: other users may write to it; compiled code in this folder is not trusted"
+    ):
         private = code_cache(place)
     assert private != place and stat.S_IMODE(private.stat().st_mode) == 0o700
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(place))
@@ -43,7 +45,7 @@ def test_who_may_replace_the_folder_counts_too(tmp_path: Path) -> None:
     place = tmp_path / "open" / "own"
     place.mkdir(parents=True, mode=0o700)
     (tmp_path / "open").chmod(0o777)
-    assert folder_weakness(place) == f"others may write {tmp_path / 'open'}"
+    assert folder_weakness(place) == f"other users may write to {tmp_path / 'open'}"
     (tmp_path / "open").chmod(0o1777)  # as /tmp: nobody moves what is not theirs
     assert not folder_weakness(place)
     (tmp_path / "link").symlink_to(place)

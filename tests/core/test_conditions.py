@@ -95,7 +95,7 @@ def test_one_number_a_list_a_range_and_any_mixture() -> None:
         ("0:1:100001", "expected FIRST:LAST or FIRST:LAST:COUNT"),
         ("0:1:2.5", "--wavelength-shift 0:1:2.5: expected a number"),
         ("", "--wavelength-shift : expected a number"),
-        ("0:1:60000,0:1:60000", "120000 values and more; expected at most 100000"),
+        ("0:1:60000,0:1:60000", "at least 120000 values; expected at most 100000"),
     ],
 )
 def test_what_cannot_be_read(text: str, expected: str) -> None:
@@ -151,7 +151,7 @@ def test_an_export_has_every_condition_in_each_frame() -> None:
         (
             {"wavelength_shift": "0:1:3", "sun": "1,2,0;0,0,0"},
             True,
-            "3 frames and --sun 1,2,0;0,0,0 has 2 frames; expected as many of each",
+            "3 frames and --sun 1,2,0;0,0,0 has 2 frames; expected equal numbers of frames",
         ),
         (
             {"wavelength_shift": "0"},

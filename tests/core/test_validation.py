@@ -126,7 +126,7 @@ def test_free_settings_take_hints_types_and_tuples() -> None:
         with pytest.raises(ConfigError) as caught:
             validate_choices(found, "model.density", offered)
         assert str(caught.value) == message
-    with pytest.raises(ConfigError, match=r"^model\.colour\.x: no such setting; there is none$"):
+    with pytest.raises(ConfigError, match=r"^model\.colour\.x: no such setting; this group has no settings$"):
         validate_choices({"x": 1}, "model.colour", {})
 
 

@@ -108,7 +108,7 @@ def test_other_plys_are_named_for_what_they_are(run_dir: Path, tmp_path: Path) -
     with pytest.raises(DataError, match=r"model\.init\.points"):
         import_run_directory(tmp_path / "g.ply", tmp_path / "out")
     (tmp_path / "m.obj").write_text("x")
-    with pytest.raises(ConfigError, match="no format reads"):
+    with pytest.raises(ConfigError, match=r"cannot import \.obj files"):
         import_run_directory(tmp_path / "m.obj", tmp_path / "out")
     with pytest.raises(DataError, match="no such file"):
         import_run_directory(tmp_path / "none.ply", tmp_path / "out")

@@ -186,7 +186,7 @@ def test_eight_bits_keep_thin_matter_and_zero() -> None:
         (["--grid", "9999", "--out", "x.vdb"], "expected at most 1024"),
         (["--box=0,0", "--out", "x.vdb"], "lower and the upper corner"),
         (["--box=0,0,0,1,1,-1", "--out", "x.vdb"], "lower and the upper corner"),
-        (["--time", "2", "--out", "x.vdb"], "expected a time in 0..1"),
+        (["--time", "2", "--out", "x.vdb"], "expected a time from 0 to 1"),
         (["--tme", "2"], "did you mean '--time'"),
         (["--level", "a"], "expected numbers separated by commas"),
         ([], "there is no display to open a window on; give --out"),

@@ -151,7 +151,10 @@ def test_only_the_reference_draws_them() -> None:
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: RayCamera(EYE[:3], torch.ones(2, 2, 3)), r"RayCamera\.viewmat.*expected finite 4x4"),
+        (
+            lambda: RayCamera(EYE[:3], torch.ones(2, 2, 3)),
+            r"RayCamera\.viewmat.*expected a 4x4 matrix of finite numbers",
+        ),
         (lambda: RayCamera(EYE * 2, torch.ones(2, 2, 3)), r"RayCamera\.viewmat.*expected a rotation"),
         (lambda: RayCamera(EYE, torch.ones(2, 3)), r"directions has shape \(2, 3\); expected \(H, W, 3\)"),
         (lambda: RayCamera(EYE, torch.ones(0, 2, 3)), r"one pixel or more"),

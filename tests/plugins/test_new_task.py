@@ -133,7 +133,7 @@ def test_nothing_that_exists_is_touched(tmp_path: Path) -> None:
     target = tmp_path / "there"
     target.mkdir()
     (target / "precious").write_text("x")
-    with pytest.raises(ConfigError, match="there: exists; expected a folder to make"):
+    with pytest.raises(ConfigError, match="there: exists already; choose a new folder"):
         write_plugin_package("wave", target)
     assert [p.name for p in target.iterdir()] == ["precious"]
 

@@ -209,7 +209,7 @@ def test_a_run_does_not_go_on_with_another_packages_task(
 ) -> None:
     glow(site, "glow-too", "7", package="glow_too")
     before = (made / "checkpoint.safetensors").read_bytes()
-    text = "written for task 'glow' of neuprim-glow 0.1; this run's task is that of glow-too 7"
+    text = "written for task 'glow' of neuprim-glow 0.1; this run uses the task of glow-too 7"
     told = error(["run", "task=glow-too:glow", *SMALL, *QUICK, "--out", "r", "resume=true"], capsys)
     assert told.endswith(f"neuprim: error: r/checkpoint.safetensors: {text}")
     assert (made / "checkpoint.safetensors").read_bytes() == before
@@ -234,7 +234,7 @@ def task_record(**changes: Any) -> dict[str, Any]:
         (task_record(package="a:b"), "made_by.task.package=a:b: expected a name of at most 200 characters"),
         (task_record(package="a\nb"), "made_by.task.package"),
         (task_record(package="\x1b[31m"), "made_by.task.package"),
-        (task_record(name="x"), "made_by.task.name: found 'x'; expected 'static', as task.name says"),
+        (task_record(name="x"), "made_by.task.name: found 'x'; expected 'static', the value of task.name"),
         ({**task_record(), "loss": {"name": "x", "package": "p", "version": "1"}}, "made_by.loss.name: found 'x'"),
     ],
 )

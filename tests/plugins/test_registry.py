@@ -93,7 +93,7 @@ FAULTS = [
     ("", "raise RuntimeError('first line\\nsecond')", "RuntimeError: first line second"),
     ("", "PLUGIN = 3", "is of type int; expected a neuprim.core."),
     ("api=1", "api=9", "written for plugin API 9, this neuprim has 1; upgrade neuprim"),
-    ('"extra"', '"other"', "other'; expected the name of the entry point"),
+    ('"extra"', '"other"', "extra', as the entry point"),
 ]
 
 
@@ -140,7 +140,9 @@ def test_a_built_in_plugin_wins_its_name(kind: str, site: Path) -> None:
     with pytest.warns(NeuprimWarning) as warned:
         assert group.load(name) is own and group.load(name) is own
     choice = group.typed.format(f"greedy-pkg:{name}")
-    assert len(warned) == 1 and f"has the name of neuprim's own, which is used; {choice}" in str(warned[0].message)
+    assert len(warned) == 1 and f"has the same name as neuprim's own, which is used; give {choice}" in str(
+        warned[0].message
+    )
     assert "greedy" not in sys.modules
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -203,7 +205,9 @@ def test_a_scene_with_the_name_of_a_tasks_own(site: Path) -> None:
     preset.parent.mkdir(parents=True)
     preset.write_text("model: {primitives: 7}\n")
     task = load_task("static")
-    with pytest.warns(NeuprimWarning, match="one of task 'static' itself, which is used; scene=fake-extra:solids"):
+    with pytest.warns(
+        NeuprimWarning, match="same name as one of task 'static' itself, which is used; give scene=fake-extra:solids"
+    ):
         assert find_registered_scene(task, "solids").added_by is None
     assert "fake_extra" not in sys.modules
     assert find_registered_scene(task, "neuprim:solids").config_package == "neuprim.tasks.static.conf"

@@ -192,7 +192,8 @@ def test_gaussians_of_five_channels_are_refused_before_any_is_fitted(
 ) -> None:
     monkeypatch.setattr("neuprim.export.gaussian_ply.fit_export_harmonics", lambda *a: pytest.fail("too late"))
     with pytest.raises(
-        ConfigError, match=r"5 channels, 450nm, .*; this format has red, green and blue; --format ply and npz hold all"
+        ConfigError,
+        match=r"5 channels, 450nm, .*; this format stores red, green and blue; --format ply and npz hold all",
     ):
         export_run(trained, "gaussian-ply", words=["--wavelength_shift=0"])
 

@@ -159,7 +159,7 @@ SUM = "density field TwoScales: lower: sum of two Cosine forms: the first: "
             "fields",
             CONSTANT,
             CONSTANT[:-1] + "[:, :3])",
-            "colour field ShiftedSpectrum: lower returned a colour of C=3; expected 5, as its member channels says",
+            "colour field ShiftedSpectrum: lower returned a colour of C=3; expected 5, its attribute channels",
         ),
         (
             "scene",

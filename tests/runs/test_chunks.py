@@ -140,7 +140,7 @@ def test_one_that_fails_does_not_stop_the_others_and_is_all_that_is_made_again(
     out, told = tmp_path / "run", list[Event]()
     with pytest.raises(
         ChunksMissing,
-        match=r"frames_1-4: no luck; 1 of 2 chunks are done, and resume=true with --out \S+ makes the others",
+        match=r"frames_1-4: no luck; 1 of 2 chunks are finished; run again with resume=true --out \S+ to train",
     ):
         run(compose(words(files, out)), told.append)
     assert [event.text.partition("chunks/")[2] for event in told if isinstance(event, Note)] == ["frames_1-4: no luck"]
@@ -167,7 +167,8 @@ def _fail_first(data: Any, attempt: int, events: Any) -> str:
 def test_other_chunks_than_it_was_begun_with_are_refused(finished: Path, files: Path, tmp_path: Path) -> None:
     shutil.copytree(finished, tmp_path / "copy")
     with pytest.raises(
-        ConfigError, match=r"chunks.json: begun with frames_1-4, .* ask for frames_1-3, .*; expected the same settings"
+        ConfigError,
+        match=r"chunks.json: contains the runs frames_1-4, .* now give frames_1-3, .*; expected the same settings",
     ):
         run(compose(words(files, tmp_path / "copy", "scene.chunks=3", "resume=true")))
     (tmp_path / "copy" / "chunks.json").write_text("{}")
@@ -203,8 +204,8 @@ def test_few_frames_in_auto_are_one_run(files: Path, tmp_path: Path) -> None:
     [
         (
             ["scene.chunks=4"],
-            "scene.chunks=4: there are 6 frames to learn from; expected at most 3, as a chunk has at least two of its "
-            "own",
+            "scene.chunks=4: there are 6 frames for training; expected at most 3, because a chunk needs at least "
+            "two training frames",
         ),
         (["model.primitives=9"], "model.primitives=9: expected at least 16 for 2 chunks"),
         (
@@ -222,7 +223,7 @@ def test_what_cannot_be_is_said_in_one_line(
 
 def test_what_trains_one_model_at_once_says_so(files: Path, tmp_path: Path) -> None:
     config = compose(words(files, tmp_path / "run"))
-    with pytest.raises(ConfigError, match=r"scene.chunks=2: this trains one model at once"):
+    with pytest.raises(ConfigError, match=r"scene.chunks=2: this function trains one model"):
         fit(config)
     with pytest.raises(ConfigError, match=r"scene.chunks=2: several ranks train one model together"):
         run(config, ignore_run_event, group=cast(ProcessGroup, _Two()))

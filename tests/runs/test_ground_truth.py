@@ -166,7 +166,7 @@ def test_a_full_disk_is_one_line_and_leaves_nothing_half_made(
     with pytest.raises(DataError) as caught:
         made(config(files, tmp_path, "scene.frames='1:4'"))
     place = next((tmp_path / "cache" / "volumes").iterdir())
-    why = "No space left on device; frames that are there are kept (2 of 4 frames are missing)"
+    why = "No space left on device; finished frames are kept (2 of 4 frames are missing)"
     assert str(caught.value) == f"cannot write the rendered images to {place}: {why}"
     assert sorted(f.name for f in place.iterdir()) == ["frame_00001", "frame_00002"]
     assert [f.name for f in tmp_path.iterdir()] == ["cache"]
@@ -210,7 +210,7 @@ def test_a_shared_folder_that_vanishes_for_good(
     assert main(["truth", *scene_words(files, tmp_path)]) == 2
     (place,) = (away / "volumes").iterdir()
     line = capsys.readouterr().err.splitlines()[-1]
-    gone = f"neuprim: error: {cache / 'volumes' / place.name}: gone for 0 s while it was in use"
+    gone = f"neuprim: error: {cache / 'volumes' / place.name}: the folder disappeared and was missing for 0 s"
     assert line.startswith(gone) and not cache.exists(), "nothing is written in its place"
     assert sorted(f.name for f in place.glob("frame*")) == ["frame_00001", "frame_00002"]
 
@@ -229,7 +229,7 @@ def test_other_files_where_a_worker_is_are_refused(files: Path, tmp_path: Path) 
     there = config(files, tmp_path)
     truth = load_run_ground_truth(there)
     assert truth is not None
-    with pytest.raises(DataError, match=r"a worker sees another scene; expected the launcher's files there"):
+    with pytest.raises(DataError, match=r"a worker has other scene files than the launcher"):
         ground_truth.render_frames_job(
             {"config": there.to_dict(), "known": truth.known, "key": "0" * 16, "frames": [0]}, 0, lambda event: None
         )

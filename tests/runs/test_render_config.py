@@ -70,7 +70,7 @@ def test_overrides_round_trip(model: Primitives, config: RenderConfig) -> None:
         ("resolution=0", "resolution"),
         ("resolution=1.5", "resolution"),
         ("colour.degre=1", "did you mean 'colour.degree'"),
-        ("colour.degree=3", "colour.degree=3: expected 2 or 1 or 0"),
+        ("colour.degree=3", "colour.degree=3: expected a reduced value: 2 or 1 or 0"),
         ("density.neurons=5", "density.neurons=5"),
         ("resolution.x=1", "resolution.x"),
     ],

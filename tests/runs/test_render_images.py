@@ -89,7 +89,9 @@ def test_a_model_in_srgb_values_is_written_as_linear_light(tmp_path: Path) -> No
     assert (rgb(found) - alpha * srgb_to_linear(expected.rgb / alpha.clamp_min(1e-30))).abs().max() < 1e-5
     assert header["neuprim:colorSpace"] == "linear light, of a model whose colours are sRGB values"
     assert np.allclose(header["neuprim:background"], srgb_to_linear(BLUE), atol=1e-6)
-    with pytest.raises(ConfigError, match=r"--layers emission: .* sRGB values, which do not add up"):
+    with pytest.raises(
+        ConfigError, match=r"--layers emission: layers of light need linear colours, but the model's are sRGB"
+    ):
         layers("srgb", names="emission")
 
 
@@ -143,7 +145,7 @@ def test_lights_apart_add_up_to_the_beauty(tmp_path: Path) -> None:
     whole = render_light_sum(model, replace(VIEW, conditions={}), lights, RenderSettings(), BLUE)
     over, _ = written(tmp_path / "b.exr", replace(how, names="beauty"), model, replace(VIEW, conditions={}))
     assert (rgb(over) - whole).abs().max() < 1e-5
-    with pytest.raises(ConfigError, match="--layers lights: 129 lights; expected at most 128"):
+    with pytest.raises(ConfigError, match="--layers lights: 129 lights, one layer each; expected at most 128"):
         replace(how, lights=lights * 43)
 
 
@@ -151,7 +153,7 @@ def test_a_layer_that_the_model_lacks_is_left_out_or_refused_by_name(tmp_path: P
     model = lit(LightNetwork(3, visibility="none"), torch.float32)
     how, view = replace(layers(), task=RELIGHT), replace(VIEW, conditions=light())
     assert set(written(tmp_path / "a.exr", how, model, view)[0]) == {*"RGBA", "depth.Z", "density.Y"}
-    with pytest.raises(ConfigError, match="--layers visibility: this run's model has none"):
+    with pytest.raises(ConfigError, match="--layers visibility: this run's model has no such layer"):
         replace(how, names="visibility").write(tmp_path / "b.exr", model, view)
     assert not (tmp_path / "b.exr").exists()
 

@@ -171,7 +171,7 @@ def test_a_model_that_no_view_shows_says_so() -> None:
     trainer = tiny.trainer(dataset, 3)
     assert not any(v.empty for v in measure_views(trainer.model, TASK, dataset, trainer.renderer))
     trainer.model.params["means"] = trainer.model.params["means"].detach() + 1000.0
-    with pytest.warns(NeuprimWarning, match=r"two: the model is in none of 2 test views.*ply_file_path"):
+    with pytest.warns(NeuprimWarning, match=r"two: the model is invisible in all 2 test views.*ply_file_path"):
         views = measure_views(trainer.model, TASK, dataset, trainer.renderer)
     assert all(v.empty for v in views)
 
@@ -309,7 +309,7 @@ def test_what_cannot_go_on_leaves_an_earlier_run_alone(scene: Path, tmp_path: Pa
             fit([*words(scene, out, 10, "resume=true"), *overrides])
         assert {p: p.read_bytes() for p in out.rglob("*") if p.is_file()} == before
 
-    refused(ConfigError, r"^model\.neurons=5: the run to resume was begun with model\.neurons=", "model.neurons=5")
+    refused(ConfigError, r"^model\.neurons=5: the run to resume was started with model\.neurons=", "model.neurons=5")
     refused(DataError, "nowhere", f"scene.path={tmp_path / 'nowhere'}")
     header, tensors = checkpoint.read_tensors(out / "checkpoint.safetensors", "checkpoint")
     checkpoint.write_tensors(out / "checkpoint.safetensors", "checkpoint", tensors, {**header, "task": "dynamic"})
@@ -485,7 +485,7 @@ def test_a_run_chooses_its_number_of_primitives_once(scene: Path, tmp_path: Path
     assert len(said) == 1 and f"auto: {found:,} for 0.3 s" in said[0] and read_metrics(out)["primitives"] == found
     again = compose([*in_seconds, "resume=true"])
     assert again.model.primitives == found and compose([f"output_dir={out}", "resume=true"]).model.primitives == found
-    with pytest.raises(ConfigError, match=f"model.primitives={found + 1}: the run to resume was begun with"):
+    with pytest.raises(ConfigError, match=f"model.primitives={found + 1}: the run to resume was started with"):
         compose([f"output_dir={out}", "resume=true", f"model.primitives={found + 1}"])
 
 

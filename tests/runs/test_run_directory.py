@@ -28,9 +28,7 @@ def test_a_second_one_is_refused_by_name_and_the_first_is_left_alone(tmp_path: P
             with pytest.raises(ConfigError) as error, lock_run_directory(tmp_path / "run", "sweep"):
                 pytest.fail("two at once")
             found = f"{tmp_path / 'run'}: process {os.getpid()} on {socket.gethostname()} (since "
-            assert str(error.value).startswith(found) and "is at work on this sweep; expected that to end first" in str(
-                error.value
-            )
+            assert str(error.value).startswith(found) and "is using this sweep; wait until it ends" in str(error.value)
         refused: list[str] = []
 
         def other() -> None:

@@ -86,7 +86,7 @@ def test_one_fails_the_others_are_compared_and_resume_makes_the_rest(
     )
 
     assert main(typed(scene, out, "resume=true", "model.primitives=9")) == 2
-    assert f"{out / 'sweep.json'}: seed-1 was begun with task=static" in capsys.readouterr().err
+    assert f"{out / 'sweep.json'}: seed-1 was started with task=static" in capsys.readouterr().err
     more = [w if not w.startswith("seed=") else "seed=3,4" for w in typed(scene, out, "resume=true")]
     assert main(more) == 0, "values may be added"
     assert [r["run"] for r in table(out)] == ["seed-3", "seed-4", "seed-1", "seed-2"]
@@ -97,7 +97,7 @@ def test_two_launchers_on_one_directory(scene: Path, tmp_path: Path, capsys: pyt
     with lock_run_directory(out, "sweep"):
         assert main(typed(scene, out, "resume=true")) == 2
         (line,) = capsys.readouterr().err.splitlines()
-        assert line.startswith(f"neuprim: error: {out}: process ") and "is at work on this sweep" in line
+        assert line.startswith(f"neuprim: error: {out}: process ") and "is using this sweep" in line
         assert [p.name for p in out.iterdir()] == [".lock"]
 
 
@@ -109,7 +109,7 @@ def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(
         assert main(typed(scene, out, "train.iterations=1", "resume=true")) == 2
     record = read_launch_record(out / "sweep.json")
     assert record is not None
-    refused = [(row.state, "is at work on this run" in row.line) for row in record.runs]
+    refused = [(row.state, "is using this run" in row.line) for row in record.runs]
     assert refused == [("done", False), ("failed", True), ("done", False)]
     assert "neuprim: error:" in capsys.readouterr().err
 
@@ -117,11 +117,11 @@ def test_a_duplicated_run_is_refused_and_the_sweep_goes_on(
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["launcher=processes", "launcher.workers=100000"], "launcher.workers=100000: more than the"),
+        (["launcher=processes", "launcher.workers=100000"], "launcher.workers=100000: needs more than the"),
         (["launcher=slurm", "launcher.address=moon"], "launcher.address=moon: expected slurm or local"),
         (
             ["launcher=slurm", "launcher.address=local", "launcher.options.color=3"],
-            "launcher.options: submitit refuses them",
+            "launcher.options: submitit refuses these options",
         ),
     ],
 )
@@ -139,7 +139,7 @@ def test_nothing_to_sweep_and_a_damaged_record_are_said(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main(["run", "-m", "--out", str(tmp_path), "resume=true"]) == 2
-    assert "no values to sweep; expected KEY=A,B,C, or --out DIR resume=true of a sweep" in capsys.readouterr().err
+    assert "no values to sweep; expected KEY=A,B,C, or resume=true with --out DIR of a sweep" in capsys.readouterr().err
     for text in ("{", "[]", '{"format": 9}', '{"format": 1, "words": [], "runs": [{"name": "../x"}]}'):
         (tmp_path / "sweep.json").write_text(text)
         assert main(["run", "-m", "--out", str(tmp_path), "resume=true"]) == 2

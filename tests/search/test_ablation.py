@@ -142,15 +142,15 @@ def test_folders_that_hold_something_else_are_refused(
 ) -> None:
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "a").touch()
-    with pytest.raises(ConfigError, match="holds something else"):
+    with pytest.raises(ConfigError, match="has other files"):
         run_ablation(request(scene, tmp_path / "mine"))
     (tmp_path / "file").touch()
     with pytest.raises(ConfigError, match="is a file"):
         run_ablation(request(scene, tmp_path / "file"))
-    with pytest.raises(ConfigError, match="holds a set with another centre"):
+    with pytest.raises(ConfigError, match="has trainings with another centre"):
         run_ablation(request(scene, measured[0], "model.neurons=3"))
     TradeoffRecord({}, {}, measured[1].points[:1]).write(tmp_path / "tradeoff.json")
-    with pytest.raises(DataError, match="of a finished run"):
+    with pytest.raises(DataError, match="is about a finished run"):
         run_ablation(request(scene, tmp_path))
     with pytest.raises(ConfigError, match="no such setting of a model"):
         run_ablation(request(scene, tmp_path / "set", knobs=("model.neuron",)))

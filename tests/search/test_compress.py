@@ -92,9 +92,9 @@ def test_what_is_measured_is_what_eval_measures_and_again_it_is_the_same(
         (["--tolerance", "0dB"], "expected decibels above 0"),
         (
             ["--tolerance", "0.2", "--level", "3"],
-            "--tolerance 0.2: decides the bits of every number; expected no --level",
+            "--tolerance 0.2: the tolerance determines the bits of all numbers; leave --level out",
         ),
-        (["--tolerance", "0.2dB", "bits.W1=3"], "expected no bits.NAME=BITS"),
+        (["--tolerance", "0.2dB", "bits.W1=3"], "leave bits.NAME=BITS out"),
         (["bits.sh=3"], "no parameter 'sh'; did you mean"),
         (["W1=3"], "W1=3: no setting of `neuprim compress`; expected bits.NAME=BITS"),
         (["--output", "m"], "--output: no such argument of `neuprim compress`; did you mean '--out'"),
@@ -191,9 +191,9 @@ def test_files_that_import_refuses(small: Path, tmp_path: Path) -> None:
     checkpoint.save_compressed(tmp_path / "bare.neuprim", load_run(small).model, "static", {}, LEVELS[3])
     (tmp_path / "wrong.neuprim").write_bytes(b"something else")
     for name, error, message in (
-        ("cut", CheckpointError, r"cut\.neuprim: the sections take"),
-        ("bare", DataError, r"bare\.neuprim: holds no config\.yaml"),
-        ("wrong", ConfigError, r"no format reads \.neuprim files; expected one of `neuprim compress`"),
+        ("cut", CheckpointError, r"cut\.neuprim: the table states"),
+        ("bare", DataError, r"bare\.neuprim: contains no config\.yaml"),
+        ("wrong", ConfigError, r"cannot import \.neuprim files; expected a file of `neuprim compress`"),
     ):
         with pytest.raises(error, match=message):
             import_run_directory(tmp_path / f"{name}.neuprim", tmp_path / "out")

@@ -103,7 +103,7 @@ def test_the_command_prints_the_fronts(bare: Path, tmp_path: Path, capsys: pytes
     for more, text in (
         (["--vary", "alpha"], "--vary alpha: no such setting of this run"),
         (["budget=x"], "budget=x: expected"),
-        (["--out", str(run_dir)], f"--out {run_dir}: holds something else"),
+        (["--out", str(run_dir)], f"--out {run_dir}: has other files"),
     ):
         assert main(["tradeoff", str(run_dir), *more]) == 2
         assert text in capsys.readouterr().err

@@ -197,9 +197,9 @@ def test_what_is_left_of_the_budget_prunes(tmp_path: Path, monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("more", "message"),
     [
-        (["train.max_seconds=60"], "train.max_seconds=60: a run with a target has its seconds from budget="),
-        (["preset=paper"], "train.population.strategy=gradient: a target decides"),
-        (["train.population.grow_to=50"], "train.population.grow_to=50: a target decides"),
+        (["train.max_seconds=60"], "train.max_seconds=60: a run with a target takes its time from budget="),
+        (["preset=paper"], "train.population.strategy=gradient: a target determines"),
+        (["train.population.grow_to=50"], "train.population.grow_to=50: a target determines"),
         (["train.iterations=0"], "train.iterations=0"),
     ],
 )
@@ -210,14 +210,14 @@ def test_settings_that_a_target_decides_are_refused(more: list[str], message: st
 
 
 def test_what_cannot_be_searched_is_refused(met: Met, tmp_path: Path) -> None:
-    expected = r"budget=20s: a full run of 40 primitives would have \d+ steps; expected 256 or more, or \d+ s"
+    expected = r"budget=20s: enough for \d+ steps of 40 primitives; expected at least 256 steps. Give a budget of \d+ s"
     clock = Clock()
     with pytest.raises(ConfigError, match=expected):
         run_target(config(tmp_path / "short"), SearchTarget(psnr=20.0), 20.0, clock.hear, clock)
     with pytest.raises(DataError, match="3 training views; a target needs 4 or more"):
         search(tmp_path / "few", 20.0, "scene.train_views=3")
-    with pytest.raises(ConfigError, match=r"target.json: begun with another model"):
+    with pytest.raises(ConfigError, match=r"target.json: the search was started with another model"):
         search(met[0], 20.0, "resume=true", "model.colour.lobes=1")
     (tmp_path / "config.yaml").write_text("task: {}\n")
-    with pytest.raises(ConfigError, match="holds a run without a target"):
+    with pytest.raises(ConfigError, match="contains a run without a target"):
         search(tmp_path, 20.0, "resume=true")

@@ -141,7 +141,7 @@ def test_a_run_that_is_no_trial_is_left_alone(scene: Path, tmp_path: Path) -> No
     folder = tmp_path / "run"
     folder.mkdir()
     (folder / "config.yaml").write_text("mine")
-    with pytest.raises(DataError, match=r"run: holds a run and no trial\.json; expected a new folder"):
+    with pytest.raises(DataError, match=r"run: contains a run, but no trial\.json; expected a new folder"):
         run_trial(Trial(config_of(scene, folder)))
     assert (folder / "config.yaml").read_text() == "mine" and len(list(folder.iterdir())) == 1
 

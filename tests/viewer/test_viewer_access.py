@@ -140,7 +140,7 @@ def test_without_its_gate_a_server_does_not_stay(monkeypatch: pytest.MonkeyPatch
         yield
 
     monkeypatch.setattr(TokenAuth, "guard_server", nothing)
-    with pytest.raises(BackendUnavailable, match="did not start behind the check"):
+    with pytest.raises(BackendUnavailable, match="did not start with access control"):
         ViewerServer(ViewerSettings(port=0), "a run")
 
 

@@ -82,7 +82,7 @@ def test_colour_alpha_depth_and_single_channels(model: Primitives) -> None:
 
 def test_a_picture_of_too_many_rays_is_refused(model: Primitives) -> None:
     look = replace(view_at(), camera=view_at().camera.resized(2048, 1536))
-    with pytest.raises(ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 take more than 67,108,864"):
+    with pytest.raises(ConfigError, match=r"2048 x 1536 pixels with renderer.samples=16 need more than 67,108,864"):
         scene_of(model).draw(look, replace(SETTINGS, samples=16))
 
 

@@ -56,7 +56,7 @@ def test_polynomials_are_good_to_float32(edge: int) -> None:
 
 
 def test_a_field_without_a_script_is_refused_by_name(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="density field GaussianDensity has no script for browsers"):
+    with pytest.raises(ConfigError, match="density field GaussianDensity has no JavaScript version"):
         page_of(random_model(GaussianDensity(), SphericalHarmonics(0)), tmp_path / "p.html")
 
 
@@ -65,7 +65,7 @@ def test_a_script_that_would_end_its_element_is_refused(
     text: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(CosineDensity, "script", lambda self: text)
-    with pytest.raises(ConfigError, match=r"density field CosineDensity: script\(\) must be a text of JavaScript"):
+    with pytest.raises(ConfigError, match=r"density field CosineDensity: script\(\) must return JavaScript text"):
         page_of(random_model(CosineDensity(1), SphericalHarmonics(0)), tmp_path / "p.html")
 
 

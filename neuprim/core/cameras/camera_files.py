@@ -149,7 +149,7 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
 def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
     """Read a camera path of nerfstudio's viewer: ``fov`` is vertical and in degrees, camera axes are OpenGL's."""
     if document.values.get("camera_type", "perspective") != "perspective":
-        raise document.fail("camera_type", "perspective; others are not drawn")
+        raise document.fail("camera_type", "perspective, the only supported type")
     records = _camera_records(document, "camera_path")
     width, height = _read_camera_image_size(document, ("render_width", "render_height"), size)
     found = []
@@ -229,10 +229,10 @@ def _read_usd_stage(path: Path, prim: str) -> JsonReader:
     try:
         done = subprocess.run(words, capture_output=True, text=True, timeout=_USD_SECONDS)
     except subprocess.TimeoutExpired:
-        raise DataError(f"{path}: not read after {_USD_SECONDS:.0f} s; expected a USD file with a camera") from None
+        raise DataError(f"{path}: reading took over {_USD_SECONDS:.0f} s; expected a USD file with a camera") from None
     if done.returncode < 0:
         raise DataError(
-            f"{path}: not a readable USD file (its reader ended by {signal.Signals(-done.returncode).name})"
+            f"{path}: not a readable USD file (the USD reader was ended by {signal.Signals(-done.returncode).name})"
         )
     if done.returncode:
         said = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
@@ -245,16 +245,16 @@ def _read_usd_stage(path: Path, prim: str) -> JsonReader:
 
 def _usd_image_size(stage: JsonReader, path: Path) -> tuple[int, int]:
     if not stage.has("resolution"):
-        raise DataError(f"{path}: names no size of an image (renderSettingsPrimPath); give --size WxH")
+        raise DataError(f"{path}: states no image size (renderSettingsPrimPath); give --size WxH")
     width, height = (int(x) for x in stage.array("resolution", (2,), "width and height").tolist())
     if not (0 < width <= MAX_IMAGE_SIDE and 0 < height <= MAX_IMAGE_SIDE):
-        raise DataError(f"{path}: resolution {width}x{height}; expected 1 to {MAX_IMAGE_SIDE} pixels a side")
+        raise DataError(f"{path}: resolution {width}x{height}; expected 1 to {MAX_IMAGE_SIDE} pixels per side")
     return width, height
 
 
 def _usd_camera(record: JsonReader, size: tuple[int, int]) -> Camera:
     if record.text("projection") != "perspective":
-        raise record.fail("projection", "perspective; others are not drawn")
+        raise record.fail("projection", "perspective, the only supported projection")
     focal = record.number("focal", "a focal length above 0", 0.0)
     (wide, high), (right, up) = (record.array(key, (2,), "two numbers").tolist() for key in ("aperture", "offset"))
     if wide <= 0 or high <= 0:
@@ -274,7 +274,7 @@ def _remove_pose_scale(matrix: Tensor, where: str) -> Tensor:
     mean = lengths.mean()
     if not bool(mean > 0) or float((lengths / mean - 1).abs().max()) > _UNEQUAL_SCALES:
         raise DataError(
-            f"{where}: its transform scales by {', '.join(f'{x:g}' for x in lengths.tolist())}; expected one "
-            "scale for all axes"
+            f"{where}: its transform scales the axes by {', '.join(f'{x:g}' for x in lengths.tolist())}; "
+            "expected the same scale for all axes"
         )
     return torch.cat([torch.cat([matrix[:3, :3] / lengths, matrix[:3, 3:]], 1), matrix[3:]])

@@ -88,7 +88,7 @@ def pinhole_parameters(lens: Any, where: str) -> tuple[float, float, float, floa
     named = {"fx": named.get("f"), "fy": named.get("f"), **named}
     fx, fy, cx, cy = (named.get(key) for key in ("fx", "fy", "cx", "cy"))
     if fx is None or fy is None or cx is None or cy is None:
-        expected = "a model with focal lengths, which a pinhole can replace"
+        expected = "a model with focal lengths, which a pinhole camera can replace"
         raise DataError(f"{where}: model is {lens.model_name}; expected {expected}")
     return fx, fy, cx, cy
 
@@ -114,7 +114,7 @@ def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
     if len(models) == 1:
         return best, ""
     found = ", ".join(f"{p.name} with {n}" for p, n in zip(models, counts, strict=True))
-    return best, f"{place}: has models of different images: {found} posed images; takes {best.name}"
+    return best, f"{place}: has several models: {found} posed images; {best.name} is used"
 
 
 def _count_colmap_images(model: Path) -> int:
@@ -198,7 +198,7 @@ class _ColmapRecordReader:
         """Advance by ``size`` bytes and return the position before."""
         start, self.at = self.at, self.at + size
         if size < 0 or self.at > len(self.data):
-            found = f"a record ends at byte {self.at}, the file at {len(self.data)}"
+            found = f"a record ends at byte {self.at}, but the file at byte {len(self.data)}"
             raise DataError(f"{self.path}: truncated or corrupt: {found}")
         return start
 
@@ -225,7 +225,7 @@ def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int
         for _ in range(file.number("Q")):
             skip_record(file)
         if file.at != len(file.data):
-            raise DataError(f"{file.path}: corrupt: its records end at byte {file.at}, the file at {len(file.data)}")
+            raise DataError(f"{file.path}: corrupt: records end at byte {file.at}, but the file at {len(file.data)}")
 
 
 def _skip_camera(file: _ColmapRecordReader, parameter_count: Callable[[int], int]) -> None:

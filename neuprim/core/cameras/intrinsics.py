@@ -66,8 +66,8 @@ class _IntrinsicsSource:
         """Return how many target pixels correspond to one pixel of this image size: (horizontally, vertically)."""
         if not is_resized_camera_size(self.size, target.size):
             own, other = _format_camera_image_size(self.size), _format_camera_image_size(target.size)
-            found = f"{keys} belong to w, h {own}, and the image is {other}"
-            expected = f"them in the frame, beside its own w, h{target.hint}"
+            found = f"{keys} are for images of {own} (w, h), but the image is {other}"
+            expected = f"{keys} in the frame, together with its w, h{target.hint}"
             raise DataError(f"{self.record.where}: {found}; expected {expected}")
         return target.width / self.size[0], target.height / self.size[1]
 
@@ -133,21 +133,21 @@ def _read_focal_lengths(
     x, y = _stated_camera_focal_lengths(level, 0, target), _stated_camera_focal_lengths(level, 1, target)
     if not x and not y:
         keys = "camera_angle_x (radians), fl_x (pixels), camera_intrinsics or x_fov (degrees)"
-        raise DataError(f"{frame.where}: no focal length: expected {keys}, in the frame or in the file")
+        raise DataError(f"{frame.where}: no focal length; expected {keys}, in the frame or in the file")
     fx, fy = (next(iter(found.values()), 0.0) for found in (x, y))
     fx, fy = fx or fy, fy or fx
     where, lengths = level.record.where, f"{fx:.5g} and {fy:.5g}"
     if min(fx / target.width, fy / target.height) < _SHORTEST:
         stated = f"focal lengths of {lengths} pixels on {_format_camera_image_size(target.size)}"
         raise DataError(
-            f"{where}: {', '.join((*x, *y))} mean {stated}, a field of view of more than 170 degrees; "
-            "expected a pinhole, and lengths in pixels, not in shares of the image"
+            f"{where}: {', '.join((*x, *y))} give {stated}, a field of view above 170 degrees; "
+            "expected a pinhole camera, with lengths in pixels and not as fractions of the image size"
         )
     if not {*x, *y} & {"fl_x", "fl_y", "camera_intrinsics"} and not _focal_lengths_agree(fx, fy):
         keys = f"{next(iter(x))} and {next(iter(y))}"
-        expected = "square pixels, or fl_x and fl_y (Blender's angle_y is the sensor's, not the image's: leave it out)"
+        expected = "square pixels, or fl_x and fl_y. Leave out Blender's angle_y, which describes the sensor"
         raise DataError(
-            f"{where}: {keys} mean pixels that are not square, with focal lengths {lengths}; expected {expected}"
+            f"{where}: {keys} give pixels that are not square, with focal lengths {lengths}; expected {expected}"
         )
     portrait = max(target.height / target.width, 1.0)
     for found, other in ((x, y), (y, x)):
@@ -155,7 +155,7 @@ def _read_focal_lengths(
         for key in found:
             if _focal_lengths_agree(found[key], value):
                 continue
-            text = f"{where}: {first} means a focal length of {value:.5g} pixels, and {key} {found[key]:.5g}"
+            text = f"{where}: {first} gives a focal length of {value:.5g} pixels, but {key} gives {found[key]:.5g}"
             # BlenderNeRF writes the angles of Blender's sensor beside the right fl_x and fl_y: angle_x is that of the
             # image's longer side, and angle_y has nothing to do with the image
             explained = key == "camera_angle_x" and _focal_lengths_agree(found[key] * portrait, value)
@@ -166,8 +166,8 @@ def _read_focal_lengths(
                 and "camera_angle_x" in other
             )
             if not explained:
-                remedy = "take out the wrong one, or give w, h of the images they are for"
-                raise DataError(f"{text}; expected the same within {_TOLERANCE:.0%}: {remedy}")
+                remedy = "remove the wrong one, or give w, h of the images that they are for"
+                raise DataError(f"{text}; expected equal values within {_TOLERANCE:.0%}: {remedy}")
             say(f"{text}; {first} is taken")
     return fx, fy
 
@@ -195,7 +195,7 @@ def _read_camera_intrinsics(record: JsonReader) -> list[float]:
     """Return [cx, cy, fx, fy] of ``camera_intrinsics``, pixels."""
     values: list[float] = record.array("camera_intrinsics", (4,), "[cx, cy, fx, fy] in pixels").tolist()
     if not (values[2] > 0 and values[3] > 0):
-        expected = "[cx, cy, fx, fy], focal lengths above 0"
+        expected = "[cx, cy, fx, fy] with focal lengths above 0"
         raise DataError(f"{record.where}: camera_intrinsics is {values}; expected {expected}")
     return values
 
@@ -218,7 +218,7 @@ def _read_principal_point(
         return 0.5 * target.width, 0.5 * target.height
     record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
     if level is frame and sum(record.has(key) for key in PRINCIPAL_POINT) == 1 and file.has(PRINCIPAL_POINT):
-        found = "cx or cy is missing, and the file's belong to another camera"
+        found = "cx or cy is missing, and the values of the file are for another camera"
         raise DataError(f"{record.where}: {found}; expected both in the frame")
     scale = level.scales(keys, target)
     plain = [record.number_or(key, 0.5 * side) for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)]
@@ -227,8 +227,8 @@ def _read_principal_point(
     if array and level.has(PRINCIPAL_POINT):
         differences = (abs(cx - plain[0] * scale[0]), abs(cy - plain[1] * scale[1]))
         if any(d > _TOLERANCE * side for d, side in zip(differences, target.size, strict=True)):
-            found = f"cx, cy are {plain}, and camera_intrinsics begins with {stated}"
-            raise DataError(f"{record.where}: {found}; expected the same")
+            found = f"cx, cy are {plain}, but camera_intrinsics begins with {stated}"
+            raise DataError(f"{record.where}: {found}; expected the same point")
     if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # an image to render may have it outside
         _check_principal_point(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
     return cx, cy
@@ -242,11 +242,11 @@ def _check_principal_point(
     kx, ky = 2.0 * cx / target.width, 2.0 * cy / target.height
     if not stated and min(kx, ky) > 0.0 and abs(kx - 1.0) > 0.05 and abs(kx - ky) <= 2 * _TOLERANCE * kx:
         width, height = round(2 * cx), round(2 * cy)
-        found = f"{keys} are {cx:g}, {cy:g}, the middle of an image of {width}x{height} and not of {image}"
-        expected = f"w, h of the images that the lengths in pixels are for, e.g. {width}, {height}"
+        found = f"{keys} are {cx:g}, {cy:g}, the centre of an image of {width}x{height}, but the image is {image}"
+        expected = f"w, h of the images to which lengths in pixels refer, e.g. {width}, {height}"
         raise DataError(f"{where}: {found}; expected {expected}")
     if max(cx, cy) <= 1.0 and min(target.width, target.height) > 8:
-        raise DataError(f"{where}: {keys} are {cx:g}, {cy:g} on {image}; expected pixels, not shares of the image")
+        raise DataError(f"{where}: {keys} are {cx:g}, {cy:g} on {image}; expected pixels, not fractions of the image")
     if not (0.0 < cx < target.width and 0.0 < cy < target.height):
         order = "the order [cx, cy, fx, fy]" if keys == "camera_intrinsics" else "a point in the image"
         found = f"{keys} put the principal point outside of {image}, at {cx:g}, {cy:g}"
@@ -276,7 +276,7 @@ def _check_one_lens(frame: _IntrinsicsSource, file: _IntrinsicsSource, target: C
         for level in (frame, file)
     )
     if not _focal_lengths_agree(own, other):
-        found = f"has a focal length of its own, and {', '.join(left)} of the file belong to another one"
+        found = f"has its own focal length, but {', '.join(left)} of the file are for another focal length"
         raise DataError(f"{frame.record.where}: {found}; expected {', '.join(left)} in the frame, too")
 
 
@@ -322,10 +322,10 @@ _HARMLESS = frozenset(
     "rendered_from scene_from_file".split()
 )
 
-_RAYS = "another projection; expected photographs of a pinhole camera, or an OPENCV_FISHEYE"
-_LENS = "a distortion that is not read; expected k1 to k4, p1, p2, or undistorted images"
+_RAYS = "a projection that is not supported; expected photographs of a pinhole camera, or an OPENCV_FISHEYE"
+_LENS = "a lens distortion that is not supported; expected k1 to k4, p1, p2, or undistorted images"
 _MOVES = "a camera that moves during the exposure; expected one transform_matrix, with images without rolling shutter"
-_ALPHA = "what is transparent; expected PNG images with an alpha channel"
+_ALPHA = "transparency that is not supported; expected PNG images with an alpha channel"
 _REFUSED = {
     **dict.fromkeys(
         "latlong equirectangular panorama ftheta ftheta_p0 ftheta_p1 ftheta_p2 ortho orthographic is_ortho "
@@ -355,14 +355,14 @@ def refuse_unsupported_camera_keys(record: JsonReader) -> None:
     """Raise DataError for a key that changes the image and that neuprim does not support."""
     for key, states in _REFUSED.items():
         if key in record.values and _is_camera_key_set(record.values[key]):
-            raise DataError(f"{record.where}: {key} states {states}")
+            raise DataError(f"{record.where}: {key} means {states}")
     pinholes = ("perspective", "persp", "none", *(m.lower() for m in MODELS))
     for key in _KINDS:
         if record.has(key) and str(record.values[key]).lower() not in pinholes:
-            raise record.fail(key, "perspective (camera_model is read for lenses)")
+            raise record.fail(key, "perspective (set camera_model to choose a lens)")
     frames = record.values.get("frames")
     if record.has("n_frames") and isinstance(frames, list) and record.count("n_frames") < len(frames):
-        raise record.fail("n_frames", f"{len(frames)}, as there are frames; take out those that should not count")
+        raise record.fail("n_frames", f"{len(frames)}, the number of frames; remove frames that should not be used")
 
 
 def _is_camera_key_set(value: Any) -> bool:

@@ -72,7 +72,7 @@ class Camera:
             found = f"intrinsics fx={self.fx} fy={self.fy} cx={self.cx} cy={self.cy}"
             raise DataError(f"{where}: {found}; expected finite numbers, focal lengths > 0")
         if self.width <= 0 or self.height <= 0:
-            raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive")
+            raise DataError(f"{where}: image size {self.width}x{self.height}; expected positive numbers")
         check_viewmat(self.viewmat, where)
         return self
 
@@ -82,7 +82,7 @@ def check_viewmat(viewmat: Tensor, where: str) -> None:
     view = viewmat.detach().double().cpu()
     if view.shape != (4, 4) or not torch.isfinite(view).all():
         found = f"camera matrix has shape {tuple(view.shape)} or non-finite entries"
-        raise DataError(f"{where}: {found}; expected finite 4x4")
+        raise DataError(f"{where}: {found}; expected a 4x4 matrix of finite numbers")
     R = view[:3, :3]
     error = (R @ R.T - torch.eye(3, dtype=torch.float64)).abs().max().item()
     if error > 1e-3:
@@ -262,7 +262,7 @@ AnyCamera = Camera | RayCamera
 
 def _check_ray_camera_size(name: str, width: int, height: int) -> None:
     if width <= 0 or height <= 0:
-        raise DataError(f"RayCamera.{name}: image size {width}x{height}; expected positive")
+        raise DataError(f"RayCamera.{name}: image size {width}x{height}; expected positive numbers")
 
 
 def _pixel_centre_grid(width: int, height: int) -> tuple[Tensor, Tensor]:

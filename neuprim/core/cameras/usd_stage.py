@@ -32,7 +32,7 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
     if wanted and wanted not in paths:
         raise SystemExit(f"has no camera {wanted}; expected one of {listed}")
     if not wanted and len(paths) > 1:
-        raise SystemExit(f"has {len(paths)} cameras; expected #PATH after the file's name, with one of {listed}")
+        raise SystemExit(f"has {len(paths)} cameras; expected FILE#PATH, where PATH is one of {listed}")
     camera = UsdGeom.Camera(cameras[paths.index(wanted) if wanted else 0])
     moments = usd_camera_times(stage, camera, most, Usd, UsdGeom)
     return {
@@ -58,10 +58,10 @@ def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any)
             Usd.TimeCode(stage.GetStartTimeCode()) if stage.HasAuthoredTimeCodeRange() else Usd.TimeCode.EarliestTime()
         ]
     if not stage.HasAuthoredTimeCodeRange():
-        raise SystemExit("startTimeCode and endTimeCode are missing; expected them, as the camera moves")
+        raise SystemExit("the camera moves, but startTimeCode and endTimeCode are missing; expected both")
     first, last = stage.GetStartTimeCode(), stage.GetEndTimeCode()
     if not (math.isfinite(first) and math.isfinite(last) and 0 <= last - first < most):
-        raise SystemExit(f"startTimeCode {first:g} and endTimeCode {last:g}; expected a range of at most {most} codes")
+        raise SystemExit(f"startTimeCode {first:g} and endTimeCode {last:g}; expected 1 to {most} time codes")
     return [Usd.TimeCode(first + i) for i in range(int(last - first + 1e-9) + 1)]
 
 

@@ -138,4 +138,4 @@ class World:
             fits = scale > 0 and bool((square / scale - torch.eye(3, dtype=torch.float64)).abs().max() < _ROTATION)
             if fits and float(torch.linalg.det(matrix[:3, :3])) > 0:
                 return self
-        raise DataError(f"{where} is damaged; expected a (4, 4) float64 matrix of a rotation, one scale and an offset")
+        raise DataError(f"{where} is damaged; expected a (4, 4) float64 matrix of rotation, uniform scale and offset")

@@ -85,12 +85,12 @@ def write_compressed(
     if len(text) > _MAX_HEADER:
         raise CheckpointError(f"{path}: the header has {len(text)} bytes; at most {_MAX_HEADER} can be stored")
     if any(s.coding == TEXT and sum(map(len, s.planes)) > MAX_TEXT for s in sections):
-        raise CheckpointError(f"{path}: {CONFIG} has more than {MAX_TEXT} bytes, which is the most that can be stored")
+        raise CheckpointError(f"{path}: {CONFIG} is too long to be stored; expected at most {MAX_TEXT} bytes")
     for s in sections:
         if len(s.name.encode()) > 255 or len(s.shape) > _MAX_DIMENSIONS or max(*s.shape, s.columns, 0) > _MAX_COLUMNS:
-            limits = f"a name of 255 bytes, {_MAX_DIMENSIONS} dimensions and {_MAX_COLUMNS} numbers"
+            limits = f"255 bytes of name, {_MAX_DIMENSIONS} dimensions and {_MAX_COLUMNS} numbers"
             raise CheckpointError(
-                f"{path}: parameter {s.name!r} of shape {s.shape} cannot be stored; at most {limits} can be"
+                f"{path}: parameter {s.name!r} of shape {s.shape} cannot be stored; expected at most {limits}"
             )
     plain = [b"".join(s.planes) for s in sections]
     packed = [compress_code_planes(s.planes) for s in sections]
@@ -193,7 +193,7 @@ def _unpack_content(data: bytes, entry: _TableEntry) -> bytes:
     except zstandard.ZstdError as error:
         raise CorruptSection(f"zstd: {error}") from error
     if len(made) != entry.content:
-        raise CorruptSection(f"zstd made {len(made)} bytes of it; expected {entry.content}")
+        raise CorruptSection(f"zstd decompressed it to {len(made)} bytes; expected {entry.content}")
     return made
 
 
@@ -204,7 +204,7 @@ def _read_compressed_head(path: Path, file: BinaryIO) -> _FileHead:
         raise CheckpointError(f"{path}: starts with {found!r}; expected a compressed model ({MAGIC!r})")
     start = file.read(_START.size)
     if len(start) < _START.size:
-        raise CheckpointError(f"{path}: ends after {size} bytes; expected {len(MAGIC) + _START.size} and more")
+        raise CheckpointError(f"{path}: the file has {size} bytes; expected at least {len(MAGIC) + _START.size}")
     version, sections, count, text_size, table_size, checksum = _START.unpack(start)
     if version != VERSION:
         raise CheckpointError(f"{path}: format version is {version}; this neuprim reads {VERSION}")
@@ -256,12 +256,12 @@ def _parse_compressed_table(table: bytes, sections: int, count: int) -> list[_Ta
                 f"row {number} of the table of {sections} sections is cut short or damaged ({error})"
             ) from error
         if name in names:
-            raise CorruptSection(f"section {name!r} is there twice")
+            raise CorruptSection(f"section {name!r} is stored twice")
         names.add(name)
         made.append(_TableEntry(_checked_codec_section(name, coding, shape), content, packing, stored, checksum))
         _check_entry_sizes(made[-1], count)
     if file.read(1):
-        raise CorruptSection(f"the table goes on after {sections} sections; expected its end")
+        raise CorruptSection(f"the table has more rows than its {sections} sections")
     return made
 
 
@@ -277,7 +277,7 @@ def _checked_codec_section(name: str, coding: int, shape: tuple[int, ...]) -> Co
     if shape != wanted:
         raise CorruptSection(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
     if (coding == TEXT) != (name == CONFIG):
-        raise CorruptSection(f"section {name!r} has coding {CODINGS[coding]}; the one text is {CONFIG!r}")
+        raise CorruptSection(f"section {name!r} has coding {CODINGS[coding]}; expected text for {CONFIG!r} alone")
     if (coding == MASKS) != (name == MASKS_NAME) or (
         coding == MASKS and not (len(shape) == 1 and 0 < shape[0] <= _MAX_MASKS)
     ):
@@ -297,7 +297,7 @@ def _check_entry_sizes(entry: _TableEntry, count: int) -> None:
     if entry.content > most:
         raise CorruptSection(
             f"section {section.name!r} has planes of {entry.content} bytes; "
-            f"expected at most {most} of {count} primitives"
+            f"expected at most {most} for {count} primitives"
         )
     if entry.packing not in (_PLAIN, _ZSTD):
         raise CorruptSection(
@@ -314,10 +314,10 @@ def _check_entry_sizes(entry: _TableEntry, count: int) -> None:
 def _check_total_size(entries: Sequence[_TableEntry], count: int, size: int, left: int) -> None:
     stored = sum(entry.stored for entry in entries)
     if stored != left:
-        raise CorruptSection(f"the sections take {stored} bytes by the table; {left} follow it")
+        raise CorruptSection(f"the table states {stored} bytes for all sections, but {left} bytes follow it")
     numbers = count * sum(entry.section.columns for entry in entries if entry.section.coding != TEXT)
     if not _decompression_allowed(numbers, size):
         raise CorruptSection(
-            f"stands for {count} primitives of {numbers // max(count, 1)} numbers; "
-            f"expected at most {MAX_EXPANSION} times its size"
+            f"decodes to {count} primitives of {numbers // max(count, 1)} numbers; "
+            f"expected float32 data of at most {MAX_EXPANSION} times the file size"
         )

@@ -279,6 +279,6 @@ def _parse_quantizer_bits(word: str, text: str, name: str) -> tuple[int, ...]:
     if any(not p.isascii() or not p.isdigit() or len(p) > 2 or not low <= int(p) <= high for p in parts) or (
         len(parts) > 1 and not several
     ):
-        more = "; several, as 7,6,5, for the bands of spherical harmonics" if several else ""
-        raise ConfigError(f"bits.{word}: expected {low} to {high}{more}")
+        more = ", or one number for each band of spherical harmonics, as in 7,6,5" if several else ""
+        raise ConfigError(f"bits.{word}: expected {low} to {high} bits{more}")
     return tuple(map(int, parts))

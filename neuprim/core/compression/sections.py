@@ -128,7 +128,7 @@ def section_content_size(section: CompressedSection, count: int, masks: Sequence
     bits = _column_records(section).bits.tolist()
     if section.coding == POSITIONS:
         if len(set(bits)) != 1 or len(bits) != 3:
-            raise CorruptSection(f"{bits} bits; expected three columns of as many bits each")
+            raise CorruptSection(f"columns of {bits} bits; expected three columns with the same number of bits")
         return count * _code_byte_count(3 * bits[0])
     return sum(_code_byte_count(b) * n for b, n in zip(bits, _column_counts(section, count, masks), strict=True))
 
@@ -139,7 +139,7 @@ def unpack_codec_masks(section: CompressedSection, content: bytes, count: int) -
         np.frombuffer(content, np.uint8).reshape(section.columns, (count + 7) // 8), axis=1, bitorder="little"
     )
     if bits[:, count:].any():
-        raise CorruptSection(f"bits beyond those of {count} primitives")
+        raise CorruptSection(f"a mask has bits set after its {count} primitives")
     return list(bits[:, :count].astype(bool))
 
 
@@ -195,7 +195,7 @@ def _column_records(section: CompressedSection) -> ColumnQuantizer:
         if not 1 <= bits <= MAX_BITS:
             raise CorruptSection(f"column {i} has {bits} bits; expected 1 to {MAX_BITS}")
         if not -np.inf < low <= high < np.inf:
-            raise CorruptSection(f"column {i} goes from {low} to {high}; expected two finite numbers, ascending")
+            raise CorruptSection(f"column {i} has the range {low} to {high}; expected ascending finite numbers")
     bits, low, high = zip(*found, strict=True) if found else ((), (), ())
     return ColumnQuantizer(
         torch.tensor(bits, dtype=torch.int64),
@@ -207,7 +207,7 @@ def _column_records(section: CompressedSection) -> ColumnQuantizer:
 def _position_cells(planes: _PlaneReader, count: int, bits: int) -> np.ndarray:
     keys = np.cumsum(planes.codes(count, 3 * bits, (1 << 3 * bits) - 1), dtype=np.int64)
     if len(keys) and (keys.min() < 0 or keys.max() >= 1 << 3 * bits):  # no step is large enough to skip both ranges
-        raise CorruptSection(f"steps along the curve leave its {3 * bits} bits")
+        raise CorruptSection(f"a position code does not fit {3 * bits} bits")
     return morton_decode(keys.astype(np.uint64), bits)
 
 
@@ -225,7 +225,7 @@ class _PlaneReader:
                 found |= self._bytes[self._at : self._at + count].astype(np.int64) << (8 * i)
                 self._at += count
             if found.min() < 0 or found.max() > last:
-                raise CorruptSection(f"a code of {bits} bits that is not among 0 to {last}")
+                raise CorruptSection(f"a code of {bits} bits is outside of 0 to {last}")
         return found
 
 

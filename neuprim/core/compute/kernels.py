@@ -278,8 +278,8 @@ def code_cache(folder: Path) -> Path:
     if not why:
         return folder
     warn_once(
-        f"{folder}: {why}; compiled code is not taken from there, and this process compiles its own. "
-        "Expected a folder of yours alone"
+        f"{folder}: {why}; compiled code in this folder is not trusted and kernels are compiled again. "
+        "Expected a folder that only you can write to"
     )
     return _private_code_folder()
 
@@ -300,7 +300,7 @@ def folder_weakness(folder: Path) -> str:
         if shared and (
             place == whole or not there.st_mode & stat.S_ISVTX
         ):  # others cannot replace a sticky folder's entries
-            return "others may write it" if place == whole else f"others may write {place}"
+            return "other users may write to it" if place == whole else f"other users may write to {place}"
     return ""
 
 

@@ -204,8 +204,8 @@ class Dataset:
     def uniform_points(self, count: int, generator: torch.Generator) -> PointCloud:
         """Return ``count`` mid-grey points, uniform in :attr:`bounds`; raise ConfigError without bounds."""
         if self.bounds is None:
-            found = f"{self.name} does not say which box its matter fills"
-            raise ConfigError(f"model.init.points=box: {found}; expected matter")
+            found = f"{self.name} has no bounds to place points in"
+            raise ConfigError(f"model.init.points=box: {found}; expected model.init.points=matter")
         low, high = self.bounds.float()
         means = low + torch.rand((count, 3), generator=generator) * (high - low)
         return PointCloud(means, torch.full((count, self.channels), 0.5))
@@ -279,8 +279,8 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     """
     count = len(dataset.train)
     if every < 2 or count < 2:
-        found = f"every {every}. of {count} training views held out"
-        raise ConfigError(f"{dataset.name}: {found}; expected 2 or more of 2 views or more")
+        found = f"cannot hold out one in {every} of {count} training views"
+        raise ConfigError(f"{dataset.name}: {found}; expected one in 2 or more, of at least 2 views")
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))
@@ -402,7 +402,7 @@ def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> W
         row = int(far.nonzero()[0])
         place = ", ".join(f"{x + 0.0:.6g}" for x in centers[row].tolist())
         found = f"{int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}"
-        warn_once(f"{where}: {found}; they do not count for the scene's size")
+        warn_once(f"{where}: {found}; they are ignored for the scene's size")
     center = centers[~far].mean(0)
     there = World.at(center.tolist())
     extent = camera_extent([there.scene_camera(c) for c in cameras])

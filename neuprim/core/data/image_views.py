@@ -135,8 +135,8 @@ def find_masks(folder: Path, files: Sequence[Path], images: Path | None = None) 
     masks = [_find_mask(folder, file, images) for file in files]
     found = [m for m in masks if m is not None]
     if found:
-        what = f"what is {'not ' if found[0].inverted else ''}black there does not count"
-        warn_once(f"{found[0].path.parent}: masks of {len(found)} of {len(files)} images are read; {what}")
+        what = f"pixels that are {'not ' if found[0].inverted else ''}black in a mask are ignored"
+        warn_once(f"{found[0].path.parent}: found masks for {len(found)} of {len(files)} images; {what}")
     return masks
 
 
@@ -393,7 +393,7 @@ class ImageViews(ViewSet):
         else:
             premultiplied = frame.info.linear
         if mask is not None and not mask.any():
-            raise DataError(f"{frame.path}: mask and lens distortion leave no pixel that counts; expected at least one")
+            raise DataError(f"{frame.path}: mask and lens distortion exclude all pixels; expected at least one pixel")
         if image.dtype == torch.float32 and image.abs().max() <= 65504.0:
             image = image.half()
         return _StoredImage(image, premultiplied, mask, self._to_linear)

@@ -44,13 +44,13 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
         raise _compressed_start_points_error(path, "a compressed PLY (property packed_position)")
     means = _starting_point_columns(found, ("x", "y", "z"))
     if means is None:
-        raise DataError(f"{path}: no properties x, y, z; expected points")
+        raise DataError(f"{path}: the vertices have no properties x, y, z; expected points")
     if not len(means):
         raise DataError(f"{path}: no vertices; expected at least one point")
     scales, opacity = _starting_point_log_sizes(found, path), _starting_point_columns(found, ("opacity",))
     quats = _starting_point_columns(found, _ROTATION) if "scale_1" in found.names else None
     colors = _starting_point_colors(found, path)
-    faults = {"place": ~(np.abs(means) < 1e30).all(1), "colour": ~np.isfinite(colors).all(1)}
+    faults = {"position": ~(np.abs(means) < 1e30).all(1), "colour": ~np.isfinite(colors).all(1)}
     if scales is not None:
         faults["size"] = ~(scales <= _LARGEST_LOG).all(1) | ~(scales >= -_LARGEST_LOG).any(1)
         if quats is not None:
@@ -60,13 +60,13 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
     kept = ~np.any(list(faults.values()), axis=0)
     if kept.any():
         away = np.linalg.norm(np.where(kept[:, None], means, np.nan) - np.median(means[kept], axis=0), axis=1)
-        faults["place"] |= kept & (away > _FARTHEST * np.median(away[kept])) & (np.median(away[kept]) > 0)
-        kept &= ~faults["place"]
+        faults["position"] |= kept & (away > _FARTHEST * np.median(away[kept])) & (np.median(away[kept]) > 0)
+        kept &= ~faults["position"]
     if not kept.all():
         parts = [
-            f"{rows.sum()} for their {what}, as vertex {rows.argmax()}" for what, rows in faults.items() if rows.any()
+            f"{rows.sum()} with bad {what}, e.g. vertex {rows.argmax()}" for what, rows in faults.items() if rows.any()
         ]
-        text = f"{path}: {(~kept).sum()} of {len(kept)} vertices are no usable points ({'; '.join(parts)})"
+        text = f"{path}: {(~kept).sum()} of {len(kept)} vertices are not usable as points ({'; '.join(parts)})"
         if not kept.any():
             raise DataError(f"{text}; expected at least one with finite numbers")
         warn_once(f"{text}; left out")
@@ -89,7 +89,7 @@ def read_points(path: Path, channels: int, color_space: str) -> PointCloud:
 
 def _compressed_start_points_error(path: Path, what: str) -> DataError:
     return DataError(
-        f"{path}: {what}, which is not read; expected an uncompressed PLY. "
+        f"{path}: {what}, which is not supported; expected an uncompressed PLY. "
         "Convert it with SuperSplat (export as PLY) or splat-transform FILE OUT.ply"
     )
 
@@ -107,7 +107,7 @@ def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | No
     if there != list(_SCALES[: len(there)]) or (len(there) > 1 and not set(_ROTATION) <= set(found.names)):
         lacking = [name for name in (*_SCALES, *_ROTATION) if name not in found.names]
         what = f"has {', '.join(there)}, but no {', '.join(lacking)}"
-        warn_once(f"{path}: {what}; sizes are ignored, and come from distances")
+        warn_once(f"{path}: {what}; sizes in the file are ignored and estimated from distances between points")
         return None
     scales = found.columns(there)
     if len(there) == 1:
@@ -126,7 +126,7 @@ def _starting_point_colors(found: PlyVertices, path: Path) -> np.ndarray:
             kind = found.rows.dtype[names[0]]
             bytes_as_floats = kind.kind == "f" and bool(np.nanmax(rgb, initial=0.0, where=np.isfinite(rgb)) > 2.0)
             if bytes_as_floats:
-                warn_once(f"{path}: {', '.join(names)} are numbers above 2; taken for 0 to 255")
+                warn_once(f"{path}: {', '.join(names)} are floats with values above 2; read as colours from 0 to 255")
             return rgb / (np.iinfo(kind).max if kind.kind in "iu" else 255.0 if bytes_as_floats else 1.0)
     return np.full((len(found.rows), 3), 0.5)
 
@@ -136,8 +136,8 @@ def _warn_of_rounded_starting_points(found: PlyVertices, means: np.ndarray, path
     largest = np.abs(means).max(initial=0.0)
     size, step = np.ptp(means, axis=0).max(), np.spacing(np.float32(largest))
     if found.rows.dtype["x"].itemsize == 4 and step > _COARSE * size > 0:
-        what = f"x y z are float, which rounds coordinates as large as {largest:.7g} to {step:.2g}"
-        warn_once(f"{path}: {what}; expected double there")
+        what = f"x, y, z are float, which rounds coordinates near {largest:.7g} to steps of {step:.2g}"
+        warn_once(f"{path}: {what}; expected double")
 
 
 def _convert_starting_point_colors(colors: Tensor, linear: bool, color_space: str) -> Tensor:

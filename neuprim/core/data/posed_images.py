@@ -125,7 +125,7 @@ def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
     if outside:
         found = f"{len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}"
-        warn_once(f"{where}: {found}; they are read as it says")
+        warn_once(f"{where}: {found}; they are read from there")
 
 
 def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
@@ -259,15 +259,15 @@ def _check_dataset_splits(
         if not frames:
             hint = ""
             if len(train) + len(test) == 1:
-                hint = "; there is one image, and two are the least: one to learn from, one to judge by"
+                hint = "; the scene has one image, but needs at least two: one for training and one for testing"
             elif split == "test" and hasattr(settings, "hold_out"):
                 hint = "; scene.hold_out=8 holds out every 8th training view instead"
             raise DataError(f"{where}: the {split} split has no images; expected at least one{hint}")
     first = train[0]
     for frame in (*train, *test):
         if frame.info.linear != first.info.linear:
-            found = f"mixes OpenEXR (linear) and PNG/JPEG (sRGB) with {first.path}"
-            raise DataError(f"{frame.path}: {found}; expected one kind")
+            found = f"images mix OpenEXR (linear) and PNG/JPEG (sRGB), see {first.path}"
+            raise DataError(f"{frame.path}: {found}; expected one kind of file")
         if frame.info.channels != first.info.channels:
             found = f"image has {frame.info.channels} channels, {first.path} has {first.info.channels}"
             raise DataError(f"{frame.path}: {found}; expected all RGB or all RGBA")

@@ -214,8 +214,8 @@ def ray_starting_points(
             break
     means, colors, owner = (torch.cat(parts)[:count] for parts in zip(*found, strict=True))
     if not len(means):
-        what = f"no place is in the images of {needed} training cameras"
-        raise DataError(f"{what}, so that no starting point can be inferred; {GIVE_POINTS}")
+        what = f"no point in space is visible in {needed} training images"
+        raise DataError(f"{what}, so no starting points can be found; {GIVE_POINTS}")
     return PointCloud(means, colors), owner
 
 

@@ -176,7 +176,7 @@ def read_image_splits(
     path = folder / f"transforms_{test}.json"
     hint = "; scene.hold_out=8 holds out every 8th training view instead"
     if not path.is_file():
-        raise MissingFiles(f"{path}: file not found, so there are no views to judge by{hint}")
+        raise MissingFiles(f"{path}: file not found, so there are no test views{hint}")
     try:
         return frames, read(test)
     except MissingFiles as error:
@@ -209,7 +209,7 @@ def split_named_images(
     shared = sorted(train_names & test_names)
     if shared:
         found = f"train_filenames and {judged} share {len(shared)} images, e.g. {shared[0]}"
-        raise DataError(f"{document.where}: {found}; expected none")
+        raise DataError(f"{document.where}: {found}; expected no image in both lists")
     return [f for n, f in listed.items() if n in train_names], [f for n, f in listed.items() if n in test_names]
 
 

@@ -45,7 +45,7 @@ def refuse_image_file_beyond_memory(path: Path) -> Iterator[None]:
     try:
         yield
     except MemoryError:
-        what = "reading the image takes more memory than there is; is it damaged, or too large?"
+        what = "reading the image needs more memory than available; it is damaged or too large"
         raise DataError(f"{path}: {what}") from None
 
 
@@ -66,7 +66,7 @@ def exr_channel_name_error(names: Sequence[Any]) -> str | None:
         if name == "A":
             return f"[{i}] is 'A'; expected another name, as A is alpha in OpenEXR files"
         if name in used:
-            return f"[{i}] is {name!r} once more; expected different names"
+            return f"[{i}] is {name!r} again; expected different names"
         used.add(name)
     return None
 
@@ -83,7 +83,7 @@ def is_exr(path: Path, required: bool = False) -> bool:
     if not head:
         raise DataError(f"{path}: file is empty; expected an image")
     if required and head[:4] != _MAGIC:
-        raise DataError(f"{path}: not an OpenEXR file; expected one, as channels have names in no other")
+        raise DataError(f"{path}: not an OpenEXR file; expected one, because other formats have no channel names")
     return head[:4] == _MAGIC
 
 
@@ -104,7 +104,7 @@ def read_exr_layout(path: Path, wanted: Sequence[str] | None = None) -> tuple[li
         expected = "R, G, B and optionally A, of one layer"
     if not names or not set(names) <= channels.keys():
         found = f"OpenEXR channels are {', '.join(channels) or 'none'}"
-        raise DataError(f"{path}: {found}; expected {expected or 'some to be asked for'}")
+        raise DataError(f"{path}: {found}; expected {expected or 'at least one requested channel'}")
     if any(channels[n].xSampling != 1 or channels[n].ySampling != 1 for n in names):
         raise DataError(f"{path}: OpenEXR colour channels are subsampled; expected one value per pixel")
     return names, width, height
@@ -195,7 +195,7 @@ def write_exr_layers(
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:
-        raise DataError(f"{path}: channels to write have shapes {shapes}; expected one (H, W)")
+        raise DataError(f"{path}: channels to write have shapes {shapes}; expected the same (H, W) for all")
     stored = {name: _exr_values(f"{path}: channel {name}", channel) for name, channel in channels.items()}
     header = {**(attributes or {}), "compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with checked_atomic_path(path) as temporary:
@@ -213,6 +213,6 @@ def _exr_values(where: str, channel: ExrChannel) -> np.ndarray:
         y, x = bad[0].tolist()
         raise DataError(f"{where}: value {values[y, x]} at row {y}, column {x}; expected finite numbers")
     if channel.half and np.abs(values).max() > _MAX_HALF:
-        found = f"value {np.abs(values).max():.6g} does not fit 16-bit floats ({_MAX_HALF:.0f})"
+        found = f"value {np.abs(values).max():.6g} does not fit 16-bit floats (at most {_MAX_HALF:.0f})"
         raise DataError(f"{where}: {found}; write 32-bit floats (half=False)")
     return np.ascontiguousarray(values, dtype=np.float16 if channel.half else np.float32)

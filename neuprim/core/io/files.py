@@ -246,7 +246,7 @@ class StagedOutput:
             refuse_existing(target, self._overwrite)
             if os.path.lexists(target) and source.is_dir() != target.is_dir():
                 actual, wanted = ("folder", "file") if target.is_dir() else ("file", "folder")
-                raise ConfigError(f"{target}: is a {actual}; expected a {wanted}, or nothing")
+                raise ConfigError(f"{target}: is a {actual}; expected a {wanted}, or a path that does not exist")
         for source, target in moves:
             target.parent.mkdir(parents=True, exist_ok=True)
             os.replace(source, target)

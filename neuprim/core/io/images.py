@@ -181,7 +181,7 @@ def to_uint8(image: Tensor) -> Tensor:
     if image.dtype == torch.uint8:
         return image
     if torch.isnan(image).any():
-        raise DataError("image has NaN values; expected numbers to write as 8 bit")
+        raise DataError("image has NaN values, which cannot be written with 8 bits; expected numbers")
     return (image.detach().float().clamp(0.0, 1.0) * 255.0).round().to(torch.uint8)
 
 
@@ -242,7 +242,7 @@ def write_animation(path: Path, frames: Sequence[Tensor], fps: float, quality: i
     _check_animation_rate(path, len(frames), fps)
     shapes = sorted({tuple(f.shape) for f in frames})
     if len(shapes) != 1:
-        raise DataError(f"{path}: frames have shapes {shapes}; expected one shape")
+        raise DataError(f"{path}: frames have shapes {shapes}; expected the same shape for all")
     if path.suffix.lower() == ".mp4":
         _write_mp4(path, frames, fps)
     else:
@@ -261,9 +261,9 @@ class FrameSpool:
 
     def add(self, frame: Tensor) -> None:
         """Append a frame of (H, W, 3) sRGB values, float 0..1 or uint8; all frames have the same size."""
-        image = pillow_image(Path(f"frame {self.count} of a film"), frame)
+        image = pillow_image(Path(f"frame {self.count} of an animation"), frame)
         if image.size != (self._size or image.size):
-            raise DataError(f"frame {self.count} of a film is {image.size}; expected {self._size}, as the first")
+            raise DataError(f"frame {self.count} of an animation has size {image.size}; expected {self._size}")
         self._size = image.size
         image.save(self._pages, format="TIFF")
         self._pages.newFrame()

@@ -182,7 +182,7 @@ def _parse_json_int(text: str) -> int:
 def _parse_json_float(text: str) -> float:
     value = float(text)
     if math.isinf(value):
-        raise ValueError(f"{cut_error_text(text)} is larger than any number here")
+        raise ValueError(f"{cut_error_text(text)} is too large for a 64-bit float")
     return value
 
 
@@ -208,7 +208,7 @@ class _PlainYamlLoader(yaml.SafeLoader):
             value = None
         if value is None or (kind == "int" and not -(2**63) <= value < 2**64):
             raise yaml.constructor.ConstructorError(
-                None, None, f"{cut_error_text(node.value)} is larger than any number here", node.start_mark
+                None, None, f"{cut_error_text(node.value)} is too large for a 64-bit number", node.start_mark
             )
         return value
 

@@ -132,12 +132,12 @@ def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHead
             order = _FORMATS[words[1]]
         elif words[0] == "element" and len(words) == 3:
             if any(element.name == words[1] for element in elements):
-                raise DataError(f"{path}: element {words[1][:40]} twice")
+                raise DataError(f"{path}: header declares element {words[1][:40]} twice")
             elements.append(_ElementHeader(words[1], _parse_ply_count(words[1], words[2], path), []))
         elif words[0] == "property" and elements:
             elements[-1].fields.append(_parse_property(words, path))
             if sum(len(element.fields) for element in elements) > _MAX_PROPERTIES:
-                raise DataError(f"{path}: more than {_MAX_PROPERTIES} properties")
+                raise DataError(f"{path}: header declares more than {_MAX_PROPERTIES} properties")
         elif words == ["end_header"]:
             break
         else:
@@ -146,17 +146,17 @@ def _read_ply_header(file: BinaryIO, path: Path) -> tuple[str, list[_ElementHead
     vertices = next((element for element in elements if element.name == "vertex"), None)
     if order is None or vertices is None or not vertices.fields:
         missing = "format" if order is None else "element vertex" if vertices is None else "property of the vertices"
-        raise DataError(f"{path}: header has no {missing}; expected vertex properties, as 'property float x'")
+        raise DataError(f"{path}: header has no {missing}; expected vertex properties such as 'property float x'")
     for element in elements:
         names = [name for name, _, _ in element.fields]
         if len(set(names)) != len(names):
-            raise DataError(f"{path}: property {next(n for n in names if names.count(n) > 1)!r} twice")
+            raise DataError(f"{path}: header declares property {next(n for n in names if names.count(n) > 1)!r} twice")
     return order, elements, tuple(comments)
 
 
 def _parse_ply_count(name: str, text: str, path: Path) -> int:
     if not (text.isascii() and text.isdigit() and len(text) <= 12):
-        raise DataError(f"{path}: {text[:20]!r} for the number of {name[:20]}; expected a count")
+        raise DataError(f"{path}: header states {text[:20]!r} as the count of {name[:20]}; expected a number")
     return int(text)
 
 
@@ -165,7 +165,7 @@ def _parse_property(words: list[str], path: Path) -> tuple[str, str, str]:
         return words[2], _TYPES[words[1]], ""
     if len(words) == 5 and words[1] == "list" and words[3] in _TYPES and _TYPES.get(words[2], "f")[0] != "f":
         return words[4], _TYPES[words[3]], _TYPES[words[2]]
-    expected = "a property as 'property float x' or 'property list uchar int x'"
+    expected = "a line such as 'property float x' or 'property list uchar int x'"
     raise DataError(f"{path}: {' '.join(words)[:60]!r}; expected {expected}")
 
 
@@ -203,7 +203,7 @@ def _read_binary(file: BinaryIO, path: Path, element: _ElementHeader, order: str
                 return rows, {name: PlyList(np.full(count, size), table[name].reshape(-1)) for name, size in lists}
             file.seek(start)
         elif not any(length for _, _, length in fields):
-            found = f"{count} {_describe_ply_rows(element)} of {dtype.itemsize} bytes; only {left} bytes follow"
+            found = f"{count} {_describe_ply_rows(element)} of {dtype.itemsize} bytes, but only {left} bytes follow"
             raise DataError(f"{path}: {found}; expected a complete file")
     return _read_row_by_row(file, path, element, order, left)
 
@@ -241,7 +241,7 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
             place += size * width
             if place > len(data) or size < 0:
                 raise DataError(
-                    f"{path}: {element.count} {_describe_ply_rows(element)} announced; the file ends in row {row}"
+                    f"{path}: header states {element.count} {_describe_ply_rows(element)}; the file ends in row {row}"
                 )
     file.seek(start + place)
     octets = np.frombuffer(data, np.uint8)
@@ -262,7 +262,7 @@ def _read_row_by_row(file: BinaryIO, path: Path, element: _ElementHeader, order:
 def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) -> _Values:
     count, fields = element.count, element.fields
     if count * (2 * len(fields)) > left + 1:  # a digit and a blank each
-        found = f"{count} {_describe_ply_rows(element)} of {len(fields)} numbers; only {left} bytes follow"
+        found = f"{count} {_describe_ply_rows(element)} of {len(fields)} numbers, but only {left} bytes follow"
         raise DataError(f"{path}: {found}; expected a complete file")
     scalars = [(name, kind) for name, kind, length in fields if not length]
     if not count or not fields:
@@ -293,7 +293,7 @@ def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) 
 def _cast_ply_column(values: np.ndarray, name: str, kind: str, path: Path) -> np.ndarray:
     info = None if kind[0] == "f" else np.iinfo(kind)
     if info is not None and not ((values >= info.min) & (values <= info.max)).all():
-        raise DataError(f"{path}: {name} has values outside its type; expected {info.min} to {info.max}")
+        raise DataError(f"{path}: {name} has values outside the range of its type; expected {info.min} to {info.max}")
     with np.errstate(over="ignore"):
         return values.astype(kind)
 

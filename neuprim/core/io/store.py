@@ -38,7 +38,7 @@ def open_store(address: str, copies: Path) -> Store:
     protocol, is_url, path = address.partition("://")
     if "::" in address or (is_url and protocol not in PROTOCOLS):
         what = "a chain of protocols" if "::" in address else f"protocol {cut_error_text(protocol)!r}"
-        expected = f"a folder, or a URL of {', '.join(PROTOCOLS)}, as s3://BUCKET/FOLDER"
+        expected = f"a folder, or a URL of {', '.join(PROTOCOLS)}, such as s3://BUCKET/FOLDER"
         raise ConfigError(f"{cut_error_text(address)}: {what}; expected {expected}")
     if not is_url:
         return Store.local(Path(address).expanduser().absolute())
@@ -53,7 +53,7 @@ def open_store(address: str, copies: Path) -> Store:
         what = f"{protocol}:// needs a package that is not installed ({_store_error_line(error)}){extra}"
         raise BackendUnavailable(f"{address}: {what}") from None
     except ValueError as error:
-        expected = "a folder or a URL that fsspec knows, as s3://BUCKET/FOLDER"
+        expected = "a folder or a URL that fsspec knows, such as s3://BUCKET/FOLDER"
         raise ConfigError(f"{address}: {_store_error_line(error)}; expected {expected}") from None
     except Exception as error:
         raise DataError(f"{address}: cannot be reached ({_store_error_line(error)})") from error
@@ -197,8 +197,8 @@ class Store:
         notify(f"{WAIT_MESSAGE} {self.path}, which is gone")
         while self._is_gone():
             if time.monotonic() > deadline:
-                found = f"gone for {MAX_WAIT:.0f} s while it was in use"
-                raise DataError(f"{self.path}: {found}; expected the folder there again (what it holds is kept)")
+                found = f"the folder disappeared and was missing for {MAX_WAIT:.0f} s"
+                raise DataError(f"{self.path}: {found}; expected it to be available again (its files are kept)")
             time.sleep(POLL_INTERVAL)
 
     @contextmanager

@@ -41,7 +41,7 @@ def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
                 f"{name} image: expected shape (H, W, C) with at least one pixel, found {tuple(image.shape)}"
             )
     if rendered.shape != truth.shape:
-        raise DataError(f"rendered image has shape {tuple(rendered.shape)} but its truth has {tuple(truth.shape)}")
+        raise DataError(f"rendered image has shape {tuple(rendered.shape)}, but ground truth {tuple(truth.shape)}")
     for name, image in images.items():
         if math.isfinite(image.detach().sum().item()):
             continue
@@ -71,7 +71,7 @@ def psnr(rendered: Tensor, truth: Tensor, mask: Tensor | None = None, peak: floa
         mask = mask.cpu()
         count = int(mask.sum()) * first.shape[2]
         if count == 0:
-            raise DataError("mask leaves no pixel to compare")
+            raise DataError("mask excludes all pixels; expected at least one to compare")
     error = sum_squared_errors(first, second, mask) / count
     return math.inf if error == 0.0 else 20.0 * math.log10(peak) - 10.0 * math.log10(error)
 

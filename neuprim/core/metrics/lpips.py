@@ -86,7 +86,7 @@ class Lpips:
         where = Path(path)
         files = sorted(f for f in where.iterdir() if f.suffix in _SUFFIXES) if where.is_dir() else [where]
         if not files:
-            raise DataError(f"{where}: no weights in it; expected files that end in {', '.join(_SUFFIXES)}")
+            raise DataError(f"{where}: the folder has no weights; expected files that end in {', '.join(_SUFFIXES)}")
         return _lpips_of_weights({key: value for file in files for key, value in _read_weights(file).items()}, where)
 
     def __call__(self, rendered: Tensor, truth: Tensor) -> float:
@@ -149,8 +149,8 @@ def _lpips_of_weights(found: Mapping[str, Any], where: Path) -> Lpips:
         if indices == {layer.number for layer in layers}:
             return _checked_weights(network, layers, parts, where)
     raise DataError(
-        f"{where}: convolutions {sorted(indices) or 'none'}; expected those of AlexNet or VGG16, as features.N or "
-        f"net.sliceM.N"
+        f"{where}: found convolutions {sorted(indices) or 'none'}; expected the layers of AlexNet or VGG16, named "
+        f"features.N or net.sliceM.N"
     )
 
 

@@ -100,7 +100,7 @@ def check_lowered_channels(found: int, colour: ColourField) -> None:
     if found != colour.channels:
         raise FormError(
             f"{model_method_label(colour, 'lower')} returned a colour of C={found}; "
-            f"expected {colour.channels}, as its member channels says"
+            f"expected {colour.channels}, its attribute channels"
         )
 
 

@@ -93,12 +93,12 @@ class LoweredPrimitives:
     def _check_devices(self, viewmat: Tensor | None) -> None:
         where = self.geometry.means.device
         if viewmat is not None and not viewmat.is_cpu and viewmat.device != where:
-            raise FormError(f"viewmat has device {viewmat.device}; expected {where}, as means has, or cpu")
+            raise FormError(f"viewmat has device {viewmat.device}; expected {where}, the device of means, or cpu")
         for kind, form in (("density", self.density), ("colour", self.colour), ("geometry", self.geometry)):
             for name, value in form.tensors().items():
                 if value.device != where:
                     who = kind if kind == "geometry" else self.source("density" if kind == "density" else "colour")
-                    raise FormError(f"{who}: {name} has device {value.device}; expected {where}, as means has")
+                    raise FormError(f"{who}: {name} has device {value.device}; expected {where}, the device of means")
 
     @property
     def kind(self) -> str:
@@ -355,12 +355,10 @@ def validate_reduction(density: DensityField, colour: ColourField, kind: str, na
     field = density if kind == KINDS[0] else colour
     offered = field.reductions()
     if name not in offered:
-        what = nearest(f"{kind}.{name}", reduction_names(density, colour)) or "; nothing of this model can be"
-        raise ConfigError(f"{kind}.{name}: nothing that {type(field).__name__} can do with less of{what}")
+        what = nearest(f"{kind}.{name}", reduction_names(density, colour)) or "; this model has none"
+        raise ConfigError(f"{kind}.{name}: {type(field).__name__} has no such setting that can be reduced{what}")
     if isinstance(value, bool) or value not in offered[name]:
-        raise ConfigError(
-            f"{kind}.{name}={value}: expected {' or '.join(map(str, offered[name]))}, less than the model has"
-        )
+        raise ConfigError(f"{kind}.{name}={value}: expected a reduced value: {' or '.join(map(str, offered[name]))}")
     return int(value)
 
 

@@ -123,12 +123,12 @@ def dense_primitive_parameters(
         )
         if name in found:
             raise CheckpointError(
-                f"{where}: {name} is there twice, as {name} and as {name + _NUMBERS}; expected one of them"
+                f"{where}: {name} is stored twice, as {name} and as {name + _NUMBERS}; expected one of them"
             )
         found[name] = torch.zeros(size).masked_scatter_(mask, numbers).reshape(len(means), *shapes[name])
     extra = sorted(set(stored) - {*found, *(name + part for name in names for part in (_MASK, _NUMBERS))})
     if extra:
-        raise CheckpointError(f"{where}: tensor {extra[0]!r} belongs to no parameter")
+        raise CheckpointError(f"{where}: tensor {extra[0]!r} belongs to no parameter of the model")
     return found
 
 

@@ -83,7 +83,7 @@ class Backend:
             return f"cannot run here: {reason}"
         unsupported = self.unsupported(lowered, camera)
         if unsupported is None and not lowered.movable and device != lowered.kind:
-            unsupported = f"code of the model's own that works on the {lowered.kind}; it draws on the {self.devices[0]}"
+            unsupported = f"the model's own code, which runs on the {lowered.kind}; it draws on the {self.devices[0]}"
         return None if unsupported is None else f"cannot draw {unsupported}"
 
 
@@ -91,9 +91,9 @@ def unsupported_by_kernels(lowered: LoweredPrimitives, camera: AnyCamera | None)
     """Return which form or camera the cpu and cuda backends cannot render; None if they can render this model."""
     if not (isinstance(lowered.density, Cosine) and isinstance(lowered.colour, Constant | RayNet)):
         forms = f"{type(lowered.density).__name__} density, {type(lowered.colour).__name__} colour"
-        return f"{forms}; it knows Cosine, and Constant or RayNet"
+        return f"{forms}; it supports Cosine density, Constant or RayNet colour"
     if isinstance(camera, RayCamera):
-        return "a RayCamera (fisheye, equirectangular); it knows pinhole cameras"
+        return "a RayCamera (fisheye, equirectangular); it supports pinhole cameras"
     return None
 
 
@@ -181,7 +181,7 @@ def gpu_backends_unavailable() -> str | None:
     reason = hardware.cuda_unavailable()
     rows = [backend.missing() for backend in TABLE if backend.devices[0] == hardware.CUDA]
     if reason is None and not rows:
-        return "no backend draws there"
+        return "no backend draws on a GPU"
     return reason or (None if None in rows else rows[0])
 
 
@@ -193,7 +193,7 @@ def check_backend_device(settings: RenderSettings) -> None:
     if settings.device not in backend.devices:
         own = " or ".join((*backend.devices, AUTO))
         raise ConfigError(
-            f"renderer.device={settings.device}: renderer.backend={backend.name} does not draw there; expected {own}"
+            f"renderer.device={settings.device}: renderer.backend={backend.name} does not draw on it; expected {own}"
         )
 
 
@@ -249,8 +249,8 @@ def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera:
         reason = backend.cannot_draw(lowered, camera, device)
         if reason is None:
             if device != backend.devices[0]:
-                own = next((f"; renderer.backend={b.name} is made for it" for b in TABLE if b.devices[0] == device), "")
-                warn_once(f"renderer.backend={backend.name} is slow on the {device}, where only its tests draw{own}")
+                own = next((f"; use renderer.backend={b.name}" for b in TABLE if b.devices[0] == device), "")
+                warn_once(f"renderer.backend={backend.name} is slow on the {device} and only for tests there{own}")
             return backend
         reasons.append(f"renderer.backend={backend.name} {reason}")
     other = next((b for b in TABLE if b.cannot_draw(lowered, camera) is None), None)

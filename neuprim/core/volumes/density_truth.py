@@ -105,7 +105,7 @@ class DensityGridPlacement:
                 ],
             )
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-            raise DataError(f"{where}: header field 'world' is damaged ({error!r})") from None
+            raise DataError(f"{where}: header field 'world' is damaged ({type(error).__name__}: {error})") from None
         matrix, count, extents = placement.scene_from_world, len(placement.numbers), placement.extents
         sound = (
             np.isfinite(matrix).all()

@@ -54,8 +54,8 @@ def divide_cores_among_jobs(settings: LauncherSettings, jobs: int) -> tuple[int,
         given = {"workers": settings.workers, "threads": settings.threads}
         names = " with ".join(f"launcher.{name}={value}" for name, value in given.items() if value is not None)
         raise ConfigError(
-            f"{names}: more than the {cores} core{'s' * (cores > 1)} of this machine; "
-            f"expected at most {cores} threads together"
+            f"{names}: needs more than the {cores} core{'s' * (cores > 1)} of this machine; "
+            f"expected at most {cores} threads in total"
         )
     return workers, threads
 
@@ -120,9 +120,9 @@ class ProcessExecutor:
             result = future.result()
         except BrokenProcessPool:
             log = self._logs[pool]
-            printed = f"; it printed {log}" if log.exists() and log.stat().st_size else ""
+            printed = f"; its output is in {log}" if log.exists() and log.stat().st_size else ""
             raise WorkerDied(
-                f"its process was killed, as the system does when memory is full, or it crashed{printed}"
+                f"its process crashed or was killed, for example because memory was full{printed}"
             ) from None
         self._idle.append(pool)
         return result
@@ -174,7 +174,7 @@ class RayExecutor:
             self.close(True)
             if isinstance(error, ConfigError):
                 raise
-            raise ConfigError(f"launcher.options: Ray refuses them: {_one_line(error)}") from None
+            raise ConfigError(f"launcher.options: Ray refuses these options: {_one_line(error)}") from None
 
     def submit(self, task: WorkerTask) -> Any:
         future = self._call.remote(task).future()
@@ -210,7 +210,7 @@ def _connect_to_ray(ray: Any, address: str) -> None:
     try:
         ray.init(address=address, logging_level=logging.ERROR, log_to_driver=False, **options)
     except (ValueError, ConnectionError, RuntimeError, SystemExit) as error:
-        raise BackendUnavailable(f"launcher.address={address}: no Ray there ({_one_line(error)})") from None
+        raise BackendUnavailable(f"launcher.address={address}: cannot connect to Ray ({_one_line(error)})") from None
 
 
 def _check_ray_address(address: str) -> None:
@@ -222,7 +222,7 @@ def _check_ray_address(address: str) -> None:
         socket.create_connection((parts.hostname or "", parts.port or 0), _RAY_TIMEOUT).close()
     except (OSError, ValueError) as error:
         raise BackendUnavailable(
-            f"launcher.address={address}: nothing answers there ({error}); expected auto, HOST:PORT or "
+            f"launcher.address={address}: no answer from this address ({error}); expected auto, HOST:PORT or "
             f"ray://HOST:PORT of a machine where `ray start --head` runs"
         ) from None
 
@@ -236,7 +236,7 @@ def _divide_ray_cluster_among_jobs(ray: Any, settings: LauncherSettings, jobs: i
     threads = settings.threads or max(min(int(sum(machines)) // workers, most), 1)
     if threads > most:
         raise ConfigError(
-            f"launcher.threads={threads}: no machine of this Ray cluster has as many; expected at most {most}"
+            f"launcher.threads={threads}: no machine of this Ray cluster has so many cores; expected at most {most}"
         )
     return workers, threads
 
@@ -275,9 +275,9 @@ class SlurmExecutor:
         except (RuntimeError, NameError, TypeError, ValueError, AssertionError) as error:
             self.close(False)
             if not isinstance(error, RuntimeError):
-                raise ConfigError(f"launcher.options: submitit refuses them: {_one_line(error)}") from None
+                raise ConfigError(f"launcher.options: submitit refuses these options: {_one_line(error)}") from None
             raise BackendUnavailable(
-                f"launcher=slurm: {_one_line(error)}; launcher.address=local does without a cluster"
+                f"launcher=slurm: {_one_line(error)}; launcher.address=local works without a cluster"
             ) from None
 
     def submit(self, task: WorkerTask) -> Any:
@@ -296,7 +296,7 @@ class SlurmExecutor:
         except UncompletedJobError:
             self._died = True
             raise WorkerDied(
-                f"job {future.job_id} ended without a result ({future.state}); it printed {future.paths.stderr}"
+                f"job {future.job_id} ended without a result ({future.state}); its output is in {future.paths.stderr}"
             ) from None
 
     def cancel(self, future: Any) -> None:

@@ -97,7 +97,7 @@ def parse_dynamic_time(text: str) -> list[Tensor]:
         time = math.nan
     if not 0.0 <= time <= 1.0:
         raise ConfigError(
-            f"--time {text}: expected a time in 0..1, as 0.5, or FIRST:LAST or FIRST:LAST:COUNT, as 0:1:100"
+            f"--time {text}: expected a time from 0 to 1, or FIRST:LAST or FIRST:LAST:COUNT, such as 0:1:100"
         )
     return [torch.tensor(time)]
 

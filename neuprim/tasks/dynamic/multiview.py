@@ -144,7 +144,7 @@ def _time_range(records: Sequence[JsonReader], others: Sequence[Path], setting: 
 def _read_time(record: JsonReader) -> float:
     name = record.text("file_path")
     if "time" not in record.values:
-        raise record.fail("time", f"a number for {name}, as other frames have one")
+        raise record.fail("time", f"a number for {name}, because other frames have a time")
     return record.number("time", f"a finite number for {name}")
 
 

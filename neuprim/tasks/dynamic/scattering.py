@@ -35,7 +35,7 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
         DataError: the model was not trained with several lights.
     """
     if "lights" not in facts:
-        raise DataError("--environment: this model has one light baked in; expected one trained with scene.lights=4")
+        raise DataError("--environment: this model's light is fixed; expected a model trained with scene.lights=4")
     found = lights_from_environment(environment, count, facts)
     lights = [{**light, SHINES: torch.tensor(float(not i))} for i, light in enumerate(found.conditions)]
     return replace(found, conditions=tuple(lights))

@@ -63,7 +63,7 @@ def _check_relight_model(model: Mapping[str, Any]) -> None:
     for key in colour:
         if key != "form" and key not in _OF_FORM[form]:
             owners = " or ".join(name for name, own in _OF_FORM.items() if key in own)
-            expected = f"model.colour.form={owners} with it, or none"
+            expected = f"model.colour.form={owners}, or no such setting"
             raise ConfigError(f"model.colour.{key}={colour[key]}: not a setting of form={form}; expected {expected}")
     try:
         _light_colour_field(model)
@@ -82,7 +82,7 @@ def _tunable_relight_settings(model: Mapping[str, Any]) -> dict[str, tuple[Any, 
 def _build_relight_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[DensityField, ColourField]:
     if dataset.channels != 3:
         raise ConfigError(
-            f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, as light_intensity has"
+            f"{dataset.name}: {dataset.channels} colour channels; task relight expects 3, like light_intensity"
         )
     falloff = dataset_lighting(dataset).falloff == "inverse_square"
     density = CosineDensity(model["neurons"], **model["density"])

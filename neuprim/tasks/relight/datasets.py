@@ -125,8 +125,8 @@ def read_olat_split(folder: Path, split: str, options: OlatSettings) -> list[Ima
         lit.append(replace(frame, conditions={"light": light, "light_intensity": intensity}))
     if split == options.train_split and len(lit) > 1 and len({tuple(f.conditions["light"].tolist()) for f in lit}) == 1:
         warn_once(
-            f"{document.where}: pl_pos is the same in all frames, so that nothing shows the scene under another light; "
-            "scene.light_space=camera if it is a place beside the camera"
+            f"{document.where}: pl_pos is the same in all frames, so no image shows the scene under another light; "
+            "set scene.light_space=camera if pl_pos is relative to the camera"
         )
     return lit
 

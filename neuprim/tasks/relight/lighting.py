@@ -65,7 +65,7 @@ def olat_percentile_exposure(views: ImageViews, where: str) -> float:
     if not value > 0.0:
         raise DataError(
             f"{where}: {EXPOSURE_PERCENTILE} % of the training images' values are black; "
-            "expected light, or a number for scene.exposure"
+            "expected lit images, or a number for scene.exposure"
         )
     return value
 
@@ -101,8 +101,8 @@ def measure_falloff(dataset: Dataset) -> Falloff:
             error = math.sqrt(float(left.square().sum()) / (len(rows) - len(rows[0])) / spread)
     if error > FALLOFF_SPREAD:
         warn_once(
-            f"{dataset.name}: training images do not say whether light weakens with its distance; taken for "
-            "inverse_square, as of point lights; scene.falloff=none where it does not"
+            f"{dataset.name}: training images do not show whether light weakens with distance; scene.falloff="
+            "inverse_square (point lights) is assumed. Set scene.falloff=none if it does not weaken"
         )
         return "inverse_square"
     return "none" if slope > -1 else "inverse_square"

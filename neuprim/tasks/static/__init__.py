@@ -37,8 +37,8 @@ def _check_static_task_model(model: Mapping[str, Any]) -> None:
     validate_choices(model["density"], "model.density", {"form": ("cosine", "gaussian"), **DENSITY_OPTIONS})
     others = [key for key in model["density"] if key != "form"]
     if model["density"].get("form") == "gaussian" and others:
-        expected = "none with model.density.form=gaussian"
-        raise ConfigError(f"model.density.{others[0]}: of densities of the form cosine; expected {expected}")
+        expected = "no such setting with model.density.form=gaussian"
+        raise ConfigError(f"model.density.{others[0]}: belongs to model.density.form=cosine; expected {expected}")
     _check_colour_settings(model["colour"], model["sh_degree"])
 
 
@@ -53,7 +53,7 @@ def _check_colour_settings(colour: Mapping[str, Any], degree: int) -> None:
     except ValueError as error:
         raise ConfigError(f"model.colour.lobes={colour['lobes']}: {error}") from error
     if degree != ModelSettings.sh_degree:
-        raise ConfigError(f"model.sh_degree={degree}: lobes have no harmonics; expected model.colour.form=sh with it")
+        raise ConfigError(f"model.sh_degree={degree}: lobes have no spherical harmonics; expected model.colour.form=sh")
 
 
 def _tunable_static_settings(model: Mapping[str, Any]) -> dict[str, tuple[int, ...]]:

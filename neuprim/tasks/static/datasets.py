@@ -135,7 +135,7 @@ def load_colmap(settings: Mapping[str, Any], context: SceneContext) -> Dataset:
         largest, line = largest_colmap_model(folder)
         model = largest or folder / "sparse" / "0"
         if line:
-            warn_once(f"{line} (scene.model takes another)")
+            warn_once(f"{line} (scene.model=DIR chooses another)")
     reconstruction = read_colmap_model(model)
     frames = _read_colmap_frames(model, folder, reconstruction, asked)
     train, test = split_every_nth(frames, asked.test_every)
@@ -196,7 +196,7 @@ def _colmap_dataset_camera(where: str, image: Any, viewmat: Tensor, file: Path, 
     lens = image.camera
     size = f"{lens.width}x{lens.height}"
     if lens.width <= 0 or lens.height <= 0 or not np.isfinite(lens.params).all():
-        raise DataError(f"{where}: size {size}, parameters {lens.params}; expected a positive size, finite numbers")
+        raise DataError(f"{where}: size {size}, parameters {lens.params}; expected a positive size and finite numbers")
     if not is_resized_camera_size((lens.width, lens.height), (info.width, info.height)):
         expected = f"{size} ({where}) or a reduction of it{exif_hint(info)}"
         raise DataError(f"{file}: image is {info.width}x{info.height}; expected {expected}")

@@ -146,5 +146,5 @@ def test_an_identity_changes_nothing() -> None:
 
 @pytest.mark.parametrize("diagonal", [(1.0, 1, 2), (1, 1, -1), (0, 0, 0), (math.nan, 1, 1)])
 def test_only_similarities_are_taken(diagonal: tuple[float, ...]) -> None:
-    with pytest.raises(DataError, match=r"expected a .* rotation, one scale and an offset"):
+    with pytest.raises(DataError, match=r"expected a .* rotation, uniform scale and offset"):
         World(torch.diag(torch.tensor([*diagonal, 1.0], dtype=torch.float64))).validate("it")

@@ -107,9 +107,9 @@ BAD: dict[str, tuple[str, str]] = {  # what stands in a stage's text, and what s
     "focal is 0.0; expected a focal length above 0": ("= 35", "= 0"),
     "aperture is 0 x 27; expected numbers above 0": ("= 36", "= 0"),
     "focal is NaN; expected a focal length": ("= 35", "= nan"),
-    "its transform scales by 2, 1, 1; expected one scale": ("(1, 0, 0, 0)", "(2, 0, 0, 0)"),
+    "its transform scales the axes by 2, 1, 1; expected the same scale": ("(1, 0, 0, 0)", "(2, 0, 0, 0)"),
     "mirrored": ("(1, 0, 0, 0)", "(-1, 0, 0, 0)"),
-    "its transform scales by 0, 1, 1": ("(1, 0, 0, 0)", "(0, 0, 0, 0)"),
+    "its transform scales the axes by 0, 1, 1": ("(1, 0, 0, 0)", "(0, 0, 0, 0)"),
     "not a readable USD file": ("{", "["),
     "startTimeCode and endTimeCode are missing": (CAMERA, MOVING),
 }
@@ -130,9 +130,9 @@ def test_bad_stages_are_refused_in_one_line(tmp_path: Path, words: str) -> None:
 
 def test_missing_sizes_endless_ranges_and_files_of_another_kind(tmp_path: Path) -> None:
     path = tmp_path / "a b.usda"
-    refused(usd(path), r"names no size of an image .* give --size WxH", None)
+    refused(usd(path), r"states no image size .* give --size WxH", None)
     for head in RANGES:
-        refused(usd(path, MOVING, head), "expected a range of at most 100000 codes")
+        refused(usd(path, MOVING, head), "expected 1 to 100000 time codes")
     for data in (b"PXR-USDC" + bytes(range(256)) * 9, b"#usda 1.0\n("):
         path.write_bytes(data)
         refused(path, "not a readable USD file")
@@ -142,8 +142,8 @@ def test_a_reader_that_never_ends_or_dies(tmp_path: Path, monkeypatch: pytest.Mo
     path, script = usd(tmp_path / "a.usda"), tmp_path / "script.py"
     monkeypatch.setattr("neuprim.core.cameras.camera_files._USD_SECONDS", 1.0)
     for text, words in (
-        ("import time; time.sleep(60)", "not read after 1 s"),
-        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "its reader ended by SIGKILL"),
+        ("import time; time.sleep(60)", "reading took over 1 s"),
+        ("import os, signal; os.kill(os.getpid(), signal.SIGKILL)", "the USD reader was ended by SIGKILL"),
         ("print('hello')", "not a readable USD file"),
         ("raise MemoryError", "MemoryError"),
     ):

@@ -215,7 +215,7 @@ def test_a_file_by_hand_is_read_as_the_page_says(tmp_path: Path) -> None:
     found = checkpoint.load_model_checkpoint(path, TASK)[0].params["b2"]
     assert found.flatten().tolist() == np.float32([(155 * low + 100 * high) / 255, high]).tolist()
     assert checkpoint.checkpoint_config(path) == CONFIG_TEXT
-    with pytest.raises(CheckpointError, match="kind is 'model'; expected 'checkpoint'"):
+    with pytest.raises(CheckpointError, match="header states kind 'model'; expected 'checkpoint'"):
         checkpoint.read_header(path, "checkpoint")
 
 
@@ -254,13 +254,13 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
     "count in the header": (lambda: by_hand(header={"primitives": 3}), ("header says 3 primitives; expected 2",)),
     "sections": (lambda: by_hand(number=2**32 - 1), ("claims 4294967295 sections; expected at most 4096",)),
     "more rows": (lambda: by_hand(number=9), ("row 8 of the table of 9 sections",)),
-    "fewer rows": (lambda: by_hand(number=7), ("goes on after 7 sections",)),
+    "fewer rows": (lambda: by_hand(number=7), ("more rows than its 7 sections",)),
     "header not JSON": (lambda: assembled(b"{", {}), ("header is not valid JSON",)),
     "header nested": (lambda: assembled(b"[" * 200_000, {}), ("header is not valid JSON",)),
     "header a list": (lambda: assembled(b"[]", {}), ("header is a list",)),
-    "kind": (lambda: by_hand(header={"kind": "checkpoint"}), ("kind is 'checkpoint'; expected 'model'",)),
+    "kind": (lambda: by_hand(header={"kind": "checkpoint"}), ("header states kind 'checkpoint'; expected 'model'",)),
     "field": (lambda: by_hand(header={"density": {"class": "os.system", "settings": {}}}), ("unknown density field",)),
-    "twice": (lambda: by_hand(b1={"label": b"W1"}), ("section 'W1' is there twice",)),
+    "twice": (lambda: by_hand(b1={"label": b"W1"}), ("section 'W1' is stored twice",)),
     "name": (lambda: by_hand(b2={"label": b"\xff\xfe"}), ("row 6",)),
     "missing": (lambda: by_hand(b2={"label": b"b3"}), ("b3",)),
     "coding": (lambda: by_hand(sections={"b2": (6, (1,), RECORD, b"ab")}), ("section 'b2' has coding 6",)),
@@ -268,7 +268,7 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
         ("section 'b2' of rows", "'rows|'")),
     "rows without a mask": (lambda: by_hand(first={"rows|": (4, (0,), b"", b"")}),
         ("section 'rows|' of rows has shape (0,)",)),
-    "rows beyond": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x07")}), ("bits beyond those of 2 primitives",)),
+    "rows beyond": (lambda: by_hand(first={"rows|": (4, (1,), b"", b"\x07")}), ("bits set after its 2 primitives",)),
     "no rows": (lambda: by_hand(sections={"b2": sparse(1, b"a")}),
         ("section 'b2' is damaged: a column refers to mask 1; expected at most 0",)),
     "more than the mask has": (
@@ -286,26 +286,26 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
         ("of positions has shape (4,)",)),
     "positions' bits": (
         lambda: by_hand(sections={"means": (2, (3,), RECORD * 2 + struct.pack("<Bff", 9, 0.0, 1.0), bytes(6))}),
-        ("three columns of as many bits",),
+        ("three columns with the same number of bits",),
     ),
     "bits": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 21, 0, 1), bytes(6))}),
         ("column 0 has 21 bits",)),
     "ends": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 8, 1, 0), b"ab")}),
-        ("goes from 1.0 to 0.0",)),
+        ("has the range 1.0 to 0.0",)),
     "NaN": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 8, math.nan, 0), b"ab")}),
-        ("goes from nan",)),
+        ("has the range nan",)),
     "code": (lambda: by_hand(sections={"b2": (1, (1,), struct.pack("<Bff", 7, 0, 1), bytes([128, 0]))}),
-        ("7 bits that is not among 0 to 127",)),
+        ("7 bits is outside of 0 to 127",)),
     "key": (lambda: by_hand(sections={"means": (2, (3,), struct.pack("<Bff", 2, 0, 1) * 3, bytes([34, 30]))}),
-        ("leave its 6 bits",)),
+        ("position code does not fit 6 bits",)),
     "wide key": (
         lambda: by_hand(sections={"means": (2, (3,), struct.pack("<Bff", 20, 0, 1) * 3, bytes([255] * 16))}),
         ("a code of 60 bits",),
     ),
     "largest": (lambda: by_hand(sections={"quats": (3, (4,), bytes([3]), bytes([4] + [0] * 7))}),
-        ("not among 0 to 3",)),
+        ("outside of 0 to 3",)),
     "rotation code": (lambda: by_hand(sections={"quats": (3, (4,), bytes([3]), bytes([0] * 7 + [7]))}),
-        ("not among 0 to 6",)),
+        ("outside of 0 to 6",)),
     "planes": (lambda: by_hand(b2={"planes": 3, "size": 12, "part": RECORD + b"abc"}), ("section 'b2' is damaged",)),
     "too many planes": (lambda: by_hand(b2={"planes": 2**60}),
         ("planes of 1152921504606846976 bytes; expected at most 6",)),
@@ -326,7 +326,7 @@ DAMAGE: dict[str, tuple[Callable[[], bytes], tuple[str, ...]]] = {
             {"b2": (1, (1,), RECORD, zstd(bytes(60_000_000), level=1))}, count=60_000_000,
             b2={"packing": 1, "planes": 60_000_000},
         ),
-        ("expected at most 64 times its size",),
+        ("expected float32 data of at most 64 times the file size",),
     ),
 }  # fmt: skip
 """Name -> a file with right check sums, and what the message says."""
@@ -390,8 +390,8 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
 
 @pytest.mark.parametrize("shape", [(1, 1, 1, 1, 1), (2**20 + 1,), (2**10, 2**11)])
 def test_parameters_that_no_reader_would_take(tmp_path: Path, shape: tuple[int, ...]) -> None:
-    with pytest.raises(CheckpointError, match=r"parameter 'p' of shape .* cannot be stored; at most"):
+    with pytest.raises(CheckpointError, match=r"parameter 'p' of shape .* cannot be stored; expected at most"):
         write_compressed(tmp_path / "m", {}, 0, [CompressedSection("p", 1, shape)])
-    with pytest.raises(CheckpointError, match="cannot be stored; at most a name of 255 bytes"):
+    with pytest.raises(CheckpointError, match="cannot be stored; expected at most 255 bytes of name"):
         write_compressed(tmp_path / "m", {}, 0, [CompressedSection("ü" * 128, 1, (1,))])
     assert list(tmp_path.iterdir()) == []

@@ -118,7 +118,7 @@ def test_a_broken_promise_is_one_line(text: str) -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (None, "train view 0 (v0): condition 'time' is missing; found none, the task needs it"),
+        (None, "train view 0 (v0): condition 'time' is missing, which the task needs; found none"),
         (torch.zeros(1), "train view 0 (v0): condition 'time' is float32 (1,); expected float32 ()"),
         (0.5, "train view 0 (v0): condition 'time' is a float; expected float32 ()"),
         (
@@ -210,7 +210,7 @@ def test_no_moment_of_a_film_is_held_out_of_every_camera() -> None:
 
 def test_what_cannot_be_held_out_is_refused() -> None:
     dataset = tiny.two_primitives()
-    with pytest.raises(ConfigError, match=r"every 1\. of 6 training views"):
+    with pytest.raises(ConfigError, match=r"cannot hold out one in 1 of 6 training views"):
         hold_out_views(dataset, 1)
-    with pytest.raises(ConfigError, match="of 1 training views held out; expected 2"):
+    with pytest.raises(ConfigError, match="of 1 training views; expected one in 2"):
         hold_out_views(replace(dataset, train=tiny.Views(1, 0.0)), 2)

@@ -112,9 +112,9 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
 @pytest.mark.parametrize(
     ("what", "changes"),
     [
-        ("place", {"x": math.nan}),
-        ("place", {"y": 4e7}),
-        ("place", {"z": -math.inf}),
+        ("position", {"x": math.nan}),
+        ("position", {"y": 4e7}),
+        ("position", {"z": -math.inf}),
         ("colour", {"f_dc_1": math.inf}),
         ("size", {"scale_0": 1e5}),
         ("size", {"scale_2": math.nan}),
@@ -126,13 +126,13 @@ def test_plain_clouds(tmp_path: Path, form: str) -> None:
 )
 def test_rows_that_are_no_points_are_left_out_and_counted(tmp_path: Path, what: str, changes: dict[str, float]) -> None:
     path = splats(tmp_path / "g.ply", **changes)
-    with pytest.warns(match=rf"g\.ply: 1 of 3 vertices are no usable points \(1 for their {what}, as vertex 1\)"):
+    with pytest.warns(match=rf"g\.ply: 1 of 3 vertices are not usable as points \(1 with bad {what}, e.g. vertex 1\)"):
         cloud = read_points(path, 3, "srgb")
     assert cloud.means.tolist() == [[0, 0.5, -1], [2, float(np.float32(0.7)), 1]] and fresh(path).count == 2
     rows = read_ply(path).rows
     write_ply(path, rows[[1]])
     if changes != {"y": 4e7}:  # alone it is not far from anything
-        with pytest.raises(DataError, match="1 of 1 vertices are no usable points"):
+        with pytest.raises(DataError, match="1 of 1 vertices are not usable as points"):
             read_points(path, 3, "srgb")
 
 
@@ -158,7 +158,7 @@ def test_discs_are_flat_along_their_third_axis_and_balls_are_round(tmp_path: Pat
     assert found is not None and torch.allclose(found, torch.tensor(0.1))
     bare = rows[[n for n in rows.dtype.names or () if n != "rot_2"]]
     write_ply(tmp_path / "bare.ply", np.lib.recfunctions.repack_fields(bare))
-    with pytest.warns(match="has scale_0, scale_1, scale_2, but no rot_2; sizes are ignored"):
+    with pytest.warns(match="has scale_0, scale_1, scale_2, but no rot_2; sizes in the file are ignored"):
         assert read_points(tmp_path / "bare.ply", 3, "srgb").deviations is None
 
 
@@ -167,5 +167,5 @@ def test_compressed_formats_are_named_with_what_to_do(tmp_path: Path, name: str)
     path = tmp_path / name
     head = "element chunk 1\nproperty float min_x\nelement vertex 1\nproperty uint packed_position\nend_header\n"
     path.write_bytes(f"ply\nformat binary_little_endian 1.0\n{head}".encode() + bytes(8))
-    with pytest.raises(DataError, match=r"is not read; expected an uncompressed PLY. Convert it with SuperSplat"):
+    with pytest.raises(DataError, match=r"is not supported; expected an uncompressed PLY. Convert it with SuperSplat"):
         fresh(path)

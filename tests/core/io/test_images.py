@@ -125,7 +125,7 @@ def test_a_lack_of_memory_is_one_line(tmp_path: Path, monkeypatch: pytest.Monkey
         raise MemoryError
 
     monkeypatch.setattr("PIL.PngImagePlugin.PngImageFile.load", load)
-    refuse(tmp_path / "a.png", "more memory than there is")
+    refuse(tmp_path / "a.png", "more memory than available")
     with pytest.raises(DataError, match=r"a\.png.*more memory"):
         images.read_mask_image(tmp_path / "a.png")
 

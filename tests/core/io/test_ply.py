@@ -99,8 +99,8 @@ ONE = HEAD.format("ascii", 1)
         ("ply\n" + ("comment " + "x" * 100 + "\n") * 60_000, "end_header in"),
         (HEAD.format("binary_little_endian", 999_999_999_999), "bytes follow"),
         (HEAD.format("ascii", 999_999_999_999), "bytes follow"),
-        (HEAD.format("ascii", -1), "expected a count"),
-        (HEAD.format("ascii", "٣"), "expected a count"),
+        (HEAD.format("ascii", -1), "as the count of vertex; expected a number"),
+        (HEAD.format("ascii", "٣"), "as the count of vertex; expected a number"),
         (ONE + "nothing\n", "not numbers"),
         (HEAD.format("ascii", 2) + "1\n \n\n\n\n", "1 vertices"),
         (ONE + "1 2\n", "expected 1 of 1"),
@@ -112,8 +112,8 @@ ONE = HEAD.format("ascii", 1)
         (ONE.replace("float x", "list uchar int x") + "3 1 2\n", "a list of 3 numbers, in a line of 3"),
         ("ply\nformat ascii 1.0\nelement a 1\nelement a 1\n", "element a twice"),
         (ONE.replace("float x", "float x\nproperty float x"), "twice"),
-        (ONE.replace("float", "uchar") + "256\n", "outside its type"),
-        (ONE.replace("float", "uchar") + "nan\n", "outside its type"),
+        (ONE.replace("float", "uchar") + "256\n", "outside the range of its type"),
+        (ONE.replace("float", "uchar") + "nan\n", "outside the range of its type"),
     ],
 )
 def test_damage_is_named(tmp_path: Path, text: str, reason: str) -> None:

@@ -67,7 +67,10 @@ def test_every_published_form_of_the_weights_is_the_same(tmp_path: Path) -> None
     ("change", "text"),
     [
         (lambda s: {k: v for k, v in s.items() if k != "lin3.model.1.weight"}, "lin3.model.1.weight of LPIPS (alex): "),
-        (lambda s: {k: v for k, v in s.items() if k.startswith("lin")}, "convolutions none; expected those of AlexNet"),
+        (
+            lambda s: {k: v for k, v in s.items() if k.startswith("lin")},
+            "convolutions none; expected the layers of AlexNet",
+        ),
         (lambda s: s | {"features.3.bias": torch.zeros(3)}, "features.3.bias of LPIPS (alex): shape (3,)"),
         (lambda s: s | {"features.3.bias": torch.full((192,), torch.nan)}, "expected finite numbers of shape (192,)"),
         (lambda s: s | {"features.12.weight": torch.zeros(1)}, "convolutions [0, 3, 6, 8, 10, 12]"),

@@ -154,7 +154,7 @@ LIES = {
     "another type": (lambda t: t.update({"sh_rest|numbers": t["sh_rest|numbers"].double()}), "is torch.float64"),
     "a part missing": (lambda t: t.pop("W1|numbers"), "W1|numbers is missing"),
     "a part of nothing": (lambda t: t.update({"sh_all|numbers": torch.zeros(1)}), "belongs to no parameter"),
-    "there twice": (lambda t: t.update({"w2": torch.zeros(COUNT, 2)}), "w2 is there twice"),
+    "there twice": (lambda t: t.update({"w2": torch.zeros(COUNT, 2)}), "w2 is stored twice"),
     "no means": (lambda t: t.pop("means"), "means"),
 }
 

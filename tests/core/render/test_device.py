@@ -73,7 +73,7 @@ def test_without_a_gpu_everything_is_computed_on_the_cpu(monkeypatch: pytest.Mon
 
 
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
-    line = r"^renderer\.device=cuda: renderer\.backend=reference does not draw there; expected cpu or auto$"
+    line = r"^renderer\.device=cuda: renderer\.backend=reference does not draw on it; expected cpu or auto$"
     with pytest.raises(ConfigError, match=line):
         compose(words(tmp_path, tmp_path / "run", 3, "renderer.device=cuda", "renderer.backend=reference"))
 
@@ -104,9 +104,7 @@ def test_code_of_a_model_stays_where_it_is(card: Card) -> None:
     own = replace(low, density=CustomDensity(lambda prim, o, d, t0, t1: t1 - t0))
     assert render_lowered(own, camera, RenderSettings()).stats.backend == "reference"
     away = replace(low.to(CARD), density=own.density)
-    with pytest.raises(
-        BackendUnavailable, match="cannot draw code of the model's own that works on the meta; it draws"
-    ):
+    with pytest.raises(BackendUnavailable, match="cannot draw the model's own code, which runs on the meta; it draws"):
         render_lowered(away, camera, RenderSettings())
 
 
@@ -136,5 +134,5 @@ def test_rasterize_takes_tensors_of_a_gpu(card: Card) -> None:
     assert found.rgb.device == CARD and torch.equal(found.rgb.detach().cpu(), wanted.rgb)
     found.rgb.sum().backward()
     assert away["means"].grad is not None and away["means"].grad.device == CARD
-    with pytest.raises(DataError, match=r"^rasterize: W1 has device cpu; expected meta, as means has$"):
+    with pytest.raises(DataError, match=r"^rasterize: W1 has device cpu; expected meta, the device of means$"):
         neuprim.rasterize({**away, "W1": t["W1"]}, camera.viewmat[None], K, (8, 6))

@@ -91,7 +91,7 @@ def test_ray_that_does_not_answer_is_said_within_seconds(tmp_path: Path) -> None
         start = time.monotonic()
         with pytest.raises(BackendUnavailable) as error:
             launch_jobs([job("x", launching.double, 1)], LauncherSettings("ray", address=address), tmp_path / "launch")
-    assert str(error.value).startswith(f"launcher.address={address}: nothing answers there")
+    assert str(error.value).startswith(f"launcher.address={address}: no answer from this address")
     assert time.monotonic() - start < 20 and not (tmp_path / "launch").exists()
     for wrong in ("moon", "http://", "ray://x:y"):
         with pytest.raises(BackendUnavailable, match="expected auto, HOST:PORT or ray://HOST:PORT"):
@@ -145,7 +145,7 @@ def test_without_slurm_it_is_said(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     pytest.importorskip("submitit")
     monkeypatch.setenv("PATH", str(tmp_path))
     with pytest.raises(
-        BackendUnavailable, match=r"launcher=slurm: .*srun.*; launcher.address=local does without a cluster"
+        BackendUnavailable, match=r"launcher=slurm: .*srun.*; launcher.address=local works without a cluster"
     ):
         launch_jobs([job("x", launching.double, 1)], LauncherSettings("slurm"), tmp_path / "launch")
     assert not (tmp_path / "launch").exists()

@@ -182,7 +182,7 @@ def test_a_scene_without_times_is_static(folder: Path, scenes: Any, context: Any
         ("auto", "0.5", ['time is "0.5"', "finite number"]),
         ("0:1", math.nan, ["time is NaN", "finite number"]),
         ("auto", math.inf, ["time is Infinity", "finite number"]),
-        ("auto", "absent", ["time is missing", "as other frames have one"]),
+        ("auto", "absent", ["time is missing", "because other frames have a time"]),
     ],
 )
 def test_times_that_are_none(

@@ -208,7 +208,7 @@ def test_voxels_do_not_ask_for_a_light(lit: Path, tmp_path: Path, capsys: pytest
     words = ["export", str(lit), "--format", "vdb", "--time", "0.5"]
     assert main([*words, "--out", str(tmp_path / "a.vdb")]) == 0 and (tmp_path / "a.vdb").is_file()
     assert main([*words, "--light", "1,0,2", "--out", str(tmp_path / "b.vdb")]) == 2
-    assert "--light: what is written does not depend on it" in capsys.readouterr().err
+    assert "--light: the export does not depend on this condition" in capsys.readouterr().err
     assert (
         main(["export", str(lit), "--format", "gaussian-ply", "--time", "0.5", "--out", str(tmp_path / "g.ply")]) == 2
     )
@@ -255,4 +255,4 @@ def test_a_model_of_one_light_takes_no_other(files: Path, tmp_path: Path, capsys
     assert "--light" in capsys.readouterr().err
     write_exr(tmp_path / "sky.exr", torch.full((8, 16, 3), 0.5))
     assert main(["render", str(baked), "--camera", "test", "--environment", str(tmp_path / "sky.exr")]) == 2
-    assert "this model has one light baked in" in capsys.readouterr().err
+    assert "this model's light is fixed" in capsys.readouterr().err

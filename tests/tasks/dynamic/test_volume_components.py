@@ -73,7 +73,7 @@ def test_extinction_is_for_the_peak_of_the_sequence(peak: float, times: float, t
 
 def test_what_was_chosen_is_said_once_in_one_line(files: Path, tmp_path: Path) -> None:
     with pytest.warns(
-        UserWarning, match=r"scene\.optics\.extinction=896 \(look: 14\), as values of grid 'density' go to about 0\.016"
+        UserWarning, match=r"extinction=896 \(look: 14\), because values of grid 'density' go up to about 0\.016"
     ):
         dataset(files, tmp_path, look="auto", frames="0:1")
 
@@ -185,5 +185,5 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
 def test_a_density_that_nothing_taught_is_refused(files: Path, tmp_path: Path) -> None:
     out = run(composed(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"))
     assert open_run(out).model.density.components(open_run(out).model.params) == {}
-    with pytest.raises(ConfigError, match=r"flames absorb beside grid 'density'.*train\.supervision=both"):
+    with pytest.raises(ConfigError, match=r"extinction mixes flames with grid 'density'.*train\.supervision=both"):
         export_run(out, "vdb", tmp_path / "frames")

@@ -164,7 +164,7 @@ def test_more_starting_points_than_are_stored_are_distinct(
 
 def test_frames_to_train_on_without_matter_are_refused(hot: Path, tmp_path: Path) -> None:
     write_vdb(hot / "ball_1.vdb", empty_frame())
-    with pytest.raises(DataError, match=r"no frame to learn from absorbs light; .*scene\.train_every"):
+    with pytest.raises(DataError, match=r"no training frame absorbs light; .*scene\.train_every"):
         dataset(hot, tmp_path, train_every=2).initial_points(5, rng())
 
 
@@ -175,7 +175,7 @@ def test_a_gap_in_the_numbers_is_a_gap_in_time(hot: Path, tmp_path: Path) -> Non
 
 
 def test_frames_that_do_not_exist(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(DataError, match=r"scene\.frames=50:60: .* has frames 2 to 11, and none of these"):
+    with pytest.raises(DataError, match=r"scene\.frames=50:60: .* has frames 2 to 11, but not these"):
         dataset(folder, tmp_path, frames="50:60")
     assert choose_volume_frames("2:10:4", list(NUMBERS)) == [2, 10]
 
@@ -219,7 +219,11 @@ def test_a_frame_without_the_grid_that_absorbs_takes_no_other(hot: Path, tmp_pat
 @pytest.mark.parametrize(
     ("names", "settings", "message"),
     [
-        (("density",), {"look": "embergen_fire"}, r"absorbs by temperature, and the files have density \('density'\)"),
+        (
+            ("density",),
+            {"look": "embergen_fire"},
+            r"takes extinction from temperature, but the files have density \('density'\)",
+        ),
         (("density",), {"grids": {"density": "densty"}}, r"density=densty: no frame has .*; did you mean 'density'"),
         (("soup",), {}, r"no grid of density or temperature; found: soup \(readable\)"),
     ],
@@ -350,7 +354,9 @@ def test_damaged_voxels_are_refused(change: dict[str, np.ndarray], tmp_path: Pat
     np.savez(path, **good, scene_from_index=np.eye(4))
     assert len(MediumVoxels.read(path).index) == 2
     np.savez(path, **{**good, "scene_from_index": np.eye(4), **change})
-    with pytest.raises(DataError, match=r"voxels\.npz: damaged .*ascending places in it, and finite values"):
+    with pytest.raises(
+        DataError, match=r"voxels\.npz: damaged .*ascending voxel indices in the grid, and finite values"
+    ):
         MediumVoxels.read(path)
 
 

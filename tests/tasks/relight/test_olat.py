@@ -138,7 +138,7 @@ def test_intrinsics_come_as_principal_point_then_focal_lengths(
 ) -> None:
     order = {"camera_intrinsics": [CX, CY, FX, FY]}
     both(folder, lambda d: d.update(order))
-    words = ("camera_intrinsics means a focal length of 20", "camera_angle_x 14.191")
+    words = ("camera_intrinsics gives a focal length of 20", "camera_angle_x gives 14.191")
     scenes.refused(load, {"path": str(folder)}, context, *words)
     both(folder, lambda d: d.pop("camera_angle_x"))
     for _ in range(2):
@@ -267,7 +267,7 @@ def test_images_say_how_light_weakens(
             return SimpleNamespace(rgb=values[i].expand(2, 2, 3))
 
     dataset: Any = SimpleNamespace(center=torch.ones(3), train=Views(), name=f"{count} {range_of_distances}")
-    with nullcontext() if told else pytest.warns(match="do not say whether light weakens"):
+    with nullcontext() if told else pytest.warns(match="do not show whether light weakens"):
         assert measure_falloff(dataset) == falloff
 
 

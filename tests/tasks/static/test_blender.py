@@ -122,7 +122,7 @@ def set_pose(row: int, column: int, value: Any) -> Any:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (lambda d: d.pop("camera_angle_x"), "frames[0]: no focal length: expected camera_angle_x"),
+        (lambda d: d.pop("camera_angle_x"), "frames[0]: no focal length; expected camera_angle_x"),
         (lambda d: d.update(camera_angle_x="wide"), 'camera_angle_x is "wide"'),
         (lambda d: d.update(camera_angle_x=math.nan), "camera_angle_x is NaN"),
         (lambda d: d.update(camera_angle_x=True), "camera_angle_x is true"),
@@ -173,4 +173,4 @@ def test_mixed_sizes_channels_and_kinds(folder: Path, scenes: Any, context: Any)
     scenes.refused(load, {"path": folder}, context, str(bad), "3 channels", "all RGB or all RGBA")
     bad.unlink()
     write_exr(bad.with_suffix(".exr"), torch.zeros(H, W, 4))
-    scenes.refused(load, {"path": folder}, context, "r_3.exr", "mixes OpenEXR")
+    scenes.refused(load, {"path": folder}, context, "r_3.exr", "images mix OpenEXR")

@@ -103,7 +103,9 @@ def two(capture: Any, pycolmap: Any) -> Path:
 
 
 def test_the_largest_of_several_models_is_taken_and_told(two: Path, context: Any) -> None:
-    with pytest.warns(NeuprimWarning, match=r"0 with 3, 1 with 10 posed images; takes 1 \(scene.model takes another\)"):
+    with pytest.warns(
+        NeuprimWarning, match=r"0 with 3, 1 with 10 posed images; 1 is used \(scene.model=DIR chooses another\)"
+    ):
         data = load({"path": two}, context)
     assert len(data.train) + len(data.test) == 10
     with pytest.warns(NeuprimWarning, match=r"7 of 10 images have no pose in .*sparse/0, e.g. 03.png"):
@@ -119,7 +121,7 @@ def test_masks_beside_the_images_count(capture: Any, context: Any, name: str) ->
     mask[:, :20] = 0
     (path / "masks").mkdir()
     Image.fromarray(mask).save(path / name)
-    with pytest.warns(NeuprimWarning, match=r"masks of 1 of 10 images are read"):
+    with pytest.warns(NeuprimWarning, match=r"found masks for 1 of 10 images"):
         data = load({"path": path}, context)
     masks = {data.train.view(i).name: data.train.pixels(i).mask for i in range(len(data.train))}
     assert masks["01"] is None and np.array_equal(masks["03"], mask > 0)

@@ -28,7 +28,10 @@ def test_forms() -> None:
     ("words", "text"),
     [
         (["preset=paper", "model.colour.lobes=2"], "model.colour.lobes=2: expected none without model.colour.form="),
-        (["model.colour.form=lobes", "model.sh_degree=1"], "model.sh_degree=1: lobes have no harmonics; expected"),
+        (
+            ["model.colour.form=lobes", "model.sh_degree=1"],
+            "model.sh_degree=1: lobes have no spherical harmonics; expected",
+        ),
         (["model.colour.form=lobes", "model.colour.lobes=9"], "model.colour.lobes=9: 9 lobes; expected 0..8"),
         (["model.colour.form=lobes", "model.colour.lobes=1.5"], "model.colour.lobes=1.5: expected a whole number"),
         (["model.colour.form=lobe"], "model.colour.form=lobe: expected"),

@@ -68,7 +68,7 @@ def test_polygons_that_cross_themselves_are_refused_with_a_count(monkeypatch: py
     bow, uneven = [(0, 0), (1, 1), (1, 0), (0, 1)], [(0, 0), (3, 3), (3, 0), (0, 1)]
     corners = np.pad(np.array([*U, *bow, *uneven], np.float64), ((0, 0), (0, 1)))
     with pytest.raises(
-        DataError, match=r"a\.obj: 2 of 3 faces cross themselves, as face 1 of 4 corners; expected simple polygons"
+        DataError, match=r"a\.obj: 2 of 3 faces cross themselves, e.g. face 1 of 4 corners; expected simple polygons"
     ):
         triangulate_polygons(PATH, corners, np.array([8, 4, 4]))
     monkeypatch.setattr(polygons, "_MOST_TESTS", 5)

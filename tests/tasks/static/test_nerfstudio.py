@@ -180,7 +180,7 @@ def test_masks_beside_the_images_count(capture: Any, context: Any, name: str) ->
     (path / "masks").mkdir()
     for i in range(10):
         Image.fromarray(255 - mask if "dynamic" in name else mask).save(path / name.format(f"{i:02d}"))
-    with pytest.warns(NeuprimWarning, match="masks of 10 of 10 images are read"):
+    with pytest.warns(NeuprimWarning, match="found masks for 10 of 10 images"):
         data = load({"path": path}, context)
     found = data.train.pixels(0).mask
     assert found is not None and np.array_equal(found.numpy(), mask > 0)
@@ -196,7 +196,7 @@ def test_resized_images_scale_the_camera(capture: Any, scenes: Any, context: Any
         data = load({"path": path}, context)
     assert worst(scenes, data) < 0.03
     edit(path, lambda d: [d.pop(key) for key in ("w", "h")] and d.update(cx=W / 2, cy=H / 2))
-    scenes.refused(load, {"path": path}, context, "the middle of an image of 64x50", "32x25", "expected w, h")
+    scenes.refused(load, {"path": path}, context, "the centre of an image of 64x50", "32x25", "expected w, h")
 
 
 def test_turned_photographs(capture: Any, scenes: Any, context: Any) -> None:

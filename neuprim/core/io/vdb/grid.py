@@ -101,7 +101,7 @@ class VdbGrid:
         channels = array.shape[3:]
         low = np.array(lower, np.int64)
         if (low < -(2**31) + 8).any() or (low + array.shape[:3] > 2**31 - 8).any():
-            raise DataError(f"grid {name!r}: indices from {low.tolist()} on; expected at most 31 bits and a sign")
+            raise DataError(f"grid {name!r}: voxel indices start at {low.tolist()}; expected indices that fit 32 bits")
         base = low & ~7
         counts = -(-(low + array.shape[:3] - base) // 8)
         padded = np.full((*(counts * 8), *channels), background, np.float32)

@@ -191,9 +191,9 @@ class GridHeader:
         if "ptdataidx" in self.type or "ptidx" in self.type:
             return f"holds points ({self.type}), which have no density; rasterise them to a fog volume first"
         if not self.channels:
-            return f"has values of type {self.type}; {' and '.join(_CHANNELS)} (also as half floats) are read"
+            return f"has values of type {self.type}; expected {' or '.join(_CHANNELS)} (also as half floats)"
         if self.transform is None:
-            return f"has a transform of class {self.map}; known: {', '.join(_DOUBLES)}"
+            return f"has a transform of class {self.map}; expected one of {', '.join(_DOUBLES)}"
         return None
 
     def refusal(self) -> str | None:
@@ -238,7 +238,7 @@ def parse_header(cursor: VdbCursor) -> FileHeader:
         raise cursor.fail(f"OpenVDB file version {version}; expected {VERSIONS[0]} to {VERSIONS[1]}")
     major, minor, offsets = cursor.unpack("IIB", "the library version")
     if not offsets:
-        raise cursor.fail("written as a stream, without offsets of grids; expected a file (save it again with OpenVDB)")
+        raise cursor.fail("an OpenVDB stream without grid offsets; expected a file (save it again with OpenVDB)")
     cursor.skip(36, "the file's identifier")
     metadata = _parse_metadata(cursor, "file metadata")
     (count,) = cursor.unpack("I", "the number of grids")
@@ -266,8 +266,8 @@ def _parse_grid(cursor: VdbCursor, what: str) -> GridHeader:
     if parent:
         block = end  # OpenVDB leaves it 0: the tree is the parent's
     if not cursor.at <= start <= block <= end <= len(cursor.data):
-        expected = f"rising offsets from {cursor.at} to at most {len(cursor.data)}"
-        raise cursor.fail(f"{what} claims bytes {start} to {block} to {end}; expected {expected}")
+        expected = f"ascending offsets from {cursor.at} to at most {len(cursor.data)}"
+        raise cursor.fail(f"{what} has the offsets {start}, {block} and {end}; expected {expected}")
     inner = VdbCursor(cursor.path, cursor.data, start, end)
     (flags,) = inner.unpack("I", f"compression of {what}")
     if flags & ~(ZIP | MASK | BLOSC):
@@ -320,5 +320,5 @@ def _parse_vdb_transform(cursor: VdbCursor, what: str) -> tuple[str, np.ndarray 
         sound = sound and abs(np.linalg.det(matrix[:3, :3] / size)) > 1e-12 and bool((matrix[3] == (0, 0, 0, 1)).all())
     if not sound:
         found = f"the transform {np.array2string(matrix, separator=', ')}"
-        raise cursor.fail(f"{what} has {found}; expected finite numbers and voxels of some volume")
+        raise cursor.fail(f"{what} has {found}; expected an invertible affine matrix of finite numbers")
     return mapping, matrix

@@ -70,8 +70,8 @@ def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_by
     if header.parent:  # an instance: own transform and metadata, another grid's tree
         source = file.grid(header.parent)
         if source.parent or source.type != header.type:
-            found = f"shares the tree of {header.parent!r}"
-            raise cursor.fail(f"{what} {found}, which has none of its own or one of another type")
+            found = f"is an instance of grid {header.parent!r}"
+            raise cursor.fail(f"{what} {found}, which is an instance itself or has another type")
     tree = _TreeReader(cursor, source, what, max_bytes)
     arrays = (tree.background, tree.origins, tree.values, tree.masks, tree.tiles)
     return VdbGrid(header.name, header.transform, *arrays, header.kind, header.half, dict(header.metadata))
@@ -386,17 +386,17 @@ def list_vdb_files(path: Path) -> VdbSequence:
     if chosen is not None:
         odd = []
     if not found and not odd:
-        raise DataError(f"{path}: no .vdb file")
+        raise DataError(f"{path}: no .vdb files found; expected names like fire_12.vdb")
     if odd:
         raise DataError(f"{folder / odd[0]}: no frame number in the name; expected names like fire_12.vdb")
     if len(found) > 1:
         names = ", ".join(repr(name) for name in sorted(found))
-        raise DataError(f"{folder}: files of several sequences: {names}; name one of them, such as one of its files")
+        raise DataError(f"{folder}: files of several sequences: {names}; choose one by the path of one of its files")
     frames = sorted(next(iter(found.values())), key=lambda frame: frame.number)
     gaps: list[tuple[int, int]] = []
     for before, after in itertools.pairwise(frames):
         if before.number == after.number:
-            raise DataError(f"{after.path}: frame {after.number} is also {before.path.name}; expected each number once")
+            raise DataError(f"{after.path}: frame {after.number} also exists as {before.path.name}; expected only one")
         if after.number > before.number + 1:
             gaps.append((before.number + 1, after.number - 1))
     return VdbSequence(folder, tuple(frames), tuple(gaps))

@@ -42,7 +42,7 @@ def write_vdb(
     """
     path = Path(path)
     if compression not in COMPRESSIONS:
-        raise DataError(f"{path}: compression {compression!r}{nearest(compression, COMPRESSIONS)}")
+        raise DataError(f"{path}: unknown compression {compression!r}{nearest(compression, COMPRESSIONS)}")
     names = [grid.name for grid in grids]
     if len(set(names)) != len(names):
         raise DataError(f"{path}: grids named {', '.join(map(repr, names))}; expected different names")

@@ -326,7 +326,7 @@ def _describe_capture_write_errors(store: Store) -> Iterator[None]:
             raise
         why = cause.strerror or cause
         raise DataError(
-            f"cannot write the rendered images to {store.address}: {why}; frames that are there are kept"
+            f"cannot write the rendered images to {store.address}: {why}; finished frames are kept"
         ) from error
 
 
@@ -415,7 +415,7 @@ class CaptureDensity(DensityGridSource):
         elif path.is_dir():
             files = [frame for frame in list_vdb_files(path).frames if first <= frame.number <= last]
             if not files:
-                raise DataError(f"{path}: no frame from {first} to {last}, which are the scene's")
+                raise DataError(f"{path}: no frame from {first} to {last}, the range of the scene's frames")
         else:
             numbers = re.findall(r"[0-9]{1,18}", path.stem)  # the last one counts, as in a folder
             files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]

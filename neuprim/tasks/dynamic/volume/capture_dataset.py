@@ -157,8 +157,8 @@ class VolumeRecording:
         weights[[t for t in range(len(weights)) if t % self.every]] = 0.0
         if not weights.sum() > 0:
             raise DataError(
-                f"{self.name}: no frame to learn from absorbs light; "
-                "expected extinction in one (scene.frames, scene.train_every)"
+                f"{self.name}: no training frame absorbs light; "
+                "expected extinction in at least one (check scene.frames and scene.train_every)"
             )
         frames = torch.multinomial(torch.from_numpy(weights), count, replacement=True, generator=generator)
         per_frame = torch.bincount(frames, minlength=len(weights)).tolist()
@@ -360,7 +360,7 @@ class MediumVoxels:
         if len(index) != len(values) or values.shape[1] not in (4, 5) or not inside or not finite:
             raise DataError(
                 f"{path}: damaged ({len(index)} voxels of a grid of {x}x{y}x{z}; "
-                "expected ascending places in it, and finite values)"
+                "expected ascending voxel indices in the grid, and finite values)"
             )
         return MediumVoxels(index, values, (x, y, z), matrix)
 

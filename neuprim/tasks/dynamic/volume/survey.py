@@ -50,7 +50,7 @@ class GridReader:
                 return replace(self, extinction=meaning)
         listed = ", ".join(f"{meaning} ({name!r})" for meaning, name in self.names.items())
         raise DataError(
-            f"{folder}: this look absorbs by {' or '.join(wanted)}, and the files have {listed}; "
+            f"{folder}: scene.look takes extinction from {' or '.join(wanted)}, but the files have {listed}; "
             f"choose another scene.look, or name the grid: scene.grids.{wanted[0]}=NAME"
         )
 
@@ -146,7 +146,7 @@ def survey_volume_frames(
     if box is None:
         where = os.path.commonpath([f.path for f in frames])
         name = reader.names[reader.extinction]
-        raise DataError(f"{where}: no frame has an active voxel of {name!r}; expected matter in at least one")
+        raise DataError(f"{where}: no frame has an active voxel of {name!r}; expected active voxels in at least one")
     peaks = {m: _peak_vdb_value(counts) for m, counts in histograms.items()}
     return SequenceSurvey(box, extents, hottest, peaks, voxel)
 
@@ -197,7 +197,7 @@ class CaptureNormalisation:
         longest = float((high - low).max())
         if not np.isfinite(high - low).all() or longest <= 0.0 or not math.isfinite(1.0 / longest):
             raise DataError(
-                f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite one with a volume"
+                f"normalisation: box from {low.tolist()} to {high.tolist()}; expected a finite box with a volume"
             )
         x, y, z = ((low + high) / 2).tolist()
         return CaptureNormalisation((x, y, z), 1.0 / longest)

@@ -69,7 +69,7 @@ def _vdb_frame_range(frames: str) -> range | None:
     return range(int(match[1]), int(match[2]) + 1, step)
 
 
-Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _vdb_frame_range(v) is not None, "FIRST:LAST, as 0:19")]
+Span = Annotated[str, Accepts(lambda v: v.count(":") == 1 and _vdb_frame_range(v) is not None, "FIRST:LAST, e.g. 0:19")]
 Frames = Annotated[
     str,
     Accepts(lambda v: v == "all" or _vdb_frame_range(v) is not None, "all, FIRST:LAST or FIRST:LAST:STEP, as 0:100:2"),
@@ -127,8 +127,8 @@ class VdbSceneSettings:
             raise ConfigError("scene.vdb: required and not given; expected a folder of .vdb files")
         if self.span is not None and self.chunks is not None:
             raise ConfigError(
-                f"scene.chunks={self.chunks}: chunks are spans of all chosen frames; "
-                "expected no scene.span beside it, but scene.frames"
+                f"scene.chunks={self.chunks}: chunks cannot be combined with scene.span; "
+                "choose the frames with scene.frames instead"
             )
 
     @property
@@ -160,7 +160,7 @@ def choose_volume_frames(frames: str, numbers: Sequence[int], where: str = "the 
         return list(numbers)
     chosen = [n for n in numbers if n in wanted]
     if numbers and not chosen:
-        raise DataError(f"scene.frames={frames}: {where} has frames {numbers[0]} to {numbers[-1]}, and none of these")
+        raise DataError(f"scene.frames={frames}: {where} has frames {numbers[0]} to {numbers[-1]}, but not these")
     return chosen
 
 
@@ -186,7 +186,7 @@ class _PreparedVdbScene:
         if not numbers:
             begin, end = self.capture.clock
             raise DataError(
-                f"scene.span={self.settings.span}: the chosen frames are {begin} to {end}, and none of these"
+                f"scene.span={self.settings.span}: the chosen frames are {begin} to {end}, but none is in the span"
             )
         return numbers[0], numbers[-1]
 
@@ -272,9 +272,7 @@ def _prepare_vdb_scene(
     views = ([*train, *test], options.samples or auto_samples)
     if options.lights > 1 and optics.light is None:
         found = f"scene.lights={options.lights}: look {options.look} has no light"
-        raise ConfigError(
-            f"{found}; expected scene.optics.light={{direction: [x, y, z], irradiance: [r, g, b]}} with it"
-        )
+        raise ConfigError(f"{found}; add scene.optics.light={{direction: [x, y, z], irradiance: [r, g, b]}}")
     lights = (options.lights, len(test))
     capture = Capture(frames, reader, optics, *views, normalisation, bounds, *lights, measured=measured)
     source: DataSource = "simulated" if options.vdb is None else "real"
@@ -289,10 +287,10 @@ def _report_chosen_extinctions(scene: _PreparedVdbScene) -> None:
     for key, meaning in {"extinction": capture.reader.extinction, "flame_extinction": "flames"}.items():
         value, usual = getattr(capture.optics, key), getattr(preset, key)
         if value != usual:
-            peak = f"values of grid {capture.reader.names[meaning]!r} go to about {usual / value:.2g}"
-            lines.append(f"scene.optics.{key}={value:g} (look: {usual:g}), as {peak}")
+            peak = f"values of grid {capture.reader.names[meaning]!r} go up to about {usual / value:.2g}"
+            lines.append(f"scene.optics.{key}={value:g} (look: {usual:g}), because {peak}")
     if lines:
-        warn_once(f"{capture.frames[0].path.parent}: {'; '.join(lines)}. Set these to choose others")
+        warn_once(f"{capture.frames[0].path.parent}: {'; '.join(lines)}. Set these settings to use other values")
 
 
 # ---------------------------------------------------------------- chunks of time
@@ -364,10 +362,10 @@ def count_time_chunks(requested: int | str | None, frames: int, image_bytes: int
         return max(min(wanted, frames // MIN_FRAMES), 1)
     count = int(requested or 1)
     if count > 1 and 2 * count > frames:
-        reason = "a chunk has at least two of its own"
-        expected = f"at most {frames // 2}, as {reason}" if frames >= 4 else f"null: {reason}"
+        reason = "a chunk needs at least two training frames"
+        expected = f"at most {frames // 2}, because {reason}" if frames >= 4 else f"null: {reason}"
         available = "is 1 frame" if frames == 1 else f"are {frames} frames"
-        raise ConfigError(f"scene.chunks={count}: there {available} to learn from; expected {expected}")
+        raise ConfigError(f"scene.chunks={count}: there {available} for training; expected {expected}")
     return count
 
 

@@ -126,7 +126,7 @@ class _GltfReader:
                 self.skipped += 1
                 continue
             if mode not in (_TRIANGLES, _STRIP, _FAN):
-                raise ValueError(f"a primitive of mode {mode}")
+                raise ValueError(f"a primitive has the unknown mode {mode}")
             position = self.document.content["accessors"][to_gltf_index(primitive["attributes"]["POSITION"])]
             if DRACO in primitive.get("extensions", {}) and "bufferView" not in position:
                 raise self.document.unsupported(DRACO)
@@ -148,7 +148,7 @@ class _GltfReader:
             index = self.document.array(primitive["indices"], ["SCALAR"])[:, 0]
         check_mesh_limits(self.path, {"vertices": (count, MAX_VERTICES), "faces": (len(index) // 3, MAX_FACES)})
         if index.dtype.kind == "f" or (len(index) and index.max() >= count):
-            raise ValueError(f"an index of {index.max()}, with {count} vertices")
+            raise ValueError(f"an index is {index.max()}, with only {count} vertices")
         name = str(to_gltf_index(primitive["material"])) if "material" in primitive else "none"
         material = materials[name]
         normals, colour, uv, glow_uv = None, None, None, None
@@ -252,7 +252,7 @@ class _GltfReader:
         }
         lengths = {len(values) for values in columns.values()}
         if len(lengths) != 1:
-            raise ValueError(f"instances have {sorted(lengths) or 'no'} places")
+            raise ValueError(f"instance attributes have {sorted(lengths) or 'no'} values")
         count = lengths.pop()
         check_mesh_limits(self.path, {"instances": (count, MAX_PARTS)})
         places = [{name: values[k] for name, values in columns.items()} for k in range(count)]
@@ -296,7 +296,7 @@ class _GltfReader:
         source = texture.get("extensions", {}).get("EXT_texture_webp", texture).get("source")
         if source is None:
             found = ", ".join(texture.get("extensions", {})) or "no image"
-            raise DataError(f"{self.path}: a texture has {found[:60]}, which is not read; expected PNG, JPEG or WebP")
+            raise DataError(f"{self.path}: a texture has {found[:60]}; expected PNG, JPEG or WebP")
         sampler: Mapping[str, int] = {}
         if "sampler" in texture:
             sampler = self.document.content["samplers"][to_gltf_index(texture["sampler"])]
@@ -338,7 +338,7 @@ def _node_matrix(place: Mapping[str, Any], where: str) -> NDArray[np.float64]:
     lengths = {"matrix": 16, "translation": 3, "rotation": 4, "scale": 3}
     numbers = {key: [finite_gltf_number(x) for x in place[key]] for key in lengths if key in place}
     if any(len(values) != lengths[key] for key, values in numbers.items()):
-        raise ValueError(f"{where} has a transform of another length")
+        raise ValueError(f"{where} has a transform with a wrong number of values")
     if "matrix" in numbers:
         matrix = np.reshape(numbers["matrix"], (4, 4)).T
     if "translation" in numbers:

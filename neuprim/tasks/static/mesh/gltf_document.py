@@ -42,7 +42,7 @@ def refuse_damaged_gltf(path: Path, function: Callable[[], _T]) -> _T:
     try:
         return function()
     except _DAMAGE as error:
-        reason = f"nothing called {error}" if isinstance(error, KeyError) else str(error)
+        reason = f"key {error} is missing" if isinstance(error, KeyError) else str(error)
         raise DataError(f"{path}: damaged glTF ({' '.join(reason.split())[:160]}); expected glTF 2") from None
 
 
@@ -56,7 +56,7 @@ def _split_glb(data: bytes) -> tuple[bytes, bytes | None]:
     if kind != _JSON:
         raise ValueError("no JSON chunk")
     if length > len(data) or 20 + size > len(data):
-        raise ValueError(f"{len(data)} bytes are there, {max(length, 20 + size)} announced")
+        raise ValueError(f"the file has {len(data)} bytes, its header states {max(length, 20 + size)}")
     text, offset = data[20 : 20 + size], 20 + size
     while offset + 8 <= length:
         size, kind = struct.unpack_from("<2I", data, offset)
@@ -98,11 +98,11 @@ class GltfDocument:
         ignored = sorted(used - known - _COMPRESSION)
         if ignored:
             shown = ", ".join(ignored[:6]) + ", ..." * (len(ignored) > 6)
-            warn_once(f"{self.path}: uses the glTF extension{'s' * (len(ignored) > 1)} {shown[:300]}; drawn without")
+            warn_once(f"{self.path}: ignores the glTF extension{'s' * (len(ignored) > 1)} {shown[:300]} of the file")
 
     def unsupported(self, extension: str) -> DataError:
         """Return the DataError for an extension that neuprim does not support."""
-        found = f"needs the glTF extension {extension[:60]}, which is not read"
+        found = f"needs the glTF extension {extension[:60]}, which is not supported"
         return DataError(f"{self.path}: {found}; expected a plain export, not compressed")
 
     def _read_buffer(self, index: int, entry: Mapping[str, Any], binary: bytes | None) -> bytes:
@@ -115,7 +115,7 @@ class GltfDocument:
         else:
             raise ValueError(f"buffers[{index}] has no uri")
         if len(data) < entry["byteLength"]:
-            raise ValueError(f"buffers[{index}] has {len(data)} bytes, {entry['byteLength']} announced")
+            raise ValueError(f"buffers[{index}] has {len(data)} bytes, its byteLength is {entry['byteLength']}")
         return data
 
     def view(self, index: int) -> tuple[bytes, int]:
@@ -139,7 +139,7 @@ class GltfDocument:
         if length is not None and count != length:
             raise ValueError(f"{where} has {count} values, {length} vertices")
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise DataError(f"{self.path}: {where} is sparse or compressed, which is not read; expected a plain export")
+            raise DataError(f"{self.path}: {where} is sparse or compressed; expected an export with neither")
         data, stride = self.view(accessor["bufferView"])
         dtype, width = np.dtype(_COMPONENT_TYPES[accessor["componentType"]]), _WIDTHS[kind]
         start, row = to_gltf_index(accessor.get("byteOffset", 0)), dtype.itemsize * width
@@ -159,7 +159,7 @@ class GltfDocument:
 def parse_gltf_uri(uri: Any) -> str:
     """Return a data URI unchanged, or a file name with percent-encoding decoded."""
     if not isinstance(uri, str) or not uri or "\0" in uri:
-        raise ValueError("a uri is no text")
+        raise ValueError("a uri is not text")
     return uri if uri.startswith("data:") else unquote(uri)
 
 

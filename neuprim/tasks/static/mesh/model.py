@@ -84,10 +84,10 @@ def find_model_file(path: Path) -> Path:
         file = path.expanduser()
         usable, there = file.is_file(), file.exists()
     except (OSError, RuntimeError) as error:
-        raise DataError(f"{path}: {error}; expected a model's file (scene.path)") from None
+        raise DataError(f"{path}: {error}; expected a mesh file (scene.path)") from None
     if not usable:
-        found = "is no file" if there else "does not exist"
-        raise DataError(f"{file}: {found}; expected a model's file (scene.path), {_SUFFIX_LIST}")
+        found = "is not a file" if there else "does not exist"
+        raise DataError(f"{file}: {found}; expected a mesh file (scene.path), {_SUFFIX_LIST}")
     if file.suffix.lower() not in SUFFIXES:
         found = f"ends in {file.suffix!r}" if file.suffix else "has no suffix"
         hint = nearest(file.suffix, SUFFIXES) if file.suffix else ""
@@ -111,7 +111,7 @@ class MeshFolder:
         """Read the mesh file itself."""
         data = self._read_within_budget(self.file, self.file.suffix.lower())
         if not data:
-            raise DataError(f"{self.file}: file is empty; expected a model, {_SUFFIX_LIST}")
+            raise DataError(f"{self.file}: file is empty; expected a mesh, {_SUFFIX_LIST}")
         return data
 
     def read_required(self, reference: str, what: str) -> bytes:
@@ -130,7 +130,7 @@ class MeshFolder:
                 return found
             faults.append(fault)
         if not self.skip_missing:
-            raise DataError(f"{faults[0]} (scene.skip_missing=true draws without)")
+            raise DataError(f"{faults[0]} (scene.skip_missing=true draws the mesh without it)")
         self._hash.update(f"missing {references[0]}".encode(errors="replace"))
         warn_once(f"{faults[0]}; drawn without it")
         return None
@@ -143,15 +143,15 @@ class MeshFolder:
         where = f"{self.file}: {what} {shown!r}"
         name = reference.replace("\\", "/")
         if _SCHEME.match(name) or name.startswith("/"):
-            kind = "a place on the network" if "://" in name and not name.startswith("file:") else "an absolute path"
-            return None, f"{where} is {kind}, which is not read; expected a file in the model's folder"
+            kind = "a network address" if "://" in name and not name.startswith("file:") else "an absolute path"
+            return None, f"{where} is {kind}, which is refused; expected a file in the model's folder"
         try:
             target = (self._root / name).resolve()
             inside, there = target.is_relative_to(self._root), target.is_file()
         except (OSError, ValueError, RuntimeError):
-            return None, f"{where} is no name of a file; expected a file in the model's folder"
+            return None, f"{where} is not a file name; expected a file in the model's folder"
         if not inside:
-            return None, f"{where} leads out of the model's folder, and is not read; expected a file inside"
+            return None, f"{where} is outside of the model's folder; expected a file inside"
         if not there:
             return None, f"{where} not found; expected it in the model's folder"
         return self._read_within_budget(target, name), ""
@@ -171,7 +171,7 @@ class MeshFolder:
             with open(path, "rb") as file:
                 size = os.fstat(file.fileno()).st_size
                 if size > self._budget:
-                    more = "" if path == self.file else f" with what it names, up to {path.name},"
+                    more = "" if path == self.file else f" with the files that it uses, up to {path.name},"
                     found = f"the model{more} is larger than {MAX_BYTES >> 20} MiB"
                     raise DataError(f"{self.file}: {found}; expected a smaller one")
                 data = file.read(size)
@@ -186,7 +186,7 @@ def check_mesh_limits(path: Path, counts: Mapping[str, tuple[int, int]]) -> None
     """Raise DataError for the first count above its limit; ``counts`` maps a name to (count, limit)."""
     for name, (count, limit) in counts.items():
         if count > limit:
-            raise DataError(f"{path}: {count} {name}; expected at most {limit} (each use of a part counts)")
+            raise DataError(f"{path}: {count} {name}; expected at most {limit} (a part counts once for each use)")
 
 
 def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np.integer]) -> None:
@@ -196,7 +196,7 @@ def check_vertices(path: Path, positions: NDArray[np.float64], faces: NDArray[np
     low, high = int(faces.min()), int(faces.max())
     if low < 0 or high >= len(positions):
         found = f"a face uses vertex {high if low >= 0 else low}"
-        raise DataError(f"{path}: {found}, but the file has only {len(positions)}, from 0")
+        raise DataError(f"{path}: {found}, but the file has only {len(positions)} vertices, counted from 0")
     bad = np.flatnonzero(~np.isfinite(positions).all(axis=1) & np.isin(np.arange(len(positions)), faces))
     if len(bad):
         raise DataError(f"{path}: vertex {bad[0]} is at {positions[bad[0]].tolist()}; expected finite numbers")
@@ -262,7 +262,7 @@ def triangulate_polygons(
     if crossed:
         first = f"face {min(crossed)} of {sizes[min(crossed)]} corners"
         raise DataError(
-            f"{path}: {len(crossed)} of {len(sizes)} faces cross themselves, as {first}; expected simple polygons. "
+            f"{path}: {len(crossed)} of {len(sizes)} faces cross themselves, e.g. {first}; expected simple polygons. "
             "Triangulate the mesh in the program that wrote it"
         )
     owner = np.concatenate(owners)

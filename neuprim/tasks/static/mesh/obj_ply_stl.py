@@ -87,21 +87,21 @@ def _read_obj_faces(path: Path, text: str) -> tuple[list[Faces], int]:
                     for name, value in zip(_WIDTHS, (*word.split("/"), "", "")[:3], strict=True):
                         index, count = int(value or 0), len(lengths[name])
                         if (index == 0 and (value or name == "v")) or index < -count:
-                            raise ValueError(f"the index {value or 'missing'} of {count} {name}")
+                            raise ValueError(f"index {value or 'missing'}, but {name} has {count} entries")
                         indices.append(index - 1 if index > 0 else count + index if value else _NONE)
                 sizes.append(len(words) - 1)
                 owners.append(material)
         except (ValueError, OverflowError) as error:
             found = f"{' '.join(line.split())[:60]!r} ({' '.join(str(error).split())[:80]})"
-            expected = "numbers, or f v/vt/vn ... with vertices that are there"
+            expected = "numbers, or f v/vt/vn ... with existing vertices"
             raise DataError(f"{path}: line {number} is {found}; expected {expected}") from None
     v, vt, vn = (_obj_number_table(key, np.array(numbers.pop(key)), np.array(lengths.pop(key))) for key in _WIDTHS)
     used = np.array(indices, np.int64).reshape(-1, 3)
     check_vertices(path, v[:, :3], used[:, 0])
-    for column, table, what in ((1, vt, "texture coordinates"), (2, vn, "normal")):
+    for column, table, what in ((1, vt, "texture coordinates (vt)"), (2, vn, "normals (vn)")):
         if len(used) and used[:, column].max() >= len(table):
-            found = f"a face uses {what} {used[:, column].max() + 1}"
-            raise DataError(f"{path}: {found}, but the file has only {len(table)}")
+            found = f"a face uses number {used[:, column].max() + 1} of the {what}"
+            raise DataError(f"{path}: {found}, but the file has only {len(table)} of them")
     faces, polygon = triangulate_polygons(path, v[used[:, 0], :3], np.array(sizes, np.int64))
     owner = np.array(owners, np.int64)[polygon]
     colours = _obj_vertex_colours(path, v)
@@ -175,7 +175,7 @@ def _read_mtl_library(text: str, folder: MeshFolder, images: dict[str, bytes]) -
             found[name] = replace(old, opacity=value if key == "d" else 1 - value, cutoff=0.5, blend=True)
         elif key == "map_d" and _mtl_texture_file_name(words, rest)[0] != old.texture:
             what = f"map_d of material {name[:40]!r} is not read"
-            warn_once(f"{folder.file}: {what}; drawn as opaque as d and the alpha of map_Kd say")
+            warn_once(f"{folder.file}: {what}; opacity comes from d and the alpha of map_Kd")
     return {name: _finish_mtl_material(material) for name, material in found.items()}
 
 
@@ -294,7 +294,7 @@ def _read_mesh_faces_of_ply(path: Path, data: bytes) -> tuple[list[Faces], int]:
         strips = elements["tristrips"].lists if "tristrips" in elements else {}
         if strips or lists:
             found = ", ".join([*strips, *lists])[:60]
-            raise DataError(f"{path}: faces are {found}; expected a list vertex_indices of every face")
+            raise DataError(f"{path}: faces are stored as {found}; expected a list vertex_indices for every face")
         return [], count
     index = corners.values.astype(np.int64)
     xyz = vertices.columns(("x", "y", "z"))
@@ -324,7 +324,7 @@ def _ply_mesh_colours(element: PlyElement, path: Path) -> NDArray[np.float32] | 
     kind = element.rows.dtype["red"]
     most = np.iinfo(kind).max if kind.kind in "iu" else 1.0
     if "alpha" in element.names and (element.rows["alpha"] < most).any():
-        warn_once(f"{path}: colours have an alpha, which is not read; drawn opaque")
+        warn_once(f"{path}: the alpha of colours is ignored; the mesh is drawn opaque")
     return np.clip(np.nan_to_num(element.columns(_RGB) / most), 0, 1).astype(np.float32)
 
 
@@ -339,8 +339,8 @@ def read_stl(folder: MeshFolder) -> Model:
     text = len(data) != 84 + 50 * count or len(data) < 84
     if text:
         if data[:5].lower() != b"solid" or b"facet" not in data[:_HEADER]:
-            expected = f"{84 + 50 * count} bytes for them, found {len(data)}"
-            raise DataError(f"{folder.file}: {count} faces announced; expected {expected}")
+            expected = f"{84 + 50 * count} bytes, found {len(data)}"
+            raise DataError(f"{folder.file}: the header states {count} faces; expected {expected}")
         check_mesh_limits(folder.file, {"solids": (data.lower().count(b"endsolid"), MAX_PARTS)})
         count = data.lower().count(b"endfacet")
     check_mesh_limits(folder.file, {"faces": (count, MAX_FACES)})

@@ -96,7 +96,7 @@ def _texture_coordinates(
     if material.texture is None:
         return None
     if uv is None:
-        found = f"texture {material.texture[:80]!r} has no coordinates on a part of {faces} faces"
+        found = f"a part of {faces} faces has no coordinates for texture {material.texture[:80]!r}"
         warn_once(f"{model.path}: {found}; drawn without it")
         return None
     with np.errstate(all="ignore"):
@@ -201,7 +201,7 @@ def decode_texture(path: Path, name: str, data: bytes, left: int = MAX_TEXELS) -
             with Image.open(io.BytesIO(data), formats=FORMATS) as image:
                 size = image.width * image.height
                 if size > min(MAX_PIXELS, left):
-                    most = f"{MAX_PIXELS}" if size > MAX_PIXELS else f"{MAX_TEXELS} of all textures"
+                    most = f"{MAX_PIXELS}" if size > MAX_PIXELS else f"{MAX_TEXELS} in all textures together"
                     raise DataError(f"{where} has {image.width}x{image.height} pixels; at most {most} are accepted")
                 if image.mode.startswith("I"):  # 16 bits of grey, which Pillow would cut off at 255
                     grey = (np.asarray(image, np.int64) >> 8).clip(0, 255).astype(np.uint8)
@@ -254,7 +254,7 @@ class MeshSurface(Scene):
     ) -> None:
         matrix = scene_from_mesh_file(parts, upward)
         if matrix is None:
-            found = "the mesh is a point, or too large for numbers"
+            found = "the mesh is a single point or too large"
             raise DataError(f"{model.path}: {found}; expected a size from 1e-150 to 1e150")
         self.scene_from_file = matrix
         points = np.concatenate([(part.corners @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3) for part in parts])
@@ -272,7 +272,7 @@ class MeshSurface(Scene):
         faint = np.concatenate([_transparent_faces(part) for part in parts])
         if not (kept & ~faint).any():
             found = "no face has an opacity of at least 0.5"
-            raise DataError(f"{model.path}: {found}; expected a model that is not all clear (alpha, d, Tr)")
+            raise DataError(f"{model.path}: {found}; expected a mesh that is not fully transparent (alpha, d, Tr)")
         kept &= ~faint
         mesh = _separate_crowded_vertices(points, faces[kept])
         turn = matrix[:3, :3].T  # to the axes of the scene; 0 where the file has no normal

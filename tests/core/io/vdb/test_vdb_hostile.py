@@ -43,9 +43,9 @@ def with_lengths(at: int) -> list[tuple[bytes, tuple[str, ...]]]:
         (head + huge + good_grid, ("name of grid 1 of 1", "4294967295 bytes")),
         (file_head(1, kept=struct.pack("<I", 1) + text("a") + text("string") + huge), ("'a'", "4294967295 bytes")),
         (file_head(1, offsets=0) + good_grid, ("stream",)),
-        (offset((0, 0, 0)), ("rising offsets",)),
-        (offset((2**62, 2**62, 2**62)), ("rising offsets",)),
-        (offset((-1, -1, -1)), ("rising offsets",)),
+        (offset((0, 0, 0)), ("ascending offsets",)),
+        (offset((2**62, 2**62, 2**62)), ("ascending offsets",)),
+        (offset((-1, -1, -1)), ("ascending offsets",)),
         (file_head(2) + grid_bytes(at, *GOOD) + grid_bytes(at + len(good_grid), *GOOD), ("two grids", "'density'")),
         (head + grid_bytes(at, *GOOD, flags=8), ("compression bits 0x8",)),
     ]
@@ -146,4 +146,4 @@ def test_many_tiles_in_few_bytes_count_too(tmp_path: Path) -> None:
 
 def test_an_instance_of_itself(tmp_path: Path) -> None:
     path = one_grid(tmp_path / "a.vdb", b"", b"", parent="density")
-    refused(lambda: read_grid(path, "density"), "a.vdb", "shares the tree")
+    refused(lambda: read_grid(path, "density"), "a.vdb", "is an instance of grid")

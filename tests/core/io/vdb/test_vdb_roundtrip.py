@@ -140,5 +140,7 @@ def test_writer_refuses(tmp_path: Path) -> None:
     large = grid(half=True, values=np.full((1, 8, 8, 8), 7e4, np.float32))
     refused(lambda: write_vdb(path, [large]), "density", "half", "65504")
     refused(lambda: VdbGrid.from_dense("density", np.ones((2, 2))), "density", "(2, 2)")
-    refused(lambda: VdbGrid.from_dense("density", np.ones((9, 9, 9)), lower=(2**31 - 9, 0, 0)), "density", "31 bits")
+    refused(
+        lambda: VdbGrid.from_dense("density", np.ones((9, 9, 9)), lower=(2**31 - 9, 0, 0)), "density", "fit 32 bits"
+    )
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]

@@ -30,13 +30,13 @@ def test_sorted_by_number_with_gaps(tmp_path: Path) -> None:
 def test_folders_that_are_no_sequence(tmp_path: Path) -> None:
     refused(lambda: list_vdb_files(tmp_path / "gone"), "gone", "no such folder")
     refused(lambda: list_vdb_files(tmp_path / ("x" * 300)), "cannot be read", "expected a folder")
-    refused(lambda: list_vdb_files(tmp_path), "no .vdb file")
+    refused(lambda: list_vdb_files(tmp_path), "no .vdb files found")
     frame(tmp_path / "a_1.vdb", 1)
     frame(tmp_path / "b_1.vdb", 1)
-    refused(lambda: list_vdb_files(tmp_path), "'a_', 'b_'", "name one of them")
+    refused(lambda: list_vdb_files(tmp_path), "'a_', 'b_'", "choose one by the path of one of its files")
     for name in ("b_1.vdb", "b_7.vdb", "b_%04d.vdb", "b_####.vdb", "b_@.vdb", "b_*.vdb"):
         assert [frame.path.name for frame in list_vdb_files(tmp_path / name).frames] == ["b_1.vdb"]
-    refused(lambda: list_vdb_files(tmp_path / "c_#.vdb"), "c_#.vdb: no .vdb file")
+    refused(lambda: list_vdb_files(tmp_path / "c_#.vdb"), "c_#.vdb: no .vdb files found")
     (tmp_path / "notes.txt").touch()
     refused(lambda: list_vdb_files(tmp_path / "notes.txt"), "notes.txt", "is a file")
     frame(tmp_path / "b_01.vdb", 1)

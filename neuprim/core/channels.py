@@ -137,15 +137,15 @@ def find_channels(task: TaskSpec, dataset: Dataset) -> Channels:
 
 
 def read_stored_channels(where: Path, header: Mapping[str, Any], task: TaskSpec, count: int) -> Channels:
-    """Return the channels of a model from its header, without its data.
+    """Return the colour channels of a stored model, read from the header of its file.
 
     Args:
         where: the model's run directory, for messages.
         header: the JSON header of the model file.
-        count: channels of the model's colour.
+        count: number of colour channels of the model.
 
     Raises:
-        CheckpointError: the header's names are damaged or do not fit the model.
+        CheckpointError: the channel names in the header are damaged or do not fit the model.
     """
     names = header.get("channels")
     if names is None:  # no run wrote the model

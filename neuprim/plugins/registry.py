@@ -161,7 +161,7 @@ class PluginGroup(Generic[T]):
     def warn_of_hidden(self, info: PluginInfo, by: str) -> None:
         """Warn that the bare name of ``info`` means another plugin, and say how to choose ``info``."""
         what = f"{self.kind} {self.typed_name(info.name)!r} of {info.origin}"
-        warn_once(f"{what} has the same name as {by}, which is used; give {self.choice(info)} to use the former")
+        warn_once(f"two plugins have the same name: {by} is used, not {what}; to use it, write {self.choice(info)}")
 
     def _find(self, word: str) -> tuple[PluginInfo, metadata.EntryPoint]:
         entries = self._entries()

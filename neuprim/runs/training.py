@@ -138,8 +138,8 @@ def _resume_training(fitted: Fitted, events: Events) -> None:
     if placed and not torch.equal(was.scene_from_world, now.scene_from_world):
         origins = [w.world_points(torch.zeros(3, dtype=torch.float64)).tolist() for w in (was, now)]
         raise CheckpointError(
-            f"{saved}: the scene's origin is {origins[0]} of the data's files, and now {origins[1]}; expected the "
-            f"same data"
+            f"{saved}: the scene's origin was {origins[0]} in the coordinates of the data's files and is {origins[1]} "
+            f"now; continue with the data that the run was started on"
         )
     events(Note(f"resumed at step {fitted.trainer.step}"))
 

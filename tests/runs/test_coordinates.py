@@ -186,6 +186,6 @@ def test_a_scene_in_utm_trains_as_at_the_origin_and_stays_where_it_was(tmp_path:
     moved(near, far, (448250.0, 5400000.0, 210.0))
     with pytest.raises(
         CheckpointError,
-        match=r"the scene's origin is \[448250.0, 5411930.0, 210.0\] of the data's files, and now \[448250.0, 54",
+        match=r"origin was \[448250.0, 5411930.0, 210.0\] in the coordinates of the data's files and is \[448250.0, 54",
     ):
         fit([*words(far, runs[1], 80), "resume=true"])

@@ -355,7 +355,7 @@ def refuse_unsupported_camera_keys(record: JsonReader) -> None:
     """Raise DataError for a key that changes the image and that neuprim does not support."""
     for key, states in _REFUSED.items():
         if key in record.values and _is_camera_key_set(record.values[key]):
-            raise DataError(f"{record.where}: {key} means {states}")
+            raise DataError(f"{record.where}: {key} describes {states}")
     pinholes = ("perspective", "persp", "none", *(m.lower() for m in MODELS))
     for key in _KINDS:
         if record.has(key) and str(record.values[key]).lower() not in pinholes:

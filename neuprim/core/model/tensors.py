@@ -131,7 +131,7 @@ class PrimitiveTensors:
 
     @property
     def movable(self) -> bool:
-        """Whether :meth:`to` can move the group to another device: True for tensors, False for custom code."""
+        """Whether :meth:`to` can move the group to another device: False if it holds functions of a plugin."""
         return bool(self.shapes)
 
     def to(self, device: torch.device) -> Self:

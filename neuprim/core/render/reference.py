@@ -284,7 +284,10 @@ class _CentralRays(FrameRays):
 
 
 def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
-    """Return the rays of a camera; ``center``: (N, 3) float64 centres of the primitives in camera axes."""
+    """Return the rays of a camera, and which primitives may meet them.
+
+    ``center``: (N, 3) float64 centres of the primitives in camera coordinates.
+    """
     make = _CentralRays if isinstance(camera, RayCamera) else _PinholeRays
     return make(camera, geometry, center, near)  # type: ignore[arg-type]
 

@@ -58,8 +58,9 @@ def adam_rows(
     """Take one Adam step in place, unless ``refused`` is set. If a gradient is not finite, only set ``refused``.
 
     Args:
-        values, grads, firsts, seconds: (N, ...) float32, none empty; all but ``grads`` contiguous.
-        rates: (P,) float32, one rate per parameter.
+        values, grads, firsts, seconds: P tensors each, (N, ...) float32, none empty; all but ``grads`` contiguous.
+            ``firsts`` and ``seconds`` are Adam's moments.
+        rates: (P,) float32, the learning rates.
         age: (N,) int64, steps of each row before this one; grows by 1.
         refused: (1,) int32.
     """

@@ -255,7 +255,7 @@ class MeshSurface(Scene):
         matrix = scene_from_mesh_file(parts, upward)
         if matrix is None:
             found = "the mesh is a single point or too large"
-            raise DataError(f"{model.path}: {found}; expected a size from 1e-150 to 1e150")
+            raise DataError(f"{model.path}: {found}; expected a mesh of size 1e-150 to 1e150")
         self.scene_from_file = matrix
         points = np.concatenate([(part.corners @ matrix[:3, :3].T + matrix[:3, 3]).reshape(-1, 3) for part in parts])
         first, same = trimesh.grouping.unique_rows(points, digits=_DIGITS)

@@ -46,9 +46,6 @@ if TYPE_CHECKING:
 _IN_FLIGHT = 16
 """Most recorded steps that the device has not finished when the host prepares another one."""
 
-_MARGIN, _SPARE = 1.5, 256
-"""Factor and addend from the largest counts seen to the sizes of the arrays."""
-
 _NUMBERS = 64
 """At most so many numbers go to the device and back for a view, besides channels, and for the points."""
 
@@ -193,8 +190,7 @@ class StepRecorder:
         if self.capacity is not None and self.capacity.fits(counts):
             return
         self._counts = tuple(max(pair) for pair in zip(counts, self._counts, strict=True))  # type: ignore[assignment]
-        pairs, in_float64, slots, float64_pairs = (int(_MARGIN * count) + _SPARE for count in self._counts)
-        self.capacity = FrameCapacity(pairs, in_float64, slots, float64_pairs, self._refused)
+        self.capacity = FrameCapacity.around(self._counts, self._refused, zeros=False)
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:

@@ -6,6 +6,7 @@ once for the counts, unless the caller gives the sizes of the arrays (:class:`Fr
 """
 
 import functools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,6 +45,7 @@ _RADII = wp.constant(d(FLOAT64_RADII))
     [wp.constant(d(number)) for number in numbers] for numbers in (NORMS, RIM_POWERS, MIN_RIM_SHARES)
 )
 _MOST = 2**31  # indices of pairs are int32
+_MARGIN, _SPARE = 1.5, 256  # factor and addend from counts to the sizes of arrays with room
 
 
 @dataclass(frozen=True)
@@ -59,7 +61,14 @@ class FrameCapacity:
     float64_pairs: int  # pairs of the primitives that are drawn in float64
     refused: Tensor  # (1,) int32 on the device
 
-    def fits(self, counts: tuple[int, int, int, int]) -> bool:
+    @classmethod
+    def around(cls, counts: Sequence[int], refused: Tensor, zeros: bool) -> "FrameCapacity":
+        """Return sizes with room beyond ``counts``, in the order of the fields; ``zeros``: a count of 0 has no room."""
+        sizes = [0 if zeros and not count else int(_MARGIN * count) + _SPARE for count in counts]
+        pairs, in_float64, slots, float64_pairs = sizes
+        return cls(pairs, in_float64, slots, float64_pairs, refused)
+
+    def fits(self, counts: Sequence[int]) -> bool:
         """Return whether a frame with these counts, in the order of the fields, fits."""
         held = (self.pairs, self.in_float64, self.slots, self.float64_pairs)
         return all(count <= size for count, size in zip(counts, held, strict=True))

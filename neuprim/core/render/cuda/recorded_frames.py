@@ -24,7 +24,6 @@ from neuprim.core.render.cuda.binning import FrameCapacity
 from neuprim.core.render.output import RenderOutput
 from neuprim.core.settings import RenderSettings
 
-_MARGIN, _SPARE = 1.5, 256  # factor and addend from the largest counts seen to the sizes of the arrays
 _MOST_PROGRAMS = 4
 
 
@@ -101,10 +100,7 @@ class FrameRecorder:
             if self._capacity is not None and self._capacity.fits(counts):
                 return
             self._counts = tuple(max(pair) for pair in zip(counts, self._counts, strict=True))  # type: ignore[assignment]
-            pairs, in_float64, slots, float64_pairs = (
-                int(_MARGIN * count) + _SPARE if count else 0 for count in self._counts
-            )
-            self._capacity = FrameCapacity(pairs, in_float64, slots, float64_pairs, self._refused)
+            self._capacity = FrameCapacity.around(self._counts, self._refused, zeros=True)
             self._programs.clear()
 
     def _make_program(

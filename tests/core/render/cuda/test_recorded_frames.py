@@ -14,7 +14,7 @@ from neuprim.core.errors import FormError, NonFiniteError
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderOutput, RenderSettings, render
-from neuprim.core.render.cuda import recorded_frames
+from neuprim.core.render.cuda import binning, recorded_frames
 from neuprim.core.render.cuda.recorded_frames import FrameRecorder, frame_recorder
 from neuprim.tasks.dynamic.colour import TimeHarmonics
 from neuprim.tasks.static import SphericalHarmonics
@@ -88,8 +88,8 @@ def test_conditions_and_changed_parameters_are_seen(recorder: list[FrameRecorder
 def test_a_frame_that_does_not_fit_is_rendered_again(
     recorder: list[FrameRecorder], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recorded_frames, "_MARGIN", 1.0)
-    monkeypatch.setattr(recorded_frames, "_SPARE", 0)
+    monkeypatch.setattr(binning, "_MARGIN", 1.0)
+    monkeypatch.setattr(binning, "_SPARE", 0)
     model = scene()
     far, _, _ = (drawn(model, 8.0) for _ in range(3))
     assert recorder[-1].replayed == 1

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -67,14 +68,8 @@ def test_it_does_not_run_where_it_cannot_help(reason: str, tmp_path: Path, monke
     if reason == "a GPU":
         monkeypatch.setattr(kernel_compiler.device, "cuda_unavailable", lambda: None)
     if reason == "a task of others":
-        found = kernel_compiler.TASKS.find("static")
-        monkeypatch.setattr(type(kernel_compiler.TASKS), "find", lambda self, word: _of_others(found))
+        found = [replace(info, distribution="others") for info in kernel_compiler.TASKS.list_plugins()]
+        monkeypatch.setattr(type(kernel_compiler.TASKS), "list_plugins", lambda self: found)
     compiler = KernelCompiler(configured(RUNS[0], tmp_path))
     assert compiler._process is None
     compiler.wait(pytest.fail)
-
-
-def _of_others(info: Any) -> Any:
-    from dataclasses import replace
-
-    return replace(info, distribution="others")

@@ -165,7 +165,9 @@ def import_run_directory(path: Path, out: Path, name: str | None = None) -> Path
             f"{path}: cannot import .{name} files; expected a file of `neuprim compress`, or of --format ply or npz"
         ) from None
     if reader.read is None:
-        raise ConfigError(f"{path}: --format {name} is lossy and cannot be imported; ply and npz can")
+        raise ConfigError(
+            f"{path}: --format {name} is lossy, and neuprim cannot import such a file; expected ply or npz"
+        )
     with attribute_errors(find_plugin_source(EXPORTERS, name)):
         stored = reader.read(path)
     return import_model_as_run(stored, path, out)

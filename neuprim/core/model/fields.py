@@ -56,8 +56,8 @@ class ConditionSpec:
         range: lowest and highest value of every element. Values outside the range give a warning; values that are not
             finite are refused.
         parse: text of ``--NAME TEXT`` -> one tensor of ``shape`` per frame; raises
-            :class:`~neuprim.core.errors.ConfigError`. For conditions that are one number, neuprim splits lists, and
-            expands ranges that ``parse`` refuses.
+            :class:`~neuprim.core.errors.ConfigError`. If the condition is one number, neuprim splits a list and calls
+            ``parse`` for each item; it expands a range itself if ``parse`` refuses it.
         sweep: a text that animates the condition, for the commands that reports suggest; empty for none.
         in_frames: (text, count) -> text of the same animation with ``count`` frames; None if the text states a number
             of frames.

@@ -63,7 +63,7 @@ def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunR
     for name, value, most in (("RANK", rank, size), ("LOCAL_RANK", local_rank, local_size)):
         if value >= most:
             whole = "WORLD_SIZE" if name == "RANK" else "LOCAL_WORLD_SIZE"
-            raise ConfigError(f"environment: {name}={value} with {whole}={most}: expected less")
+            raise ConfigError(f"environment: {name}={value}; expected less than {whole}={most}")
     if local_size > size or local_rank > rank:
         raise ConfigError(
             f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected no more "

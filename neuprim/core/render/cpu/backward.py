@@ -255,10 +255,10 @@ def _load_tile_gradients(state, tx, ty, norms, image, C):  # type: ignore[no-unt
 
 @kernel
 def backward_tiles(start, stop, frame, colors, image, live, first_lane, depths, net, edge):  # type: ignore[no-untyped-def]
-    """Fill the gradient rows of all pairs of tiles ``start:stop``; return the number of evaluated lanes.
+    """Fill the gradient rows of all (tile, primitive) pairs of tiles ``start:stop``; return the number of lanes.
 
-    ``live``, ``first_lane``, ``depths``: :class:`~neuprim.core.render.cpu.forward.SavedForBackward`, ``depths`` of
-    these tiles. Other arguments as for :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
+    ``live``, ``first_lane`` and ``depths`` are fields of :class:`~neuprim.core.render.cpu.forward.SavedForBackward`.
+    For the other arguments see :func:`~neuprim.core.render.cpu.forward.composite_tiles`.
     """
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     live, first_lane, depths = borrow_array(live), borrow_array(first_lane), borrow_array(depths)

@@ -25,7 +25,7 @@ def row_width(neurons: int) -> int:
 
 
 def net_row_width(hidden: int, channels: int) -> int:
-    """Return the number of floats in the row of a colour network, for H padded units; at least one."""
+    """Return the number of floats, at least 1, in a row of a colour network; ``hidden``: its units after padding."""
     return max((NET_OUT + channels) * hidden, 1)
 
 

@@ -45,7 +45,7 @@ _NUMBERS = ("step", "elapsed", "views", "iterations", "train_seconds", "primitiv
 
 
 def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: Mapping[str, Any]) -> None:
-    """Write tensors and a JSON header atomically: a failed write leaves the previous file unchanged."""
+    """Write tensors, ``kind`` and a JSON header atomically: a failed write leaves the previous file unchanged."""
     text = json.dumps({"format": FORMAT, "kind": kind, **header}, allow_nan=False)
     compact = {name: value.detach().cpu().contiguous() for name, value in tensors.items()}
     try:

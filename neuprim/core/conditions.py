@@ -147,7 +147,7 @@ def read_conditions(
 
 
 def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequence[Tensor]]) -> int:
-    """Return the number of frames that conditions have in common; a single value holds in all frames.
+    """Return the number of frames that the values ``found`` have in common; a single value holds in all frames.
 
     Raises ConfigError if two conditions have different numbers of frames.
     """

@@ -227,7 +227,7 @@ def _sum_rectangle(table: Array, box: tuple[int, int, int, int]) -> Array:
 
 
 def _direction_spread(sums: Array) -> Array:
-    """Return energy times variance of direction, W - |M|^2/W, from (..., 4) sums (M, W)."""
+    """Return energy times variance of direction, W - |M|^2/W, from (..., 4) sums: the vector M, then W."""
     weight = sums[..., 3]
     return np.asarray(np.maximum(weight - (sums[..., :3] ** 2).sum(-1) / np.maximum(weight, 1e-300), 0.0))
 
@@ -235,7 +235,7 @@ def _direction_spread(sums: Array) -> Array:
 def _cut_environment_rectangle(
     table: Array, box: tuple[int, int, int, int], least: float
 ) -> list[tuple[int, int, int, int]]:
-    """Return the two parts after the best cut of a rectangle; empty if no cut lowers the spread by ``least``."""
+    """Return the two parts after the best cut of rectangle ``box``; empty if no cut lowers the spread by ``least``."""
     r0, r1, c0, c1 = box
     whole = _sum_rectangle(table, box)
     best, parts = float(_direction_spread(whole)) - least, []

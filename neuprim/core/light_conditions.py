@@ -137,7 +137,7 @@ def lights_from_environment(environment: Environment, count: int, facts: Mapping
     environment's irradiance E. With falloff inverse_square, the model renders I / (distance^2 x exposure), so I =
     exposure x E r^2. With falloff irradiance, I = exposure x E; else, I = exposure x E / pi. At an offset from the
     centre, the light differs from parallel light by about 2 offset/r. A black environment gives one black light.
-    ``facts``: entry "data" of the model's header; raises DataError if the entry is damaged.
+    ``facts`` is the entry "data" of the model's header. Raises DataError if the entry is damaged.
     """
     data = JsonReader(dict(facts), "the model's header: data")
     center, up = (data.array(name, (3,), "3 numbers") for name in ("center", "up"))

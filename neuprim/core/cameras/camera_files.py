@@ -108,7 +108,7 @@ def _read_camera_file_times(records: list[JsonReader], key: str) -> tuple[float,
 
 
 def _read_camera_frame_rate(document: JsonReader, count: int) -> float | None:
-    """Return the frames per second of a file: its ``fps``, else ``count`` / ``seconds``; None without either."""
+    """Return a file's frames per second: field ``fps``, else ``count`` / field ``seconds``; None without either."""
     for key in ("fps", "seconds"):
         if document.has(key):
             value = document.number(key, "a number above 0", 0.0)
@@ -147,7 +147,7 @@ def _read_camera_frames(document: JsonReader, size: tuple[int, int] | None) -> C
 
 
 def _read_camera_path(document: JsonReader, size: tuple[int, int] | None) -> CameraViews:
-    """Read a camera path of nerfstudio's viewer: ``fov`` is vertical and in degrees, camera axes are OpenGL's."""
+    """Read a camera path of nerfstudio's viewer, where ``fov`` is vertical, in degrees, and axes are OpenGL's."""
     if document.values.get("camera_type", "perspective") != "perspective":
         raise document.fail("camera_type", "perspective, the only supported type")
     records = _camera_records(document, "camera_path")

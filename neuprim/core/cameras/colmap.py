@@ -102,7 +102,7 @@ def colmap_viewmat(image: Any) -> Tensor:
 
 
 def largest_colmap_model(project: Path) -> tuple[Path | None, str]:
-    """Return the folder of the model with the most images in ``sparse``, or None, and a message ("" for none)."""
+    """Return the folder of the model with most images in the project's ``sparse``, or None, and a message, or ""."""
     place = project / "sparse"
     models = sorted(
         (p for p in place.glob("*") if _colmap_model_suffix(p) is not None), key=lambda p: (len(p.name), p.name)
@@ -214,7 +214,7 @@ class _ColmapRecordReader:
 def check_binary_colmap_model(folder: Path, parameter_count: Callable[[int], int]) -> None:
     """Check all ``.bin`` files of a model record by record; raise DataError for a damaged file.
 
-    ``parameter_count``: function (number of a camera model) -> number of its parameters, -1 if unknown.
+    ``parameter_count`` maps the number of a camera model to its number of parameters, -1 if unknown.
     """
     records = (lambda file: _skip_camera(file, parameter_count), _skip_image, _skip_point, _skip_rig, _skip_frame)
     for part, skip_record in zip(_PARTS, records, strict=True):

@@ -289,7 +289,7 @@ def read_lens_coefficients(frame: JsonReader, file: JsonReader) -> dict[str, flo
 def has_fisheye_lens(frame: JsonReader, file: JsonReader, others: tuple[str, ...] = ("OPENCV_FISHEYE",)) -> bool:
     """Return whether the lens is OpenCV's fisheye; raise DataError for a lens model that is neither that nor a pinhole.
 
-    ``others``: further lens models that the error message lists as valid.
+    ``others`` are further lens models that the error message lists as valid.
     """
     record = _record_with_camera_keys(("camera_model", "is_fisheye"), frame, file)
     model = record.text("camera_model") if record.has("camera_model") else "OPENCV"

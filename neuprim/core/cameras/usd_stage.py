@@ -46,7 +46,7 @@ def read_usd_camera(path: str, wanted: str, most: int) -> dict[str, Any]:
 
 
 def usd_camera_times(stage: Any, camera: Any, most: int, Usd: Any, UsdGeom: Any) -> list[Any]:
-    """Return every whole time code of the stage if the camera moves, else only its start, or the earliest time."""
+    """Return all whole time codes if the camera moves, else only the stage's start, else the earliest time."""
     prim, moves = camera.GetPrim(), any(a.ValueMightBeTimeVarying() for a in camera.GetPrim().GetAttributes())
     while not moves and prim and not prim.IsPseudoRoot():
         moves, prim = (

@@ -163,7 +163,7 @@ def _sparse_quantized_parameters(model: Primitives) -> set[str]:
 
 
 def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool) -> ColumnQuantizer:
-    """Return a quantizer that clips no position. Distant primitives raise the bits of all, unless ``exact``."""
+    """Return a quantizer that clips no position ``x``. Unless ``exact``, distant primitives raise ``bits`` for all."""
     if model.count and not exact:
         width = (x.amax(0) - x.amin(0)).double().max()
         size = model.params["log_scales"].double().amax(1).exp().median()
@@ -173,7 +173,7 @@ def _fit_position_quantizer(model: Primitives, x: Tensor, bits: int, exact: bool
 
 
 def storage_order(model: Primitives, made: Quantizers) -> Tensor:
-    """Return the (N,) int64 order of the primitives in a file: along a Z curve through the quantized positions."""
+    """Return the (N,) int64 order of primitives in a file: along a Z curve through positions quantized by ``made``."""
     places = made["means"]
     assert isinstance(places, ColumnQuantizer)
     return torch.from_numpy(

@@ -36,7 +36,7 @@ CLIPS = (0.0, 1e-4, 1e-3, 1e-2)
 
 @dataclass(frozen=True)
 class ColumnQuantizer:
-    """Uniform quantizer of C columns. ``bits``: (C,) int64; ``low``, ``high``: (C,) float32, first and last value."""
+    """Uniform quantizer of C columns, of ``bits`` (C,) int64 each, from ``low`` to ``high``, both (C,) float32."""
 
     bits: Tensor
     low: Tensor
@@ -69,7 +69,7 @@ class ColumnQuantizer:
 def fit_columns(x: Tensor, bits: Sequence[int], clips: Sequence[float] = CLIPS) -> ColumnQuantizer:
     """Fit ``low`` and ``high`` of each column to x (N, C), which must be finite and on the CPU.
 
-    ``clips``: candidate fractions of the values to clip at each end; each column takes the one with the least error.
+    ``clips`` are fractions of the values to try to clip at each end; each column takes the one of least error.
     """
     wanted = torch.tensor(list(bits), dtype=torch.int64)
     best = ColumnQuantizer(wanted, torch.zeros(len(wanted)), torch.zeros(len(wanted)))

@@ -272,7 +272,7 @@ def _plane_runs(planes: Sequence[bytes]) -> list[bytes]:
 
 
 def _zstd_frame(parts: Sequence[bytes], size: int, level: int) -> bytes:
-    """Return a zstd frame with one or more blocks per part."""
+    """Return a zstd frame with one or more blocks per part; ``size`` is the total length of the parts."""
     packer = zstandard.ZstdCompressor(level=level).compressobj(size=size)
     made = []
     for i, part in enumerate(parts):

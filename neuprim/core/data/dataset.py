@@ -351,7 +351,7 @@ def find_outliers(positions: Tensor) -> Tensor:
 
 
 def dataset_focus_point(cameras: Sequence[Camera]) -> Tensor:
-    """Return the (3,) float64 point nearest to all optical axes; a weak pull draws it to one extent ahead."""
+    """Return the (3,) float64 point nearest to all optical axes, drawn weakly to one extent ahead of the cameras."""
     positions, forward = _dataset_optical_axes(cameras)
     eye = torch.eye(3, dtype=torch.float64)
     planes = eye - forward[:, :, None] * forward[:, None, :]

@@ -340,7 +340,7 @@ class ImageViews(ViewSet):
     def preload(
         self, progress: Callable[[float], None] = lambda fraction: None, empty: bool = True
     ) -> dict[int, DataError]:
-        """Decode and cache all images; return view index -> error of bad ones. ``empty``: accept transparent images."""
+        """Decode and cache all images; return view index -> error of bad ones. ``empty`` accepts transparent ones."""
 
         def fault(index: int) -> DataError | None:
             try:

@@ -283,7 +283,7 @@ def _choose_dataset_background(where: str, background: str, alpha: bool) -> str:
 def _preload_split(
     where: str, images: ImageViews, split: str, strict: bool, empty: bool, progress: Callable[[str, float], None]
 ) -> None:
-    """Decode all images of a split and leave out damaged ones. ``empty``: accept fully transparent images."""
+    """Decode all images of a split and leave out damaged ones. ``empty`` accepts fully transparent images."""
     bad = BadImageViews(f"{where} ({split})", strict)
     faults = images.preload(lambda fraction: progress(f"reading {split} images", fraction), empty)
     for index, error in faults.items():

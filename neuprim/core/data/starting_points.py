@@ -133,9 +133,9 @@ def _carve_hull_points(
 ) -> Any:
     """Return (M,) bool: points inside ``needed`` or more images, and without matter in at most ``allowed`` of them.
 
-    ``points`` (M, 3), ``poses`` (V, 3, 4) world to camera, ``lenses`` (V, 6) fx fy cx cy width height, all float64. The
-    summed-area table (height+1, width+1) of view j begins at ``tables[offsets[j]]``. ``reach`` is half the side of the
-    cube around a point whose projection is searched for matter.
+    ``points`` are (M, 3). For V views, ``poses`` (V, 3, 4) are world to camera, and ``lenses`` (V, 6) hold fx, fy, cx,
+    cy, width and height. All are float64. The summed-area table (height+1, width+1) of view j begins at
+    ``tables[offsets[j]]``. The projection of a cube around each point, of half side ``reach``, is searched for matter.
     """
     keep = np.zeros(len(points), dtype=np.bool_)
     for i in range(len(points)):
@@ -227,7 +227,7 @@ def evenly_spaced(count: int, most: int) -> list[int]:
 def _draw_starting_pixels(
     views: ViewSet, count: int, generator: torch.Generator, matter: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Draw pixels that show matter: ray origins and directions (N, 3) float64, colours (N, C), view indices (N,)."""
+    """Draw pixels with matter; return ray origins and directions (N, 3) float64, colours (N, C), view indices (N,)."""
     drawn = torch.randint(len(views), (count,), generator=generator)
     spots = torch.rand((count, 2), generator=generator).double()
     found = []

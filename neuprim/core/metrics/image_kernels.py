@@ -24,7 +24,7 @@ _PIXELS = 1 << 15  # pixels whose errors are summed at a time
 
 @inline
 def _blur_moments_down(moments, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
-    """Blur x, y, xx, yy and xy over 11 rows of flat images from position ``at``."""
+    """Blur x, y, x^2, y^2 and xy of flat images x and y over 11 rows from position ``at``; fill ``moments``."""
     for j in range(count):
         s0, s1, s2, s3, s4 = 0.0, 0.0, 0.0, 0.0, 0.0
         for k in range(SSIM_WINDOW):
@@ -61,7 +61,7 @@ def _sum_ssim_of_moments(s, count, c1, c2):  # type: ignore[no-untyped-def]
 
 @kernel
 def _sum_ssim_of_rows(start, stop, x, y, height, channels, c1, c2):  # type: ignore[no-untyped-def]
-    """Return the sum of SSIM over window rows start:stop; x, y: flat (height x width x channels)."""
+    """Return the sum of SSIM over window rows start:stop of x and y, flat images of (height, width, channels)."""
     pitch = x.shape[0] // height
     reach = (SSIM_WINDOW - 1) * channels
     windows = pitch - reach
@@ -96,7 +96,7 @@ def mean_ssim(first: Tensor, second: Tensor, peak: float) -> float:
 
 @exact_kernel
 def _sum_squares_of_pixels(start, stop, x, y, counted, channels):  # type: ignore[no-untyped-def]
-    """Return the sum of squared differences over the counted pixels in start:stop; an empty ``counted`` means all."""
+    """Return the sum of squared differences over pixels start:stop that ``counted`` marks, all if it is empty."""
     total = 0.0
     for pixel in range(start, stop):
         if counted.size == 0 or counted[pixel]:

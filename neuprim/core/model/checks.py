@@ -65,7 +65,7 @@ def model_method_label(field: Field, name: str) -> str:
 def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
     """Return the sizes that the tensors of a :class:`Geometry` share, or raise FormError if they do not fit.
 
-    ``count``: expected number of primitives, if known.
+    ``count`` is the expected number of primitives, if known.
     """
     if not isinstance(geometry, Geometry):
         raise FormError(f"{who} has type {type(geometry).__name__}; expected Geometry")
@@ -77,12 +77,12 @@ def check_geometry(geometry: Any, who: str, count: int | None = None) -> Sizes:
 
 
 def check_lowered_density(density: Any, sizes: Sizes, field: str | None) -> None:
-    """Raise :class:`FormError` unless a lowered density fits the geometry; ``sizes``: from :func:`check_geometry`."""
+    """Raise :class:`FormError` unless a lowered density fits the ``sizes`` from :func:`check_geometry`."""
     _check_lowered_form(model_field_label("density", field), density, _DENSITIES, sizes)
 
 
 def check_lowered_colour(colour: Any, sizes: Sizes, field: str | None) -> None:
-    """Raise :class:`FormError` unless a lowered colour fits the geometry; ``sizes``: from :func:`check_geometry`."""
+    """Raise :class:`FormError` unless a lowered colour fits the ``sizes`` from :func:`check_geometry`."""
     _check_lowered_form(model_field_label("colour", field), colour, _COLOURS, sizes)
 
 
@@ -202,7 +202,7 @@ def non_finite_primitive_error(tensors: Mapping[str, Tensor], row: int) -> NonFi
 def check_primitive_colours_finite(tensors: Mapping[str, Tensor], named: Mapping[str, Tensor] | None = None) -> None:
     """Raise NonFiniteError for non-finite colours, because the kernels that check primitives do not read colours.
 
-    Synchronises with a GPU. ``named``: all tensors of the frame; the message names the first that is not finite.
+    Synchronises with a GPU. ``named`` are all tensors of the frame; the message names the first that is not finite.
     """
     total = sum(tensor.detach().sum(dtype=torch.float64) for tensor in tensors.values())
     if math.isfinite(total):  # one number, so that a GPU is waited for once

@@ -152,7 +152,7 @@ class CosineDensity(DensityField):
 
 
 def apply_density_gain(w2: Tensor, b2: Tensor, log_gain: Tensor | None) -> tuple[Tensor, Tensor]:
-    """Return ``w2`` (N, K) and ``b2`` (N, 1), each times exp(``log_gain``); ``log_gain``: (N, 1) or (N,)."""
+    """Return ``w2`` (N, K) and ``b2`` (N, 1), each times exp(``log_gain``), where ``log_gain`` is (N, 1) or (N,)."""
     if log_gain is None:
         return w2, b2
     from neuprim.core.model.rows import fused_cosine_gain  # numba, loaded when first needed
@@ -202,9 +202,10 @@ def split_cosine(
 ) -> dict[str, Tensor]:
     """Return the parameters of children of split primitives, which continue the function f of their parents.
 
-    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m. With a hard edge, c = r, and sigma does not
-    change. With a soft edge, sigma also fades inside a child. Then c = r V/2V', V = s_1 s_2 s_3, so that both children
-    together have the weight (1 - |y|^2)^p of their parent. Float64 keeps the change of f to the final rounding.
+    W1' = r W1, b1' = b1 + W1 (mu'-mu)/m, (w2, b2)' = c (w2, b2), r = m'/m: primes mark the child, mu is the centre, m
+    the longest semi-axis. With a hard edge, c = r, and sigma does not change. With a soft edge, sigma also fades inside
+    a child. Then c = r V/2V', V the product of the semi-axes, so that both children together have the weight
+    (1 - |y|^2)^p of their parent. Float64 keeps the change of f to the final rounding.
     """
     r, c = split_density_scale(old, new), split_density_scale(old, new, edge)
     shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
@@ -232,7 +233,7 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
     """Return size c (N,) and central optical depth tau (N,) of primitives that replace Gaussians; float64.
 
     c is the distance from centre to edge in standard deviations; ``alphas`` are the (N,) opacities of the Gaussians,
-    0..1. ``volume``: the Gaussians are densities in space. Then their optical depth, not their alpha, is a Gaussian in
+    0..1. With ``volume``, the Gaussians are densities in space: their optical depth, not their alpha, is a Gaussian in
     the image.
     """
     table = _gaussian_support_table(edge, volume)
@@ -246,14 +247,14 @@ def gaussian_support(edge: int, alphas: Tensor, volume: bool = False) -> tuple[T
 
 @lru_cache
 def _gaussian_support_table(edge: int, volume: bool) -> Tensor:
-    """Return (O, 2): c and log(tau / -log(1 - o)) for the tabulated opacities o, by a golden-section search of c."""
+    """Return (O, 2): for O opacities o, size c by golden-section search, and log(tau / -log(1 - o)), tau the depth."""
     r = (torch.arange(_NODES, dtype=torch.float64) + 0.5) / _NODES * _FAR
     opacity = torch.sigmoid(_LOGITS)[:, None]
     bell = (-r * r / 2).exp()
     target = -torch.expm1(torch.log1p(-opacity) * bell) if volume else opacity * bell
 
     def best(c: Tensor) -> tuple[Tensor, Tensor]:
-        """Return (O,) squared errors and log tau for (O,) c; this tau gives both footprints the same integral."""
+        """Return (O,) squared errors for sizes ``c`` (O,), and log tau, which gives both footprints equal integrals."""
         shape = (1 - (r / c[:, None]).square()).clamp_min(0) ** (edge + 0.5)
         low, high = torch.full_like(c, -12.0), torch.full_like(c, 6.0)
         for _ in range(40):

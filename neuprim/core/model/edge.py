@@ -68,7 +68,7 @@ def spherical_bessel(z: Tensor, last: int) -> list[Tensor]:
 
 
 def edge_legendre(c0: Tensor, c1: Tensor, c2: Tensor, edge: int) -> list[Tensor]:
-    """Return the coefficients a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), p = 1 or 2."""
+    """Return a_0 to a_2p of (c0 + c1 u + c2 u^2)^p = sum of a_n P_n(u), P_n Legendre polynomials, p = ``edge`` > 0."""
     if edge == 1:
         return [c0 + c2 / 3, c1, 2 * c2 / 3]
     d0, d1, d2, d3, d4 = c0 * c0, 2 * c0 * c1, c1 * c1 + 2 * c0 * c2, 2 * c1 * c2, c2 * c2
@@ -81,7 +81,8 @@ def soft_edge_chord_integral(
     """Return the (M,) mean values along chords of a cosine density with a soft edge.
 
     The mean is 1/2 integral over [-1, 1] of (c0 + c1 u + c2 u^2)^p (offset + sum_k amplitude_k cos(phase_k + z_k u)),
-    p = 1 or 2. ``quadratic``: c0, c1, c2, (M,) each; amplitude, phase, z: (M, K); offset: (M,).
+    p = ``edge``, 1 or 2. ``quadratic`` holds c0, c1 and c2 of M chords, (M,) each. ``amplitude``, ``phase`` and ``z``
+    are (M, K), for K neurons, and ``offset`` is (M,).
     """
     a = edge_legendre(*quadratic, edge)
     total = offset * a[0]

@@ -208,7 +208,7 @@ class DensityField(Field):
         return None
 
     def active_rows(self, params: Params, conditions: Conditions) -> Tensor | None:
-        """Return the ascending int64 row numbers (M,) of primitives with non-zero extinction; None: all primitives."""
+        """Return the ascending int64 row numbers (M,) of primitives with non-zero extinction, or None for all."""
         return None
 
     def move(self, params: Params, geometry: Geometry, conditions: Conditions) -> Geometry:
@@ -246,5 +246,5 @@ class ColourField(Field):
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading | None:
-        """Return additional factors on the colours of a frame, such as shadows; None: no additional factors."""
+        """Return additional factors on the colours of a frame, such as shadows, or None for no factors."""
         return None

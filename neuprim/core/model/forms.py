@@ -170,7 +170,7 @@ class Constant(PrimitiveTensors):
         return {"colors": self.rgb}  # the name that users know
 
     def shaded(self, factors: Tensor | None) -> Constant:
-        """Return the colours ``rgb`` times (N,) factors, at least 0, plus ``ambient``; None: factors of 1."""
+        """Return the colours ``rgb`` times ``factors`` (N,), at least 0, plus ``ambient``; ``factors`` None means 1."""
         rgb = self.rgb if factors is None else self.rgb * factors.to(self.rgb)[:, None]
         return Constant(rgb if self.ambient is None else rgb + self.ambient)
 
@@ -208,7 +208,7 @@ class CustomColour(PrimitiveTensors):
         return labelled_fault("radiance", function_fault(self.radiance))
 
     def shaded(self, factors: Tensor | None) -> CustomColour:
-        """Return these colours multiplied by ``factors`` (N,), at least 0; None: unchanged."""
+        """Return these colours multiplied by ``factors`` (N,), at least 0, or unchanged if ``factors`` is None."""
         if factors is None:
             return self
 
@@ -235,9 +235,10 @@ class RayNet(PrimitiveTensors):
 
         c(pixel) = max(0, base + Wout cos(Wx . x~_m + bias)),   x~_m = (x_m - mu)/m
 
-    x_m is the middle of the chord behind the near plane. The network has one hidden layer of H cosine units, H = 0 to
-    256. Inputs that are constant in a primitive (view direction, light) are already part of ``bias``, ``Wout`` and
-    ``base``. A colour of exactly 0 still passes its gradient, as with ``clamp_min``.
+    x_m is the middle of the chord behind the near plane, mu the primitive's centre and m its longest semi-axis. The
+    network has one hidden layer of H cosine units, H = 0 to 256. Inputs that are constant in a primitive (view
+    direction, light) are already part of ``bias``, ``Wout`` and ``base``. A colour of exactly 0 still passes its
+    gradient, as with ``clamp_min``.
     """
 
     per_primitive: ClassVar[bool] = True
@@ -263,7 +264,7 @@ class RayNet(PrimitiveTensors):
         return int(self.Wx.shape[1])
 
     def shaded(self, factors: Tensor | None) -> RayNet:
-        """Return these colours multiplied by ``factors`` (N,), at least 0; None: unchanged."""
+        """Return these colours multiplied by ``factors`` (N,), at least 0, or unchanged if ``factors`` is None."""
         if factors is None:
             return self
         factors = factors.to(self.base)

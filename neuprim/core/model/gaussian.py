@@ -33,8 +33,8 @@ _FAINTEST = 1e-30  # a density scaled by zero keeps a finite logarithm
 class GaussianDensity(DensityField):
     """Density field of Gaussians, sigma = kappa/m exp(-c^2 |y|^2 / 2), with one parameter, log kappa.
 
-    ``init.mode`` "opaque" (default) starts every primitive at central opacity ``init.alpha``, "paper" at 0.1, as 3D
-    Gaussian splatting does.
+    m is the longest semi-axis, and |y| = 1 on the ellipsoid. ``init.mode`` "opaque" (default) starts every primitive at
+    central opacity ``init.alpha``, "paper" at 0.1, as 3D Gaussian splatting does.
 
     Args:
         deviations: c, standard deviations from the centre to the edge of the support, 0.5 to 10; else ValueError.
@@ -71,11 +71,12 @@ class GaussianDensity(DensityField):
     def lower(self, params: Params, geometry: Geometry, conditions: Conditions) -> CustomDensity:
         """Return the line integral over a chord [t0, t1] in closed form, float64, differentiable in every argument.
 
-        With y the whitened chord middle, v = diag(1/s) R^T d, a = v.v, u = y.v/a and x = y - u v the closest approach,
+        With y the whitened chord middle, v = diag(1/s) R^T d the whitened direction d of the ray, a = v.v, u = y.v/a
+        and x = y - u v the closest approach,
 
             I = kappa/m sqrt(2/a)/c exp(-c^2 x.x / 2) B(c sqrt(a/2) u, c sqrt(a/2) (t1 - t0)/2)
 
-        where B(u, w) is :func:`bell_integral`. Only o - mu grows with the distance to the camera.
+        where B(u, w) is :func:`bell_integral`. Only ray origin minus centre grows with the camera's distance.
         """
         c = self.deviations
         whiten = geometry.rotations.double().transpose(1, 2) / geometry.scales.double()[:, :, None]
@@ -120,7 +121,7 @@ class GaussianDensity(DensityField):
         }
 
     def scale_density(self, params: Params, factor: Tensor) -> dict[str, Tensor]:
-        """Return the parameters with kappa times ``factor``, clamped to at least 1e-30; negative: ValueError."""
+        """Return the parameters with kappa times max(``factor``, 1e-30); a negative ``factor`` is a ValueError."""
         if bool((factor < 0).any()):
             raise ValueError(f"density factor {float(factor.min())}; a Gaussian's must not be negative")
         shift = factor.to(params["log_amplitude"]).clamp_min(_FAINTEST).log()

@@ -99,7 +99,7 @@ class PrimitiveChords:
     Attributes:
         prim: (M,) int64 rows of the primitives.
         direction: (M, 3) unit vectors along the rays, scene axes.
-        local: (M, 3) middles of the chords, (x - mu)/m, scene axes.
+        local: (M, 3) middles x of the chords as (x - mu)/m, mu the primitive's centre, scene axes.
         half: (M,) half lengths of the chords, in m.
         origin: (M, 3) or (3,) starts of the rays, scene units.
         near, far, middle: (M,) ends and middles of the chords, as ray distances in m.

@@ -280,7 +280,7 @@ class Primitives:
     def limit(self, largest: float, when: Tensor | None = None) -> None:
         """Scale the densities of primitives in place, so that none exceeds the extinction ``largest``, 1/scene unit.
 
-        ``when``: (1,) bool on the device; False leaves all as they are.
+        ``when`` is (1,) bool on the device; if it is False, all stay as they are.
         """
         own = self.of(self.density)
         found = self.density.largest(own, self.geometry)
@@ -296,7 +296,7 @@ class Primitives:
     ) -> ActivePrimitives:
         """Return the active primitives of a frame; differentiable. With ``dtype``, they are detached and of this dtype.
 
-        ``everything``: keep inactive primitives, too.
+        ``everything`` keeps inactive primitives, too.
         """
         rows = None if everything else self.density.active_rows(self.of(self.density), conditions)
         params = self.params

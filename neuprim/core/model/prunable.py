@@ -57,7 +57,7 @@ def primitive_unit_removal_effect(unit: PrunableUnit, params: Params, gradients:
 def zero_units(units: Mapping[str, tuple[PrunableUnit, Tensor]], params: Params) -> dict[str, Tensor]:
     """Return copies of the parameters in which some primitives' units are zero.
 
-    ``units``: name -> (unit, (N,) bool of the primitives that lose the unit).
+    ``units`` maps a name to (unit, (N,) bool of the primitives that lose the unit).
     """
     changed = {name for unit, gone in units.values() if bool(gone.any()) for name in unit.places}
     found = {name: value.detach().clone() if name in changed else value for name, value in params.items()}

@@ -38,7 +38,7 @@ def _take_primitive_rows_kernel(rows, whole, taken):  # type: ignore[no-untyped-
 
 @exact_kernel
 def _put_primitive_rows_kernel(rows, taken, whole):  # type: ignore[no-untyped-def]
-    """Scatter the rows ``taken`` into ``whole``; all other rows become zero."""
+    """Copy ``taken`` into the rows ``rows`` of ``whole``; all other rows become zero."""
     row = 0
     for n in range(rows.shape[0]):
         while row < rows[n]:
@@ -123,7 +123,7 @@ def fill_ellipsoid_rotation(q, out):  # type: ignore[no-untyped-def]
 
 @strict
 def quaternion_gradient(w, x, y, z, n, g):  # type: ignore[no-untyped-def]
-    """Return dL/dq from ``g``, the nine entries of dL/dR row by row, and ``n`` = 1/|q|.
+    """Return dL/dq, q = (w, x, y, z), from ``g``, the nine entries of dL/dR row by row, and ``n`` = 1/|q|.
 
     The result is perpendicular to q, because the rotation does not depend on |q|.
     """

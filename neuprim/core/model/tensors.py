@@ -141,7 +141,7 @@ class PrimitiveTensors:
     def fault(self, sizes: Sizes) -> str | None:
         """Return the first error in the tensors, ``"w2 has shape (5,); expected (100, 3), as means has N=100 ..."``.
 
-        Returns None if all tensors are valid. ``sizes``: known sizes, to which the sizes found are added.
+        Returns None if all tensors are valid. ``sizes`` holds known sizes; the sizes found are added to it.
         """
         return primitive_tensors_fault(
             [(name, getattr(self, name), shapes) for name, shapes in self.shapes.items()], sizes

@@ -73,7 +73,7 @@ class Backend:
     ) -> str | None:
         """Return why the backend cannot render this model, as in "cannot run here: ..."; None if it can.
 
-        ``camera`` None: any pinhole. ``device``: "cpu", "cuda" or None, the main device of the backend.
+        A ``camera`` of None is any pinhole. ``device`` is "cpu", "cuda" or None, the main device of the backend.
         """
         device = device or self.devices[0]
         if device not in self.devices:

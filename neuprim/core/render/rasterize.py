@@ -93,7 +93,7 @@ def remember_rasterizer_inputs(ctx: Any, inputs: Sequence[Tensor]) -> None:
 def rasterizer_input_gradients(ctx: Any, view: Tensor | None, gradients: Sequence[Tensor | None]) -> tuple[Any, ...]:
     """Return what ``backward`` must return: a gradient per input, in its dtype and on its device.
 
-    ``view``: (3, 4) dL/d(R | t); ``gradients``: gradients of the tensors that follow ``viewmat``.
+    ``view`` is the (3, 4) dL/d(R | t), and ``gradients`` are those of the inputs that follow ``viewmat``.
     """
     full = None
     if view is not None:

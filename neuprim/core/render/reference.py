@@ -284,9 +284,9 @@ class _CentralRays(FrameRays):
 
 
 def frame_rays(camera: AnyCamera, geometry: Geometry, center: Tensor, near: float) -> FrameRays:
-    """Return the rays of a camera, and which primitives may meet them.
+    """Return the rays of a camera, which also tell the primitives that they may meet, front to back.
 
-    ``center``: (N, 3) float64 centres of the primitives in camera coordinates.
+    The order follows from ``center``, the (N, 3) float64 centres of the primitives in camera coordinates.
     """
     make = _CentralRays if isinstance(camera, RayCamera) else _PinholeRays
     return make(camera, geometry, center, near)  # type: ignore[arg-type]

@@ -32,8 +32,9 @@ def take_adam_step(
 ):  # fmt: skip
     """Take an Adam step unless ``refused`` is set; one thread per number.
 
-    ``width``: numbers per row; ``rest1``, ``rest2``: 1 - beta, rounded once; ``log1``, ``log2``: logarithms of the
-    betas; ``age``: steps of each row before this one.
+    A row has ``width`` numbers; ``age`` counts its steps before this one. The learning rate is ``rates[parameter]``.
+    ``rest1`` and ``rest2`` are 1 - ``beta1`` and 1 - ``beta2``, rounded once; ``log1`` and ``log2`` are the logarithms
+    of the betas.
     """
     i = wp.tid()
     if refused[0] == 0:
@@ -58,10 +59,11 @@ def adam_rows(
     """Take one Adam step in place, unless ``refused`` is set. If a gradient is not finite, only set ``refused``.
 
     Args:
-        values, grads, firsts, seconds: P tensors each, (N, ...) float32, none empty; all but ``grads`` contiguous.
+        values, grads, firsts, seconds: lists of P float32 tensors (N, ...), none empty, contiguous except ``grads``.
             ``firsts`` and ``seconds`` are Adam's moments.
         rates: (P,) float32, the learning rates.
         age: (N,) int64, steps of each row before this one; grows by 1.
+        betas: decays of the first and of the second moment.
         refused: (1,) int32.
     """
     device, flag = age.device, array(refused, wp.int32)
@@ -89,7 +91,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def along_rows(
         a: wp.array3d(dtype=float), b: wp.array3d(dtype=float), window: _Window, out: wp.array3d(dtype=_vec5)
     ):
-        """Blur (x, y, xx, yy, xy) of images x and y along pixel rows, to (H, W - 10, C)."""
+        """Blur a, b, a^2, b^2 and ab of the images a and b along pixel rows, to (H, W - 10, C)."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -107,7 +109,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     def compare(
         rows: wp.array3d(dtype=_vec5), window: _Window, S: wp.array3d(dtype=float), maps: wp.array3d(dtype=wp.vec3)
     ):
-        """Compute SSIM, (H - 10, W - 10, C), and its derivatives with respect to the window means of x, x^2 and x y."""
+        """Compute SSIM of images a and b, (H - 10, W - 10, C), and its derivatives by window means of a, a^2 and ab."""
         y, x, c = wp.tid()
         total = _vec5()
         for k in range(SSIM_TAPS):
@@ -141,7 +143,7 @@ def ssim_loss_kernels() -> tuple[Any, Any, Any, Any]:
     ):  # fmt: skip
         """Write |a - b| and dloss/da, applying the adjoint of the blur along rows.
 
-        ``by_l1``: weight of L1 / (pixels x channels); ``by_ssim``: weight of SSIM / (windows x channels).
+        ``by_l1`` is the weight of L1 over (pixels x channels), ``by_ssim`` that of SSIM over (windows x channels).
         """
         y, x, c = wp.tid()
         total = wp.vec3()

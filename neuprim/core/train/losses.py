@@ -80,7 +80,7 @@ class _Photometric(torch.autograd.Function):
 
 
 def photometric(settings: Mapping[str, Any]) -> Loss:
-    """Return the loss (1 - lambda) L1 + lambda (1 - SSIM); ``settings``: ``{"ssim_weight": lambda}``."""
+    """Return the loss (1 - lambda) L1 + lambda (1 - SSIM), where lambda is ``settings["ssim_weight"]``."""
     weight = float(settings["ssim_weight"])
 
     def loss(rendered: Tensor, truth: Tensor, frame: Supervision) -> tuple[Tensor, dict[str, Tensor]]:
@@ -219,7 +219,7 @@ class MaxScreenSize:
     def apply(self, means: Tensor, log_scales: Tensor, when: Tensor | None = None) -> None:
         """Shrink primitives beyond the limit, all three axes by one factor: changes ``log_scales`` (N, 3) in place.
 
-        ``when``: (1,) bool on the device; False changes nothing.
+        ``when`` is (1,) bool on the device; if it is False, nothing changes.
         """
         with torch.no_grad():
             if device.on_numba(means):

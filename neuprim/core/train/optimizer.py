@@ -32,7 +32,7 @@ def adam_step_reference(
 ) -> None:
     """Take one Adam step (Kingma and Ba 2015) in place on an (N, ...) tensor.
 
-    ``age``: (N,) number of steps of each row, including this one.
+    ``age`` (N,) counts the steps of each row, including this one.
     """
     shape = (-1, *[1] * (value.dim() - 1))
     m.mul_(BETA1).add_(grad, alpha=1 - BETA1)
@@ -43,10 +43,10 @@ def adam_step_reference(
 
 @exact_kernel
 def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, correction, root):  # type: ignore[no-untyped-def]
-    """Take the step of :func:`adam_step_reference` on flat float32 arrays of ``width`` numbers per row.
+    """Take the step of :func:`adam_step_reference` on rows start:stop of flat float32 arrays, ``width`` numbers a row.
 
-    ``correction`` is 1 / c1 and ``root`` is sqrt(1 / c2) of each age. Neighbouring rows mostly have the same age. Runs
-    of equal age end at ``breaks``: one long loop each, which vectorises.
+    By age, ``correction`` is 1 / (1 - BETA1^age) and ``root`` is sqrt(1 / (1 - beta2^age)). Neighbouring rows mostly
+    have the same age. Runs of equal age end at ``breaks``: one long loop each, which vectorises.
     """
     b1, b2, eps = np.float32(BETA1), np.float32(beta2), np.float32(EPS)
     one_b1, one_b2 = np.float32(1 - BETA1), np.float32(1 - beta2)
@@ -68,7 +68,7 @@ def _adam_rows(start, stop, width, value, grad, m, v, rate, beta2, age, breaks, 
 
 @exact_kernel
 def _largest_gradient_bits_of_step(x):  # type: ignore[no-untyped-def]
-    """Return the largest bit pattern of |x|, x float32; not below that of infinity if an element is not finite."""
+    """Return the largest bit pattern in |x|, for float32 x; it is at least that of infinity if x is not finite."""
     bits = x.view(np.uint32)
     largest = np.uint32(0)
     for k in range(bits.shape[0]):  # a maximum of integers vectorises, a sum of floats does not
@@ -85,7 +85,7 @@ def _all_gradients_finite(gradients: list[Tensor]) -> bool:
 
 @lru_cache(maxsize=4)
 def _bias_corrections(beta2: float, ages: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the bias corrections 1 / c1 and sqrt(1 / c2) for ages 0 to ``ages`` - 1.
+    """Return 1 / (1 - BETA1^age) and sqrt(1 / (1 - beta2^age)), 0 for age 0, for ages 0 to ``ages`` - 1.
 
     Cached, because the powers take longer than the rest of a row's step.
     """

@@ -71,7 +71,7 @@ def split_population(
 class PopulationChange:
     """A new set of primitives: row i of ``params`` comes from old row ``origin[i]``.
 
-    ``fresh``: (N,) bool, rows that start with zero Adam moments.
+    ``fresh`` is (N,) bool, True for rows that start with zero Adam moments.
     """
 
     params: dict[str, Tensor]
@@ -236,10 +236,10 @@ def _split_population_into_rows(
 class GradientPopulation(Population):
     """Strategy of the authors of the method: clone, split and prune by the gradient of the density network.
 
-    Splits are exact (method: "Population"). g is |dW1| + |db1| + |dw2| + |db2|, averaged over the steps whose views
-    show the primitive. g >= grow_threshold: clone in place, both copies at half density, if max s <= clone_scale x
-    extent, else split in two (s/1.6). Prune if g < prune_threshold, max s > prune_scale x extent, or no view shows the
-    primitive.
+    Splits are exact (method: "Population"). A primitive's g is |dW1| + |db1| + |dw2| + |db2|, averaged over the steps
+    whose views show it. If g >= grow_threshold, it is cloned in place, both copies at half density, if its longest
+    semi-axis is <= clone_scale x extent, else split in two, with semi-axes / 1.6. It is removed if g < prune_threshold,
+    its longest semi-axis is > prune_scale x extent, or no view shows it.
     """
 
     def __init__(self, settings: PopulationSettings) -> None:

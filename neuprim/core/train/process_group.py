@@ -129,7 +129,7 @@ class ProcessGroup:
         return values
 
     def share_number(self, name: str, make: Callable[[], int]) -> int:
-        """Call ``make`` on rank 0 only; return its result on all ranks. ``name``: a key not used by other calls.
+        """Call ``make`` on rank 0 only; return its result on all ranks. No other call may use the key ``name``.
 
         Raises RankError.
         """

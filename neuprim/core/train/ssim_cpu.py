@@ -36,7 +36,7 @@ _C1, _C2 = f(0.01**2), f(0.03**2)
 
 @inline
 def _vertical_loss_moments(V, x, y, at, pitch, count):  # type: ignore[no-untyped-def]
-    """Blur x, y, xx, yy and xy over 11 rows of flat images from position ``at``, with sums in registers."""
+    """Blur x, y, x^2, y^2 and xy of flat images x and y over 11 rows from position ``at``, with sums in registers."""
     for j in range(count):
         s0, s1, s2, s3, s4 = f(0), f(0), f(0), f(0), f(0)
         for k in range(SSIM_TAPS):
@@ -73,7 +73,7 @@ def _blur_loss_rows(out, V, step, count):  # type: ignore[no-untyped-def]
 def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
     """Replace E[x], E[xx] and E[xy] in ``s`` by the derivatives of scale x SSIM; return the sum of SSIM.
 
-    ``s``: blocks E[x], E[y], E[xx], E[yy], E[xy].
+    In each of the blocks E[x], E[y], E[xx], E[yy] and E[xy] of ``s``, the first ``n`` numbers count.
     """
     total = f(0)
     for j in range(n):
@@ -93,7 +93,7 @@ def _ssim_loss_derivatives(s, n, scale):  # type: ignore[no-untyped-def]
 
 @exact_kernel
 def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[no-untyped-def]
-    """Set unequal[i] to the range [first, end) of differing elements of row i, [n, 0) for none; rows start:stop."""
+    """For rows i in start:stop, set unequal[i] to the range [first, end) where x and y differ; first > end if none."""
     n = x.shape[0] // height
     for i in range(start, stop):
         first, end = 0, n
@@ -108,8 +108,8 @@ def _find_unequal_columns(start, stop, x, y, height, unequal):  # type: ignore[n
 def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[no-untyped-def]
     """Return the range [first, end) that contains the unequal elements of image rows start:stop.
 
-    The range is extended by ``before`` and ``after`` within [0, most). If no elements differ, it is empty (end is
-    first).
+    The range begins ``before`` elements earlier and ends ``after`` elements later, within [0, most). If no elements
+    differ, it is empty (end is first).
     """
     first, end = most, np.int64(0)
     for i in range(start, stop):
@@ -122,7 +122,8 @@ def _widest_columns(unequal, start, stop, before, after, most):  # type: ignore[
 def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type: ignore[no-untyped-def]
     """Write window rows start:stop of the derivative maps of the mean SSIM; return the sum of SSIM over them.
 
-    x, y: flat (height x width x channels). maps: (3, windows + 20, m + 20 channels), a zero border around the windows.
+    ``x`` and ``y`` are flat images of (height, width, channels). ``maps`` holds three planes of all windows, with a
+    zero border of 10 windows on every side.
     """
     n = x.shape[0] // height
     reach = (SSIM_TAPS - 1) * channels
@@ -152,7 +153,7 @@ def _ssim_loss_maps(start, stop, x, y, height, channels, unequal, maps):  # type
 
 @inline
 def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped-def]
-    """Write the gradient of L1 and SSIM into ``gr``, from the three blurred maps; return the sum of |x - y|."""
+    """Write the gradient of L1 and SSIM into ``gr``, from the three blurred maps ``s``; return the sum of |x - y|."""
     line = f(0)
     for j in range(n):
         a, b = x[j], y[j]
@@ -165,7 +166,7 @@ def _loss_gradient(gr, x, y, s, n, l1_share, weight):  # type: ignore[no-untyped
 
 @kernel
 def _spread_loss_gradient(start, stop, x, y, height, channels, unequal, maps, weight, grad):  # type: ignore[no-untyped-def]
-    """Write image rows start:stop of d loss / d x, by the adjoint of the blur; return the sum of |x - y|."""
+    """Write rows start:stop of d loss / d x into ``grad``, by the adjoint of the blur; return the sum of |x - y|."""
     n = x.shape[0] // height
     pitch = maps.shape[2]
     reach = (SSIM_TAPS - 1) * channels

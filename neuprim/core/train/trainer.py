@@ -295,7 +295,7 @@ class Trainer:
     ) -> tuple[list[ViewResult], Contributions]:
         """Return the results of all views of the step, in order, and the sum of their contributions.
 
-        ``start``: time at the beginning of the step.
+        ``start`` is the time at the beginning of the step.
         """
         return results, each[0] if len(each) == 1 else sum_contributions(each, self.current_model.count)
 
@@ -391,7 +391,7 @@ class Trainer:
     def limit_model(self, sizes: bool, when: Tensor | None = None) -> None:
         """Limit extinction to the largest of the data, and with ``sizes`` the sizes of primitives on the screen.
 
-        ``when``: (1,) bool on the device; False changes nothing.
+        ``when`` is (1,) bool on the device; if it is False, nothing changes.
         """
         model = self.current_model
         if self.dataset.largest is not None:

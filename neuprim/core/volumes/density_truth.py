@@ -234,7 +234,7 @@ def measure_density_errors(
     The result is that of :meth:`DensityComparison.errors`.
 
     Args:
-        component: name of a source grid; compares only the extinction from this grid. None: all.
+        component: name of a source grid, to compare only the extinction from this grid; None for all of it.
     """
     place = truth.points(frame)
     if place is None:

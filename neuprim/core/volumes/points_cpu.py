@@ -27,7 +27,8 @@ class PointCells(NamedTuple):
         order: (M,) int64 indices of the given points, cell by cell.
         points: (M, 3) float64 points in that order.
         starts: (X Y Z + 1,) int64 position in ``points`` of each cell's first point.
-        low: (3,) float64 corner; step: edge of a cell; counts: (3,) int64.
+        low, counts: lowest corner of the grid, (3,) float64, and its numbers of cells X, Y, Z, (3,) int64.
+        step: edge length of a cell.
     """
 
     order: np.ndarray
@@ -54,8 +55,8 @@ def sort_points_into_cells(points: np.ndarray) -> PointCells:
 
 
 class CosinePointValues(torch.autograd.Function):
-    """Autograd function of (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive, that
-    returns (M, 1 + C) float32 extinction and weighted extinctions."""
+    """Autograd function of (means, log_scales, quats, W1, b1, w2, b2, weights), each with one row per primitive. The
+    result is (M, 1 + C) float32 at M points: extinction, and its sums weighted by the C columns of ``weights``."""
 
     @staticmethod
     def forward(
@@ -111,8 +112,8 @@ class CosinePointValues(torch.autograd.Function):
 
 @exact_kernel
 def _prepare_point_axes(start, stop, means, log_scales, quats, centers, A, m, reach):  # type: ignore[no-untyped-def]
-    """Fill ``centers`` (N, 3), A (N, 3, 3) with y = A (x - mu), longest semi-axes m (N,) and half sides of the boxes
-    around the ellipsoids, ``reach`` (N, 3). Returns whether all are finite."""
+    """For primitives start:stop, fill ``centers`` (N, 3), the matrices A (N, 3, 3) from offsets to whitened space,
+    longest semi-axes m (N,), and ``reach`` (N, 3), half sides of boxes around them. Returns whether all are finite."""
     R, s, total = np.empty((3, 3)), np.empty(3), 0.0
     for n in range(start, stop):
         fill_ellipsoid_rotation(quats[n], R)
@@ -131,8 +132,9 @@ def _prepare_point_axes(start, stop, means, log_scales, quats, centers, A, m, re
 
 @exact_kernel
 def _prepare_point_neurons(start, stop, W1, b1, w2, b2, colors, omega0, m, rate, phase, amplitude, offset, shown):  # type: ignore[no-untyped-def]
-    """Fill rate (N, K, 3), phase and amplitude (N, K), and offset (N,), so that f/m = offset + sum of amplitude
-    cos(phase + rate . (x - mu)), and colours in float64. Returns whether all are finite."""
+    """Fill rate (N, K, 3), phase and amplitude (N, K), and offset (N,), so that the network's output f at x is given by
+    f/m = offset + sum of amplitude cos(phase + rate . (x - mu)), mu the centre. Copies ``colors`` to ``shown``, in
+    float64. Returns whether all are finite."""
     total = 0.0
     for n in range(start, stop):
         for k in range(W1.shape[1]):
@@ -205,7 +207,7 @@ def _sort_density_points(points, low, step, counts, starts, order, placed):  # t
 
 @exact_kernel
 def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignore[no-untyped-def]
-    """Add up ``parts`` (P, M, W) of the sorted points, in order; fill ``merged`` (M, W) in the original point order."""
+    """Add up the P ``parts`` (P, M, W) in order, for sorted points start:stop; fill ``merged`` (M, W), unsorted."""
     for p in range(start, stop):
         for q in range(parts.shape[2]):
             total = 0.0
@@ -216,7 +218,7 @@ def _merge_density_point_sums(start, stop, parts, order, merged):  # type: ignor
 
 @inline
 def _density_point_cell_span(center, reach, low, step, count):  # type: ignore[no-untyped-def]
-    """Return the first and last cell of an axis that a box meets; if none, first is past the end or last is -1."""
+    """Return the first and last cell of an axis that a box meets; without one, first is past the end or last -1."""
     first = int(np.floor(min(max((center - reach - low) / step, 0.0), float(count))))
     return first, int(np.floor(min(max((center + reach - low) / step, -1.0), float(count - 1))))
 
@@ -241,7 +243,7 @@ def _whiten_density_point_offset(A, n, dx, dy, dz):  # type: ignore[no-untyped-d
 
 @inline
 def _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz):  # type: ignore[no-untyped-def]
-    """Return f/m at an offset from the mean."""
+    """Return f/m, the network's output over the longest semi-axis, at offset (dx, dy, dz) from primitive n's centre."""
     f = offset[n]
     for k in range(phase.shape[1]):
         f += amplitude[n, k] * np.cos(phase[n, k] + rate[n, k, 0] * dx + rate[n, k, 1] * dy + rate[n, k, 2] * dz)
@@ -250,7 +252,7 @@ def _density_at_point_offset(rate, phase, amplitude, offset, n, dx, dy, dz):  # 
 
 @kernel
 def _add_density_point_values(start, stop, cells, reach, prims, edge, chunk, sums):  # type: ignore[no-untyped-def]
-    """Add sigma and source of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
+    """Add sigma and sigma x weights of primitives start:stop to part ``start // chunk`` of ``sums`` (parts, M, 1 + C).
 
     Args:
         reach, prims: filled by :func:`_prepare_point_axes` and :func:`_prepare_point_neurons`, for all primitives.

@@ -51,7 +51,7 @@ def _is_in_box(offset: wp.vec3d, reach: wp.vec3d):
 
 @wp.func
 def _network_at(offset: wp.vec3d, n: int, rate: Vec3ds2d, phase: Doubles2d, amplitude: Doubles2d, constant: Doubles):
-    """Return f/m at an offset from the mean of primitive n."""
+    """Return f/m, the network's output over the longest semi-axis, at ``offset`` from primitive n's centre."""
     total = constant[n]
     for k in range(phase.shape[1]):
         total += amplitude[n, k] * wp.cos(phase[n, k] + wp.dot(rate[n, k], offset))
@@ -60,7 +60,7 @@ def _network_at(offset: wp.vec3d, n: int, rate: Vec3ds2d, phase: Doubles2d, ampl
 
 @wp.func
 def _fade(inner: wp.float64, edge: int):
-    """Return (1 - |y|^2)^p."""
+    """Return (1 - |y|^2)^p from ``inner`` = 1 - |y|^2 and ``edge`` = p."""
     value = d(1.0)
     if edge > 0:
         value = inner
@@ -74,7 +74,7 @@ def _add_primitives(
     points: Vec3ds, reach: Vec3ds, edge: int, means: Vec3ds, A: Mat33ds, rate: Vec3ds2d, phase: Doubles2d,
     amplitude: Doubles2d, constant: Doubles, weights: Doubles2d, values: Doubles2d,
 ):  # fmt: skip
-    """Add up sigma and sigma x weights of part ``part`` of the primitives at a point, in row part x points + point."""
+    """Thread (part, at) adds sigma and sigma x ``weights`` of its primitives to row part x M + at, for M points."""
     part, at = wp.tid()
     p = part * points.shape[0] + at
     for n in range(part, means.shape[0], _FORWARD_PARTS):
@@ -98,9 +98,9 @@ def _add_points(
     g_means: Vec3ds, g_A: Mat33ds, g_rate: Vec3ds2d, g_phase: Doubles2d, g_amplitude: Doubles2d,
     g_constant: Doubles, g_weights: Doubles2d, shares: Doubles2d,
 ):  # fmt: skip
-    """Add up gradients, given as zeros, and (sigma, sigma x error) of a primitive over part ``part`` of the points.
+    """Thread (part, n) adds up gradients, given as zeros, and (sigma, sigma x error) of primitive n over its points.
 
-    Row part x primitives + primitive. ``pulled``: gradient of the values.
+    For N primitives, the sums are in row part x N + n. ``pulled`` is the gradient of the values.
     """
     part, n = wp.tid()
     row = part * means.shape[0] + n

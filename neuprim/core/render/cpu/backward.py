@@ -76,7 +76,7 @@ def lane_optical_depths(S, n, edge):  # type: ignore[no-untyped-def]
 
 @inline
 def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
-    """Fill ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH; clamps as in the forward pass."""
+    """Fill ALPHA, 1/(1 - alpha) and d alpha/d(2 FIELD HALF FADE) from DEPTH; ``amin``, ``amax`` as in forward."""
     for k in range(n):
         norm, depth = S[L.NORM_L + k], S[L.DEPTH + k]
         raw = one_minus_exp(depth)
@@ -94,7 +94,7 @@ def lane_opacities(S, n, amin, amax):  # type: ignore[no-untyped-def]
 
 @inline
 def _uncomposite_rgb_row(state, S, base, at, sums, a, b, rank, color, net):  # type: ignore[no-untyped-def]
-    """Go back over a row of three channels: recover T, fill GRAD and (with ``net``) dL/d RAY_COLOUR, add ``sums``."""
+    """For three channels: recover T of a row of pixels, fill GRAD, with a ``net`` dL/d RAY_COLOUR; add to ``sums``."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -157,7 +157,7 @@ def _weigh_colours(state, S, base, at, cg, color, net):  # type: ignore[no-untyp
 def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-untyped-def]
     """For any number of channels, with depth: recover T of a row of pixels; fill weights ``w`` and GRAD.
 
-    ``cg``: sum_c color_c dL/drgb_c (+ z dL/dz).
+    ``cg`` is the sum over channels of colour times dL/d colour, plus z dL/dz if depth has a gradient.
     """
     a, b = f(a), f(b)
     st, lanes = state[base:], S[L.ALPHA + at :]
@@ -180,7 +180,7 @@ def _uncomposite_row(state, S, base, at, cg, w, a, b, rank):  # type: ignore[no-
 
 @inline
 def _add_row_sums(state, S, base, at, w, sums, a, b, C, net):  # type: ignore[no-untyped-def]
-    """For any number of channels: add w, w x error and colour gradients of one row to ``sums``.
+    """For any number of channels: add weights ``w``, w x error and colour gradients of one row to ``sums``.
 
     With a ``net``, also fill dL/d RAY_COLOUR.
     """

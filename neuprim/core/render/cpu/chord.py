@@ -191,8 +191,8 @@ def _reduced_chord_rates(v, w):  # type: ignore[no-untyped-def]
 
 @inline
 def _hard_reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
-    """Return sinc(2 pi v) and its derivative by v, for v = whole + r and iv = 1/v: the polynomials if ``near``, else
-    (beyond half a turn) r/v sinc(2 pi r) and (cos - sinc)/v."""
+    """Return sinc(2 pi v) and its derivative by v, for r = v - rint(v) and iv = 1/v: by polynomials if ``near`` (up to
+    half a turn), else r/v sinc(2 pi r) and (cos - sinc)/v."""
     z = r * r
     x = sinc_turns(z)
     b = x if near else x * r * iv
@@ -266,7 +266,7 @@ def _soft_reduced(p: int) -> Kernel:
 
     @inline
     def reduced(v, near, r, iv):  # type: ignore[no-untyped-def]
-        """Return (B_p, dB_p/dv) for v = whole + r and iv = 1/v; the polynomial if ``near``."""
+        """Return (B_p, dB_p/dv) for r = v - rint(v) and iv = 1/v; by polynomials if ``near``, up to half a turn."""
         z, iz = r * r, iv * f(1 / TAU)  # iz = 1/(2 pi v)
         b0, cosine = sinc_turns(z) * r * iv, cos_turns(z)
         b1 = f(3) * (b0 - cosine) * iz * iz
@@ -282,7 +282,7 @@ def _soft_reduced(p: int) -> Kernel:
 
 
 def _fast_chord_profiles(reduced: Kernel) -> tuple[Kernel, Kernel]:
-    """Return two functions of any v and w: B_p(2 pi v) and B_p(2 pi w), without and with derivatives."""
+    """Return two functions of any rates v and w; both give B_p(2 pi v) and B_p(2 pi w), the second also derivatives."""
 
     @inline
     def profiles(v, w):  # type: ignore[no-untyped-def]
@@ -329,7 +329,8 @@ def load_ray(p):  # type: ignore[no-untyped-def]
 def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
     """Return the chord of one pixel's ray, named as in the layout; ``half`` is 0 if the ray misses the primitive.
 
-    fx0, fy0: offset of the tile corner's pixel centre from the anchor; row: from :func:`load_ray`.
+    ``pixel`` is 16 y + x in the tile, (``fx0``, ``fy0``) the offset of the tile's first pixel centre from the anchor,
+    and ``row`` the result of :func:`load_ray`.
     """
     e0, e1, e2, x0, x1, x2, y0, y1, y2, a0, a1, a2, u0, u1, u2, v0, v1, v2, tu, tv, near = row
     y = np.floor(pixel * f(1 / P.TILE))
@@ -358,7 +359,7 @@ def intersect_chord(pixel, fx0, fy0, row):  # type: ignore[no-untyped-def]
 
 @inline_source
 def half_chord_slope(D, ia, depth_floor, edge):  # type: ignore[no-untyped-def]
-    """Return dh/dD of h = sqrt(D/a), with a floor on D; a soft edge needs none, as D^p outweighs D^-1/2."""
+    """Return dh/dD of h = sqrt(D ``ia``), with a floor on D; a soft edge needs none, as D^p outweighs D^-1/2."""
     return f(0.5) * ia / np.sqrt(max(D, depth_floor if len(edge) == 0 else f(1e-12)) * ia)
 
 
@@ -377,9 +378,10 @@ def chord_edge_fade(D, edge):  # type: ignore[no-untyped-def]
 def chord_backward(  # type: ignore[no-untyped-def]
     g_half, g_mid, g_tm, gD, gA, half, ex, ey, ez, px, py, pz, mid, tm, ia, h, uncut, dh, qx, qy, qz, vx, vy, vz,
 ):  # fmt: skip
-    """Return dL/d(origin m, direction e) of the ray, from dL/d(half, MID), dL/d(chord middle) = q, dL/d(half e) = v.
+    """Return dL/d(origin m, direction e) of a ray from ``g_half``, ``g_mid``, q = dL/d(chord middle), v = dL/d(half e).
 
-    g_tm, gD, gA: gradients of the closest approach, D = 1 - |p|^2 and a = e.e that bypass the chord's ends.
+    ``g_tm``, ``gD`` and ``gA`` are the gradients by closest approach tm, D = 1 - |p|^2 and a = e.e, without the parts
+    through the chord's ends.
     """
     gex, gey, gez = vx * half + mid * qx, vy * half + mid * qy, vz * half + mid * qz
     gt1 = (g_mid + g_half) * f(0.5)

@@ -72,7 +72,7 @@ def _fill_net_rows(start, stop, which, log_scales, quats, Wx, bias, Wout, out, f
 
 
 def prepare_rasterizer_colour_net(which: Array, t: dict[str, Array], wide: bool, threads: int) -> tuple[Array, Array]:
-    """Return rows of primitives ``which``, float64 if ``wide``, and which of them turn too fast for float32."""
+    """Return network rows of primitives ``which``, float64 if ``wide``, and which networks are too fast for float32."""
     H, C = t["Wx"].shape[1], t["Wout"].shape[1]
     out = np.empty((len(which), L.net_row_width(H + H % 2, C)), np.float64 if wide else np.float32)
     fast = np.empty(len(which), np.bool_)
@@ -145,7 +145,7 @@ def _ray_rgb_unit(p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _add_ray_rgb_units(S, V0, V1, n, p, o, o2, slopes):  # type: ignore[no-untyped-def]
-    """Add the outputs of two units to RAY_COLOUR, three channels; with ``slopes`` fill their cos and d cos/d turn."""
+    """For three channels: add two units' outputs to RAY_COLOUR; with ``slopes``, fill units' cos and d cos/d turn."""
     ax, ay, az, ab, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, bb, b0, b1, b2 = _ray_rgb_unit(p, o2)
     for k in range(n):
@@ -190,7 +190,7 @@ def _unit_waves_float64(D, V0, n, p, o):  # type: ignore[no-untyped-def]
 
 @inline
 def _mix_net_outputs(S, V, n, p, hidden, C):  # type: ignore[no-untyped-def]
-    """Add the outputs of all units to RAY_COLOUR, any channels, from their cos in ``V``."""
+    """For any number of channels: add the outputs of all units, from their cos in ``V``, to RAY_COLOUR."""
     for c in range(C):
         colour = S[L.RAY_COLOUR + c * L.LANES :]
         for j in range(hidden):
@@ -223,7 +223,7 @@ def ray_colours(S, D, V, n, i, net, slots, base, slopes):  # type: ignore[no-unt
 
 @inline
 def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped-def]
-    """Fill the gradients of two units, three channels, and add their dL/dQ."""
+    """For three channels: fill the gradients of two units in ``out``, and add the units' dL/dQ."""
     ax, ay, az, _, a0, a1, a2 = _ray_rgb_unit(p, o)
     bx, by, bz, _, b0, b1, b2 = _ray_rgb_unit(p, o2)
     s0, s1, s2, s3, s4, s5, s6 = f(0), f(0), f(0), f(0), f(0), f(0), f(0)
@@ -259,7 +259,7 @@ def _rgb_units_gradient(S, V0, V1, n, p, o, o2, out):  # type: ignore[no-untyped
 
 @inline
 def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
-    """Fill the gradients of one unit, any channels, and add its dL/dQ. Overwrites the unit's cos in ``V0``."""
+    """For any number of channels: fill a unit's gradients, and add its dL/dQ. Overwrites the unit's cos in ``V0``."""
     wx, wy, wz = p[o + P.WX], p[o + P.WY], p[o + P.WZ]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)
@@ -287,7 +287,7 @@ def _unit_gradient(S, V0, n, p, o, C, out):  # type: ignore[no-untyped-def]
 
 @inline
 def ray_colour_gradient(S, V, n, i, net, C, out, base_at):  # type: ignore[no-untyped-def]
-    """Fill the gradient row from dL/d RAY_COLOUR of the lanes: base at ``base_at``, then the units; add to dL/dQ."""
+    """From dL/d RAY_COLOUR, fill gradients in ``out``: of the base at ``base_at``, then of the units; add to dL/dQ."""
     p, row = net.rows[i], out[base_at + C :]
     for c in range(C):
         gradient, total = S[L.RAY_COLOUR + (C + c) * L.LANES :], f(0)

@@ -34,7 +34,7 @@ Array = np.ndarray[Any, Any]
 
 
 class _PairLanes(NamedTuple):
-    """Scratch memory for the lanes of one (tile, primitive) pair; ``waves``: for a colour network, or None."""
+    """Scratch memory for the lanes of one (tile, primitive) pair; ``waves`` is None without a colour network."""
 
     S: Array
     D: Array
@@ -185,7 +185,7 @@ def _sort_tile_hits(count, hits):  # type: ignore[no-untyped-def]
 
 @kernel
 def composite_tiles_by_entry(start, stop, frame, colors, image, net, edge):  # type: ignore[no-untyped-def]
-    """Like :func:`~neuprim.core.render.cpu.forward.composite_tiles`; ``image.last``: number of hits per pixel."""
+    """Like :func:`~neuprim.core.render.cpu.forward.composite_tiles`, but ``image.last`` counts hits per pixel."""
     frame, image, colors = borrow_arrays(frame), borrow_arrays(image), borrow_array(colors)
     height, width = frame.norms.shape
     across = (width + P.TILE - 1) // P.TILE

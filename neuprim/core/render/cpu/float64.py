@@ -136,7 +136,7 @@ def _chord_bessel(z, j):  # type: ignore[no-untyped-def]
 
 @inline
 def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
-    """Fill M[n] = C_n for even n, S_n for odd n, n = 0..5."""
+    """Fill M[n] with C_n of ``z`` for even n and S_n for odd n, n = 0..5; overwrites ``j``."""
     _chord_bessel(z, j)
     M[0], M[1] = j[0], j[1]
     M[2], M[3] = (j[0] - 2.0 * j[2]) / 3.0, (3.0 * j[1] - 2.0 * j[3]) / 5.0
@@ -146,7 +146,7 @@ def _chord_moments(z, j, M):  # type: ignore[no-untyped-def]
 
 @inline
 def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untyped-def]
-    """Fill coefficients q[0..4] of (D - a (shift + half u)^2)^p; return the polynomial's mean over the chord."""
+    """Fill q[0..4], coefficients of (D - ``square`` (shift + half u)^2)^``soft``; return its mean over the chord."""
     c0, c1, c2 = D - square * shift * shift, -2.0 * square * shift * half, -square * half * half
     q[0], q[1], q[2], q[3], q[4] = c0, c1, c2, 0.0, 0.0
     if soft == 2:
@@ -158,7 +158,7 @@ def _edge_polynomial(D, shift, square, half, soft, q):  # type: ignore[no-untype
 def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped-def]
     """Add the neurons' weighted means to FIELD, and fill FADE, for soft-edged chords that the near plane cuts.
 
-    If ``V`` is given, fill ``V`` and BY_D, BY_A, BY_TM, from the moments of p q^(p - 1).
+    If ``V`` is given, fill it, and BY_D, BY_A, BY_TM from moments of the edge weight's derivative by 1 - |y|^2.
     """
     q, j, M, rest = np.zeros(5), np.zeros(6), np.zeros(6), np.zeros(3)
     for k in range(n):
@@ -202,7 +202,7 @@ def _cut_chord_neurons(S, X, V, n, p, neurons, soft):  # type: ignore[no-untyped
 
 @inline
 def neurons_float64(S, X, V, n, p, neurons, cut, edge):  # type: ignore[no-untyped-def]
-    """Add every neuron's weighted mean to FIELD; if ``cut``, fill FADE; unless None, fill ``V`` for gradients."""
+    """Add every neuron's weighted mean to FIELD; if ``cut``, fill FADE; if ``V`` is not None, fill it for gradients."""
     if len(edge) > 0 and cut:
         _cut_chord_neurons(S, X, V, n, p, neurons, len(edge))
     else:

@@ -92,7 +92,7 @@ def _max_lanes(start, stop, across, frame):  # type: ignore[no-untyped-def]
 
 @inline
 def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-untyped-def]
-    """Fill ALPHA: 0 below alpha_min and for integrals <= 0, at most alpha_max; if ``keep``, fill ``depths``."""
+    """Fill ALPHA: 0 below alpha_min and for integrals <= 0, at most alpha_max; if ``keep``, fill ``depths[at:]``."""
     amin, amax = frame.alpha_min, frame.alpha_max
     for k in range(n):
         depth = S[L.FIELD + k] * S[L.HALF + k] * S[L.NORM_L + k] * f(2)
@@ -111,7 +111,7 @@ def _store_opacities(S, n, frame, edge, keep, depths, at):  # type: ignore[no-un
 
 @inline
 def _composite_rgb_row(state, S, base, at, a, b, tmin, rank, color, net):  # type: ignore[no-untyped-def]
-    """For three channels: add alpha T c to the colours of a row of pixels, then update T."""
+    """For three channels: add alpha T times colour to each pixel of a row, then update T."""
     a, b = f(a), f(b)
     c0, c1, c2 = color[0], color[1], color[2]
     for k in range(P.TILE):
@@ -147,7 +147,7 @@ def _composite_row(state, S, base, at, a, b, tmin, rank, w):  # type: ignore[no-
 
 @inline
 def _add_colours(state, S, base, at, w, color, net):  # type: ignore[no-untyped-def]
-    """For any number of channels: add w c to the colours."""
+    """For any number of channels: add ``w`` times ``color``, or with a ``net`` times RAY_COLOUR, to the colours."""
     for c in range(color.shape[0]):
         st = state[L.COLOR + c * P.PIXELS + base :]
         if net is None:

@@ -41,9 +41,9 @@ def _load_neuron(p, o):  # type: ignore[no-untyped-def]
 
 
 def _neuron_products(slopes):  # type: ignore[no-untyped-def]
-    """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate of two neurons.
+    """Return a function that computes cos B, d(cos B)/d phase and cos dB/d rate of two neurons, B their chord profile.
 
-    Its q is the chord middle, its v the half chord.
+    ``slopes`` computes B and dB/d rate. The function's argument q is the chord middle, its v the half chord.
     """
 
     @inline
@@ -208,7 +208,7 @@ def _chord_field_gradient(S, n, out, edge, in_float64):  # type: ignore[no-untyp
 def _two_neuron_lane_gradients(products):  # type: ignore[no-untyped-def]
     """Return a function that computes gradients of neurons m and m + 1, dL/dQ and dL/d(half e).
 
-    ``products`` None: the function reads the products from V0 and V1.
+    If ``products`` is None, the function reads cos B and its derivatives from V0 and V1.
     """
 
     @inline

@@ -20,17 +20,17 @@ def _padded_row_width(floats: int) -> int:
 
 
 def row_width(neurons: int) -> int:
-    """Return the number of floats in a primitive's row, for K padded neurons; a multiple of 16."""
+    """Return the number of floats in a primitive's row, a multiple of 16; ``neurons`` is the number after padding."""
     return _padded_row_width(NEURONS + PER_NEURON * neurons)
 
 
 def net_row_width(hidden: int, channels: int) -> int:
-    """Return the number of floats, at least 1, in a row of a colour network; ``hidden``: its units after padding."""
+    """Return the number of floats in a colour network's row, 1 without units; ``hidden`` counts units after padding."""
     return max((NET_OUT + channels) * hidden, 1)
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the number of floats in a gradient row: K padded neurons, C colours, H padded units; a multiple of 16."""
+    """Return the number of floats in a gradient row, a multiple of 16; ``neurons`` and ``hidden`` include padding."""
     return _padded_row_width(G_NEURONS + PER_NEURON * neurons + channels + (NET_OUT + channels) * hidden)
 
 

@@ -58,7 +58,7 @@ class PrimitiveArrays(NamedTuple):
 
 
 class View(NamedTuple):
-    """A camera: world-to-camera rotation and translation, intrinsics, size, near plane; ``turns``: omega0 / 2 pi."""
+    """A camera: world-to-camera rotation, translation, intrinsics, size, near plane; and ``turns`` = omega0 / 2 pi."""
 
     R: Array
     t: Array
@@ -111,7 +111,8 @@ def _is_too_faint_to_draw(most, edge, least):  # type: ignore[no-untyped-def]
 def _visible_square(most, longest, edge, least):  # type: ignore[no-untyped-def]
     """Return r^2 of an ellipsoid's visible extent in units of its semi-axes: 1 for all of it, 0 for nothing.
 
-    ``most``: F; ``longest``: s, in units of the longest semi-axis. Rounded to float32, so that backends agree.
+    ``most`` is b2 + sum |w2|, and ``longest`` bounds half chords in units of the longest semi-axis. The result is
+    rounded to float32, so that backends agree.
     """
     share = least / (most * NORMS[edge] * longest)
     if share >= 1.0:
@@ -139,8 +140,8 @@ def _is_finite_undrawn_primitive(i, parameters, most):  # type: ignore[no-untype
 def _silhouette_screen_extent(z, ci, s22, square, b, axes, towards, focal, middle):  # type: ignore[no-untyped-def]
     """Return the pixel range of the silhouette, scaled by ``square`` ** 0.5, along a screen axis.
 
-    Uses the tangents of ``screen_boxes`` in the reference, in units of m; ``b``, ``towards``: rows of B of the screen
-    axis and of depth; ``s22``: S_zz of the whole ellipsoid.
+    Uses the tangents of ``screen_boxes`` in the reference, in units of m. ``b`` and ``towards`` are the rows of B for
+    the screen axis and for depth, and ``s22`` is S_zz of the whole ellipsoid.
     """
     (b0, b1, b2), (s0, s1, s2), (d0, d1, d2), szz = b, axes, towards, square * s22
     sii = square * ((b0 * s0) ** 2 + (b1 * s1) ** 2 + (b2 * s2) ** 2)

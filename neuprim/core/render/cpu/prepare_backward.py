@@ -42,7 +42,7 @@ _COLUMNS = COLUMNS + 56
 def _axis_gradient(b, s, g, reference, w, fx, fy):  # type: ignore[no-untyped-def]
     """Return dL/d(column of B), dL/d(log of its axis s), and this axis's part of -m dL/d centre.
 
-    ``g``: dL/d(E0, EX, EY, XA) along the axis.
+    ``g`` is dL/d(E0, EX, EY, XA) along this axis, ``b`` its column of B, and ``s`` its length over m.
     """
     a = b[0] / s, b[1] / s, b[2] / s
     gx = g[3]

@@ -134,7 +134,7 @@ def bin_primitives(
 ) -> TileLists:
     """Return the tile lists of a frame.
 
-    ``images``: (N,) index of the image of each primitive, and the number of images; None for one image.
+    ``images`` holds each primitive's image index, (N,), and the number of images; None means one image.
     """
     count = projected.depth.shape[0]
     across, down = -(-width // P.TILE), -(-height // P.TILE)
@@ -173,7 +173,7 @@ class FrameArrays(NamedTuple):
 
 
 class PairWindow(NamedTuple):
-    """Pixels x0:x1, rows y0:y1 of tile (tx, ty) inside primitive i's box; fx0, fy0: tile corner minus anchor."""
+    """Columns x0:x1 and rows y0:y1 of tile (tx, ty) in primitive i's box; (fx0, fy0) is tile corner minus anchor."""
 
     i: int
     tx: int
@@ -323,7 +323,7 @@ def lane_chords(S, n, frame, pair, with_mid, backward, edge):  # type: ignore[no
 
 
 def _neuron_values(profiles):  # type: ignore[no-untyped-def]
-    """Return a function for two neurons: FIELD += w2 cos(phase at middle) B_p(rate x half chord), one rate range."""
+    """Return a function that adds w2 cos(phase at middle) B_p(rate x half chord) of two neurons to FIELD."""
 
     @inline
     def add(S, n, p, o, edge):  # type: ignore[no-untyped-def]

@@ -71,7 +71,7 @@ from neuprim.core.settings import RenderSettings
 
 @functools.cache
 def pixels_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the first backward kernel, for pixels; ``depth``: whether the sum of w z has a gradient."""
+    """Return the first backward kernel, for pixels; with ``depth``, the sum of weight x depth has a gradient, too."""
     C, H = form.channels, form.hidden
     colours, width = L.rasterizer_colour_column(form.neurons), L.rasterizer_row_columns(form.neurons, C)
     vecC = wp.types.vector(length=C, dtype=wp.float32)
@@ -82,7 +82,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
         transmittance: Floats, reached: Ints, background: Floats, g_rgb: Floats2d, g_transmittance: Floats, g_z: Floats,
         depths: Floats, hues: Floats2d, hits: Vec2s,
     ):  # fmt: skip
-        """Store dL/dI = (1 - alpha) T dL/dw - b, and the weight, in each slot.
+        """Store dL/dI = (1 - alpha) T dL/dw - b, I the optical depth, and the weight w in each slot.
 
         b, the light behind the hit, is the sum of w dL/dw of later hits and T dL/dT.
         """
@@ -138,7 +138,7 @@ def pixels_kernel(form: KernelForm, depth: bool) -> Any:
 
 @functools.cache
 def pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the second backward kernel, for pairs; ``depth``: whether the sum of w z has a gradient."""
+    """Return the second backward kernel, for pairs; with ``depth``, the sum of weight x depth has a gradient, too."""
     K, P, C = form.neurons, form.edge, form.channels
     W, width = L.rasterizer_row_columns(K, C), L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)
@@ -297,7 +297,7 @@ def sum_pairs(
 
 @functools.cache
 def uncomposite_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return a kernel like :func:`pixels_kernel` for sorted hits, which turns (alpha, T) into (dL/dI, weight)."""
+    """Return a kernel like :func:`pixels_kernel`, for sorted hits; it turns slots (alpha, T) into (dL/dI, weight)."""
     C, H = form.channels, form.hidden
     colours = L.rasterizer_colour_column(form.neurons)
 

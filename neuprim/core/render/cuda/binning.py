@@ -63,7 +63,7 @@ class FrameCapacity:
 
     @classmethod
     def around(cls, counts: Sequence[int], refused: Tensor, zeros: bool) -> "FrameCapacity":
-        """Return sizes with room beyond ``counts``, in the order of the fields; ``zeros``: a count of 0 has no room."""
+        """Return sizes with room beyond ``counts``, in the order of fields; with ``zeros``, a count of 0 gets none."""
         sizes = [0 if zeros and not count else int(_MARGIN * count) + _SPARE for count in counts]
         pairs, in_float64, slots, float64_pairs = sizes
         return cls(pairs, in_float64, slots, float64_pairs, refused)
@@ -112,7 +112,7 @@ def running_sums(counts: Tensor) -> Tensor:
 
 
 def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = None) -> TileCounts:
-    """Return sizes and running sums for the stage's ``counts``; waits for the device if there is no ``capacity``.
+    """Return sizes and running sums of the ``counts`` of ``prepare``; waits for the device if there is no ``capacity``.
 
     Raises BackendUnavailable if there are too many pairs.
     """
@@ -149,7 +149,7 @@ def silhouette_screen_extent(p: ProjectedPrimitive, v: View, axis: int, s22: wp.
 
 @wp.struct
 class SilhouetteSpans:
-    """A silhouette's row spans (hx, hy UNBOUNDED if it is no ellipse), and whether it needs float64."""
+    """A silhouette's row spans, hx and hy UNBOUNDED if it is no ellipse, and whether the primitive needs float64."""
 
     skew: wp.float64
     xc: wp.float64
@@ -161,7 +161,7 @@ class SilhouetteSpans:
 
 @wp.func
 def silhouette_spans(p: ProjectedPrimitive, r: Ray, width: int, height: int, square: wp.float64):
-    """Return row spans where |r e|^2 - |x x e|^2 > 0, r^2 = ``square``: centre XC + SKEW (dv - YC), width by HX, HY."""
+    """Return row spans of the rays (x, e) with ``square`` |e|^2 > |x cross e|^2: centre XC + SKEW (dv - YC), HX, HY."""
     o = SilhouetteSpans()
     o.hx = _UNBOUNDED
     o.hy = _UNBOUNDED
@@ -236,7 +236,7 @@ def is_too_faint_to_draw(most: wp.float64, edge: int, least: wp.float64):
 
 @wp.func
 def visible_square(most: wp.float64, bound: wp.float64, edge: int, least: wp.float64):
-    """Return r^2 of an ellipsoid's visible extent: 1 for all, 0 for nothing. ``most``: b2 + sum |w2|, positive."""
+    """Return r^2 of the visible extent, 0 to 1 (all of it); ``most`` is b2 + sum |w2|, half chords are <= ``bound``."""
     square, share = d(0.0), least / (most * _chord_bound_by_edge(edge, _N0, _N1, _N2) * bound)
     if share <= _chord_bound_by_edge(edge, _W0, _W1, _W2):
         square = d(1.0)
@@ -261,7 +261,7 @@ class Ellipse:
 
 @wp.func
 def silhouette_ellipse(span: wp.vec4, hy: wp.float32, ux: wp.float32, uy: wp.float32, box: wp.vec4i):
-    """Return the ellipse of a silhouette; ``span``: SKEW, XC, YC, HX."""
+    """Return the ellipse of a silhouette from ``span`` (SKEW, XC, YC, HX), ``hy`` and the anchor (``ux``, ``uy``)."""
     e = Ellipse()
     e.box = box
     e.skew = d(span[0])
@@ -305,7 +305,7 @@ def _primitives_fit(ends: Longs2d, pairs: int, which: Ints):
 
 @functools.cache
 def _binning_kernels(short: bool) -> tuple[Any, Any]:
-    """Return the kernels that write keys and read them; ``short``: keys are int32, which sort in half the time."""
+    """Return the kernels that write keys and read them; ``short`` keys are int32, which sort in half the time."""
     number = wp.int32 if short else wp.int64
     Keys: Any = wp.array(dtype=number)
 
@@ -314,9 +314,9 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
         rows: Vec4s2d, spans: Vec4s2d, boxes: Vec4is, order: Longs, counts: Ints2d, ends: Longs2d, across: int,
         images: Ints, tiles: int, first: Ints, keys: Keys, slots: Ints, which: Ints,
     ):  # fmt: skip
-        """Write keys tile x N + rank, one per tile that the primitive with depth rank tid reaches.
+        """Thread ``rank`` writes the keys tile x N + rank, one per tile that the primitive of this depth rank reaches.
 
-        ``tiles``: tiles per image; 0 for one image.
+        N is the number of primitives; ``tiles`` is the number of tiles per image, or 0 for one image.
         """
         rank = wp.tid()
         i = int(order[rank])
@@ -346,7 +346,7 @@ def _binning_kernels(short: bool) -> tuple[Any, Any]:
         keys: Keys, came_from: Longs, order: Longs, ends: Longs2d, which: Ints, tiles: int, each: int,
         starts: Ints, ids: Ints, tile_of: Ints, slots_of: Ints,
     ):  # fmt: skip
-        """Fill the tile lists from sorted keys; dim (pairs,). ``tiles``: count in all images; ``each``: in one."""
+        """Thread k fills the lists from sorted key k; ``tiles`` counts the tiles of all images, ``each`` of one."""
         k = wp.tid()
         pairs = int(0)
         if _primitives_fit(ends, keys.shape[0], which):
@@ -382,7 +382,7 @@ def bin_primitives(
 ) -> tuple[TileLists, Tensor, Tensor]:
     """Return a frame's tile lists, ``slots`` and ``which``, from what ``prepare`` and :func:`count_tiles` filled.
 
-    ``images``: (N,) int32 index of the image of each primitive, and the number of images.
+    ``images`` holds each primitive's image index, (N,) int32, and the number of images; None means one image.
     """
     device, N, pairs = rows.device, depth.shape[0], counted.pairs
     across, down = -(-camera.width // L.TILE), -(-camera.height // L.TILE)

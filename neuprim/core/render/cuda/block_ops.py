@@ -80,7 +80,7 @@ def gradient_row_type(width: int) -> Any:
 
 @functools.cache
 def gradient_row_sums(width: int) -> Callable[..., Any]:
-    """Return a function (x, lane, out, pair) that sums x over a warp into row ``pair``; ``width``: multiple of 32."""
+    """Return a function (x, lane, out, pair) that sums x over a warp into row ``pair``; ``width``: a multiple of 32."""
     row = gradient_row_type(width)
 
     @wp.func_native(_halving_sums(width))

@@ -63,7 +63,7 @@ def sin_turns(r: float):
 
 
 def chord_edge_profiles(edge: int) -> tuple[Function, Function]:
-    """Return Warp functions v -> B_p and v -> (B_p, B_(p+1)), p = 0, 1, 2, for any v."""
+    """Return Warp functions v -> B_p(2 pi v) and v -> (B_p, B_(p+1)) of p = ``edge``, 0 to 2, for any rate v."""
     low, high = _B[edge], _B[edge + 1]
 
     @wp.func
@@ -201,7 +201,7 @@ class Pull:
 def chord_ends_backward(
     c: Chord, g_half: float, g_mid: float, g_tm: float, gD: float, gA: float, gq: wp.vec3, gv: wp.vec3
 ):
-    """Return dL/d(m, e) from dL/d(half, mid), dL/d(chord middle) = gq, dL/d(half e) = gv; gD includes dh/dD."""
+    """Return dL/d(m, e) from gradients by half, mid, chord middle (gq), half e (gv), ...; gD includes dL/dh dh/dD."""
     gt1 = 0.5 * (g_mid + g_half)
     gt0 = 0.5 * (g_mid - g_half) * c.uncut
     tm = g_tm + gt0 + gt1

@@ -128,7 +128,7 @@ def _colour_net_kernels(double: bool) -> tuple[Any, Any, Any]:
         channels: int, weights: Floats2d, grads: Floats2d, first: int, g_log_scales: Vec3s, g_quats: Vec4s,
         g_Wx: Vec3s2d, g_bias: Floats2d, g_Wout: Floats3d,
     ):  # fmt: skip
-        """Thread i computes the parameter gradients of primitive i, visible if column G_WEIGHT of ``weights`` > 0.
+        """Thread i computes the parameter gradients of primitive i, visible if ``weights[i, G_WEIGHT]`` > 0.
 
         Adds to g_log_scales and g_quats; overwrites the other gradients.
         """
@@ -216,7 +216,7 @@ def colour_net_backward(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the float32 gradients of Wx, bias and Wout; add the gradients of log_scales and quats to ``out``.
 
-    ``weights``, ``grads``: (N, ...) gradient rows of the density and of the networks.
+    ``weights`` has the (N, ...) gradient rows of the density, ``grads`` those of the networks.
     """
     _, log_scales, quats, *_ = parameters
     _, g_log_scales, g_quats, *_ = out
@@ -329,7 +329,7 @@ def float64_hues_kernel(channels: int) -> Any:
         pairs: Ints, wide: Doubles2d, net: Vec4ds2d, mixes: Vec4s2d, rows: Vec4s2d, first: int, hidden: int,
         slots: Ints, ids: Ints, tiles: Ints, spans: Shorts2d, offsets: Ints, size: wp.vec2i, hues: Floats2d,
     ):  # fmt: skip
-        """``mixes``: float32 rows of networks, for output weights; ``rows``: constant colours from column ``first``."""
+        """Fill ``hues``; output weights are from ``mixes``, constant colours from column ``first`` of ``rows``."""
         member, lane = wp.tid()
         n = pairs[member]
         i, r = ids[n], slots[ids[n]]

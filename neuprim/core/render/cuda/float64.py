@@ -176,7 +176,7 @@ class Moments:
 
 @wp.func
 def weighted_moments64(w: Weight, M: vec6d):
-    """Return the :class:`Moments` of an edge weight; ``M``: from :func:`chord_moments`."""
+    """Return the :class:`Moments` of an edge weight from ``M``, the result of :func:`chord_moments`."""
     out = Moments()
     out.even = w.q[0] * M[0] + w.q[2] * M[2] + w.q[4] * M[4]
     out.odd = w.q[1] * M[1] + w.q[3] * M[3]
@@ -224,7 +224,7 @@ def ray_norm(lens: wp.vec4, X: int, Y: int):
 
 @functools.cache
 def float64_opacity_kernel(depth: bool) -> Any:
-    """Return the kernel that computes opacities, for any form; ``depth``: also camera-z of the chords' middles."""
+    """Return the kernel that computes opacities, for any form, and with ``depth`` camera-z of the chords' middles."""
 
     @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
     def float64_opacity(
@@ -270,7 +270,7 @@ def float64_opacity_kernel(depth: bool) -> Any:
 
 @functools.cache
 def float64_pairs_kernel(form: KernelForm, depth: bool) -> Any:
-    """Return the gradient kernel for float64 pairs of a form; ``depth``: whether the sum of w z has a gradient."""
+    """Return the gradient kernel for float64 pairs of a form; with ``depth``, weight x depth has a gradient, too."""
     K, P, C = form.neurons, form.edge, form.channels
     width = L.gradient_width(K, C)
     row_of, add_lanes = gradient_row_type(width), gradient_row_sums(width)

@@ -69,9 +69,9 @@ BATCH = 16  # rows in shared memory at a time
 def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = False, several: bool = False) -> Any:
     """Return the compositing kernel of a form.
 
-    ``keep``: fill the slots, and read float64 primitives from slots; ``depth``: also compute the sum of w z.
-
-    ``listing``: only list key and pair of every hit, for :func:`composite_kernel`; ``several``: more than one image.
+    With ``keep``, it fills the slots, and reads float64 primitives from slots. With ``depth``, it also computes the sum
+    of weight x depth. With ``listing``, it only lists key and pair of every hit, for :func:`composite_kernel`. With
+    ``several``, there is more than one image.
     """
     assert (keep or not listing) and not (listing and several)
     K, P, C = form.neurons, form.edge, form.channels
@@ -92,7 +92,7 @@ def forward_kernel(form: KernelForm, keep: bool, depth: bool, listing: bool = Fa
     ):  # fmt: skip
         """Composite one tile per block; sets ``reached[tile]``, the end of the composited pairs.
 
-        ``limits``: (alpha_min, alpha_max, transmittance_min, -).
+        ``limits`` holds alpha_min, alpha_max, transmittance_min and an unused number.
         """
         tile, lane = wp.tid()
         across = (size[0] + L.TILE - 1) // L.TILE

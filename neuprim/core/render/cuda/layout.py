@@ -72,6 +72,6 @@ def rasterizer_net_columns(channels: int) -> int:
 
 
 def gradient_width(neurons: int, channels: int, hidden: int = 0) -> int:
-    """Return the number of columns of a gradient row with H network units, a multiple of the warp size."""
+    """Return the number of columns of a gradient row with ``hidden`` network units, a multiple of the warp size."""
     used = G_NEURONS + PER_NEURON * neurons + channels + (4 + channels) * hidden
     return -(-used // WARP) * WARP

@@ -102,8 +102,9 @@ def _projected_frequency(w: wp.vec3d, p: ProjectedPrimitive, turns: wp.float64):
 def project_primitives_kernel(double: bool) -> Any:
     """Return a kernel that fills rows, spans, boxes, depth, status and counts of every primitive; dim (N,).
 
-    ``counts`` (2, N): number of tiles reached; 1 if the primitive is visible and needs float64. ``bad`` (1,): the first
-    primitive that is not finite, colours included. ``least``: the optical depth below which samples are skipped.
+    Row 0 of ``counts`` (2, N) is the number of tiles reached, row 1 is 1 for visible primitives that need float64.
+    ``bad`` (1,) is the first primitive that is not finite, colours included. Samples of less optical depth than
+    ``least`` are skipped.
     """
     real, vec3, vec4 = (wp.float64, wp.vec3d, wp.vec4d) if double else (wp.float32, wp.vec3, wp.vec4)
 

@@ -129,7 +129,7 @@ def _prepare_backward_kernel(double: bool) -> Any:
 def prepare_backward(frame: Frame, grads: Tensor, want_view: bool = False) -> tuple[tuple[Tensor, ...], Tensor | None]:
     """Return float32 gradients of the parameters, and with ``want_view`` the (3, 4) float64 gradient of (R | t).
 
-    ``grads``: (N, gradient_width) float32 rows; a row with weight 0 gives zero gradients.
+    ``grads`` are (N, gradient_width) float32 rows; a row with weight 0 gives zero gradients.
     """
     out = tuple(torch.empty(x.shape, dtype=torch.float32, device=x.device) for x in frame.parameters)
     g_view = torch.empty(grads.shape[0], 12, dtype=torch.float64, device=grads.device) if want_view else None

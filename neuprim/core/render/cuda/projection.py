@@ -44,7 +44,7 @@ class ProjectedPrimitive:
 class Ray:
     """A = m S^-1 B^T and the rays of a primitive in whitened space.
 
-    Rays are x(t) = (xa + du xu + dv xv + s G) + t (e0 + G).
+    Rays are x(t) = (xa + du xu + dv xv + s G) + t (e0 + G), with G = du ex + dv ey and s = du tu + dv tv.
     """
 
     A: wp.mat33d

@@ -55,7 +55,7 @@ def row_spans(
     """Thread n writes the pixels that pair n covers in its tile: start << 8 | last << 4 | first for each of 16 rows.
 
     Each covered pixel has a slot for the data of the backward pass, in the order of pairs, rows and pixels. The slots
-    take a fifth of the memory of whole tiles. ``counts`` (2, pairs): number of slots; 1 if the pair needs float64.
+    take a fifth of the memory of whole tiles. ``counts`` (2, pairs): row 0 counts slots, row 1 float64 pairs.
     """
     n = wp.tid()
     if n >= starts[starts.shape[0] - 1]:  # the arrays are larger than the frame needs
@@ -98,7 +98,7 @@ def row_spans(
 
 @wp.kernel(enable_backward=False, module="unique", module_options=OPTIONS, grid_stride=False)
 def list_float64_pairs(starts: Ints, counts: Ints2d, ends: Longs2d, found: Ints):
-    """Write the pairs that need float64 to ``found``, in order; from the counts of row_spans and their sums."""
+    """Write the pairs that need float64 to ``found``, in order, from ``counts`` of row_spans and sums ``ends``."""
     n = wp.tid()
     if counts[1, n] > 0 and n < starts[starts.shape[0] - 1]:  # a refused frame has no pairs
         found[int(ends[1, n]) - 1] = n
@@ -110,7 +110,7 @@ def refuse_frame(
 ):  # fmt: skip
     """Empty all tiles and set ``refused`` if the frame exceeds its capacity or a primitive is not finite.
 
-    ``capacity``: the sizes of :class:`FrameCapacity`; ``slot_ends``: running sums of the counts of row_spans.
+    ``capacity`` holds the sizes of :class:`FrameCapacity`, ``slot_ends`` running sums of the counts of row_spans.
     """
     t = wp.tid()
     last, pair = ends.shape[1] - 1, slot_ends.shape[1] - 1
@@ -153,7 +153,7 @@ def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) ->
 
 
 def refuse_misfit(frame: Frame, slot_ends: Tensor, capacity: FrameCapacity) -> None:
-    """Empty the tiles of a frame that does not fit. ``slot_ends``: (2, P) running sums of slots and float64 pairs."""
+    """Empty the tiles of a frame that does not fit. ``slot_ends`` are running sums of slots and of float64 pairs."""
     starts = frame.lists.starts
     sizes = wp.vec4i(capacity.pairs, capacity.in_float64, capacity.slots, capacity.float64_pairs)
     sums = (array(frame.ends, wp.int64), array(slot_ends, wp.int64), array(frame.bad, wp.int32))

@@ -156,7 +156,7 @@ def _check_tensor(name: str, value: Any) -> None:
 def _check_primitives(
     t: Mapping[str, Tensor], views: int, omega0: float, edge: int
 ) -> tuple[Geometry, Cosine, list[Tensor]]:
-    """Return geometry, density and one colour tensor per camera. The renderer, not this function, refuses NaN."""
+    """Check the tensors ``t``; return geometry, density and one colour tensor per camera. Does not look for NaN."""
     for name in t:
         if name not in (*_REQUIRED, "log_gain"):
             raise DataError(f"rasterize: unknown tensor {name!r}{nearest(name, [*_REQUIRED, 'log_gain'])}")

@@ -229,7 +229,8 @@ def _report_launched_runs(
     configs: Sequence[RunConfig], results: Sequence[JobResult | None], live: bool, typed: CommandLine
 ) -> int:
     """Print failed runs; return the exit status: 1 for a bug, else 2 for bad input, else 0. After Ctrl-C, raise
-    KeyboardInterrupt with the command that continues. ``live``: a table showed the progress, so no run was printed."""
+    KeyboardInterrupt with the command that continues. If ``live``, a table showed the progress; only
+    then does this function print the errors of failed runs and, in a sweep, the directories of finished ones."""
     status, left = 0, []
     for config, result in zip(configs, results, strict=True):
         if result is None or result.state == "interrupted":

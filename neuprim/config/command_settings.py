@@ -130,7 +130,7 @@ def take_viewer_overrides(overrides: Sequence[str]) -> tuple[ViewerSettings | No
 
 
 def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget, float] | None, list[str]]:
-    """Split overrides into a pair (target, budget in seconds), or None if neither is given, and the other overrides."""
+    """Split overrides into (target, budget in seconds) and the other overrides. Without both, the pair is None."""
     budget, rest = take_budget_override(overrides)
     whole, target, others = take_settings(rest, "target", SearchTarget)
     if len(others) == len(overrides):
@@ -147,7 +147,7 @@ def take_target_overrides(overrides: Sequence[str]) -> tuple[tuple[SearchTarget,
 
 
 def take_budget_override(overrides: Sequence[str]) -> tuple[str | None, list[str]]:
-    """Split overrides into the text after ``budget=``, or None if there is no budget, and the other overrides."""
+    """Split overrides into the text after ``budget=`` (None if there is no budget) and the other overrides."""
     budget, _, others = take_settings(overrides, "budget", _Budget)
     return (None if budget is None else str(budget)), others
 

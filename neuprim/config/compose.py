@@ -107,7 +107,7 @@ class _Selection:
 
 @dataclass(frozen=True)
 class _BaseConfig:
-    """Settings before overrides and before ``${...}`` is resolved, and names of the scene settings that are paths."""
+    """Settings before overrides apply and ``${...}`` is resolved, and names of the scene settings that hold paths."""
 
     tree: dict[str, Any]
     paths: list[str]

@@ -252,7 +252,7 @@ def config_output_directory(asked: str | None, name: str, resume: bool, check: b
     Args:
         asked: the user's ``output_dir``, or None for ``outputs/NAME``, ``outputs/NAME-2``, ...
         name: ``<task>-<scene>``.
-        resume: use an existing directory; without ``asked``, the existing one with the highest number.
+        resume: whether the run continues; without ``asked``, the existing directory with the highest number is used.
         check: whether to refuse an ``asked`` directory that holds files (unless ``resume``).
     """
     if asked is None:

@@ -211,8 +211,9 @@ def fit_gaussians(run: TrainedModel, conditions: Conditions, size: str) -> Gauss
     * "moments": The Gaussian has the mean and the covariance of rho = max(0, sigma), by quadrature in the ellipsoid.
       Its opacity is 1 - exp(-tau), averaged over the three axes of the ellipsoid. tau is the integral of rho along a
       line through the mean, parallel to the axis.
-    * "footprint": As "moments", but the covariance is scaled. The Gaussian's projected alpha, opacity x exp(-d^2/2),
-      then has the same integral over the image as the primitive's alpha, on average over views along the three axes.
+    * "footprint": As "moments", but the covariance is scaled. The Gaussian's projected alpha, opacity x exp(-d^2/2)
+      at d standard deviations, then has the same integral over the image as the primitive's alpha, on average over
+      views along the three axes.
     * "profile": The scale of the covariance and the opacity minimise the squared difference of the two alphas over the
       images along the three axes. For each scale, the opacity preserves the integral of alpha, but is at most 0.99.
 
@@ -279,8 +280,9 @@ def _fit_gaussian_ply_profile(
 ) -> tuple[Tensor, Tensor]:
     """Fit size="profile" of :func:`fit_gaussians`: return (n,) factors on the covariance, and (n,) opacities.
 
-    Each of the three ``screens`` is a projection of n primitives along an axis: (alpha, covariance, mean, area). The
-    fit tries a list of factors. For each factor, the opacity preserves the integral of alpha, but is at most 0.99. The
+    Each of the three ``screens`` is a projection of n primitives along an axis: (alpha, covariance, mean, area). On the
+    image plane, alpha has the integrals ``areas`` (3, n), and the unscaled Gaussian of opacity 1 has ``bells`` (3, n).
+    The fit tries a list of factors. For each, the opacity preserves the integral of alpha, but is at most 0.99. The
     factor with the smallest squared error wins. The error includes the Gaussian's part outside of the image.
     """
     step = ticks[1] - ticks[0]
@@ -308,10 +310,11 @@ def draw_exported_gaussians(
 ) -> Tensor:
     """Draw Gaussians as the 3DGS rasteriser does, but in float64; return a (H, W, 3) float32 image.
 
-    Gaussians are projected by a local affine approximation (EWA) and blurred by 0.3 square pixels. In a pixel, alpha is
-    min(0.99, opacity exp(-d^2/2)); Gaussians with alpha below 1/255 are skipped. Compositing is front to back by the
-    depth of centres, and stops before the transmittance falls below 1e-4. Gaussians with a depth below 0.2 are left
-    out. 3DGS draws a Gaussian only in the tiles within three standard deviations; here, only alpha limits it.
+    Gaussians are projected by a local affine approximation (EWA) and blurred by 0.3 square pixels. In a pixel, d
+    standard deviations from the centre, alpha is min(0.99, opacity exp(-d^2/2)); Gaussians with alpha below 1/255 are
+    skipped. Compositing is front to back by the depth of centres, and stops before the transmittance falls below 1e-4.
+    Gaussians with a depth below 0.2 are left out. 3DGS draws a Gaussian only in the tiles within three standard
+    deviations; here, only alpha limits it.
     """
     view = camera.viewmat.double()
     W, t = view[:3, :3], gaussians.means @ view[:3, :3].T + view[:3, 3]

@@ -61,7 +61,7 @@ _MOST_VOXELS = 2**34
 
 @dataclass(frozen=True)
 class _GridFrame:
-    """A frame to write: number in the file's name, conditions, and index among the source's files or None."""
+    """A frame to write: its number in the file name, its conditions, and its index in the source (None: not there)."""
 
     number: int
     conditions: Conditions
@@ -124,10 +124,10 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
 
 
 def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) -> Primitives:
-    """Return the model to export. If flames add to sigma, it has only the part of the source's extinction grid.
+    """Return the model to export. If flames add to its extinction, keep only the part of the source's extinction grid.
 
     Raises:
-        ConfigError: the model has not learned this component.
+        ConfigError: the model has not learned this part separately.
     """
     model = job.run.model
     if placement is None or placement.exact:

@@ -117,7 +117,7 @@ def encode_inspected_values(values: np.ndarray, scale: Scale) -> tuple[np.ndarra
     linear    any other                   255 (v - low) / (high - low)
     ========  ==========================  ==================================================
 
-    ``reach`` is the larger of |low| and |high|.
+    v is a value, low and high are the ends of the scale, and ``reach`` is the larger of |low| and |high|.
     """
     low, high = scale.low, scale.high
     if low == 0:

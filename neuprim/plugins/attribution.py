@@ -130,7 +130,7 @@ class RunPlugins:
     """The plugins that take part in a run: its task, its scene and its loss.
 
     Args:
-        task, scene: names, or ``PACKAGE:NAME``.
+        task, scene: ``NAME`` or ``PACKAGE:NAME`` of the run's task and of its scene.
         loss: ``NAME`` or ``PACKAGE:NAME`` of ``train.loss``; None for the task's own loss.
     """
 

@@ -49,7 +49,7 @@ class PluginVersion:
 
     Attributes:
         name: name of the task, scene or loss, without its package.
-        package, version: the distribution that provided the plugin; the version may be empty.
+        package, version: name and version of the distribution that provided the plugin; the version may be empty.
     """
 
     name: _Name

@@ -66,7 +66,7 @@ class PluginInfo:
 
     Attributes:
         name: name of the entry point; for a task this is what the user types after ``task=``.
-        distribution, version: the installed package that registers it.
+        distribution, version: name and version of the installed package that registers the plugin.
         target: ``module:attribute`` of the plugin's description, for example of a :class:`~neuprim.core.task.TaskSpec`.
     """
 

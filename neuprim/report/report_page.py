@@ -80,7 +80,7 @@ def report_banner(notes: Iterable[str]) -> str:
 
 
 def report_tiles(items: Iterable[Tile]) -> str:
-    """Return tiles with key numbers in large type, as HTML."""
+    """Return tiles with key numbers in large type, as HTML. An item is (label, number, note)."""
     cells = "".join(
         f'<div class="tile"><dt>{label}</dt><dd>{value}</dd><dd class="note" title="{text}">{text}</dd></div>'
         for label, value, text in items
@@ -93,7 +93,8 @@ def figure(source: Path | Tensor, caption: str, alternative: str, attributes: st
 
     Args:
         source: a picture file, or an (H, W, 3) image.
-        caption, alternative, attributes: HTML.
+        caption, alternative: the text below the picture and its ``alt`` text, both as HTML.
+        attributes: HTML attributes of the ``<figure>`` element.
     """
     under = f"<figcaption>{caption}</figcaption>" if caption else ""
     shown = inline_picture(source) if isinstance(source, Tensor) or source.is_file() else None
@@ -104,7 +105,7 @@ def figure(source: Path | Tensor, caption: str, alternative: str, attributes: st
 
 
 def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> str:
-    """Return charts as HTML, each with its caption, which is HTML. Charts without points are left out."""
+    """Return (caption, chart) pairs as HTML of CSS class ``kind``. Captions are HTML; empty charts are left out."""
     panels = [
         f'<figure class="panel"><figcaption>{caption}</figcaption>{drawn}</figure>'
         for caption, chart in charts
@@ -114,14 +115,14 @@ def chart_panels(charts: Iterable[tuple[str, Chart]], kind: str = "panels") -> s
 
 
 def number_table(head: Iterable[str], rows: Iterable[str], kind: str = "numbers") -> str:
-    """Return a table as HTML; titles and rows (:func:`table_row`) are HTML."""
+    """Return a table of CSS class ``kind`` as HTML. Column titles (``head``) and rows (:func:`table_row`) are HTML."""
     titles = "".join(title if title.startswith("<th") else f"<th>{title}</th>" for title in head)
     table = f'<table class="{kind}"><thead><tr>{titles}</tr></thead><tbody>{"".join(rows)}</tbody></table>'
     return f'<div class="scroll">{table}</div>'
 
 
 def table_row(name: str, cells: Iterable[str], attributes: str = "") -> str:
-    """Return one row of a table as HTML: its heading and its cells, which are HTML."""
+    """Return a table row as HTML. Its heading ``name``, its cells and the attributes of its element are HTML."""
     body = "".join(cell if cell.startswith("<td") else f"<td>{cell}</td>" for cell in cells)
     return f"<tr{attributes}><th scope=row>{name}</th>{body}</tr>"
 

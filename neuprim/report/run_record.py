@@ -32,7 +32,7 @@ class ReportedRun:
     Attributes:
         metrics: content of ``metrics.json``; empty if the run has not finished.
         log: complete lines of ``metrics.jsonl``.
-        views, clips: pictures of held-out views, and video clips, in ``renders/``.
+        views, clips: the pictures of held-out views and the video clips that are in ``renders/``.
     """
 
     run_dir: Path

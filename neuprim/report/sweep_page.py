@@ -44,8 +44,8 @@ class SweepPageRun:
     Attributes:
         name: name of the run's folder in the sweep's directory.
         swept: key -> value, as typed, of the settings that differ between runs.
-        state, line: how the run ended; one line that says why it failed.
-        seconds, attempts: time from the run's start to its end; number of starts.
+        state, line: how the run ended, and one line of text that says why it failed.
+        seconds, attempts: the time from the run's start to its end, and how often the run was started.
         run: content of the run's directory.
     """
 

@@ -172,7 +172,7 @@ def prepare_training(
     """Load the data and create loss, model and trainer, without training. Raises the errors of :func:`fit`.
 
     Args:
-        hold_out: n > 1: hold out every n-th training view; these replace the test views. 0: use the splits unchanged.
+        hold_out: n > 1 holds out every n-th training view in place of the test views; 0 uses the splits unchanged.
         make: function that makes the trainer; None for :func:`make_run_trainer`, which creates an untrained model.
         group: the ranks that train the model together; None for one process.
     """

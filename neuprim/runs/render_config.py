@@ -179,10 +179,11 @@ class RunExrLayers:
         names: names of the layers, as after ``--layers``; None: all layers except those of single lights.
         half: whether alpha and the layers that hold light are stored as 16-bit floats.
         background: (C,) in the model's colour space. Without an alpha layer, beauty is composited over it.
-        lights: conditions of the lights of an environment map, whose images are summed; empty: the view's own light.
+        lights: conditions of the lights of an environment map, over which images are summed; empty: the view's light.
         world: coordinates and units of cameras, positions and depths in the file.
         fps: frames per second of the sequence that the images belong to; None if unknown.
-        shutter: motion blur: all layers are means over its sub-frames, of depth weighted by alpha; None for none.
+        shutter: shutter of the motion blur, which averages each layer over sub-frames, and depth with alpha as weight;
+            None: no motion blur.
 
     Raises:
         ConfigError: a layer is unknown, or holds light although the model's colours are not linear light.
@@ -246,7 +247,7 @@ class RunExrLayers:
     def _draw_layers(
         self, model: Primitives, view: View, present: dict[str, LayerSpec], on_alpha: Callable[[Tensor], None]
     ) -> dict[str, Tensor]:
-        """Return layer name -> (H, W, C) values that can be averaged over time: linear light, depth times alpha.
+        """Return layer name -> (H, W, C) values that can be averaged over time: linear light, and depth times alpha.
 
         The entry ``_COVERAGE`` is alpha. Layers that the model does not have are removed from ``present``.
         """

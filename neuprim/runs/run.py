@@ -123,7 +123,8 @@ class ChunkPlan:
 
     Attributes:
         chunks: the scene's chunks, with the function that joins their models.
-        configs: configuration of each chunk's run. runs: entry of each chunk's run in ``chunks.json``.
+        configs: configuration of each chunk's run.
+        runs: entry of each chunk's run in ``chunks.json``.
         steps: training steps of the joined model; None: as many as fit into ``seconds``.
     """
 

@@ -22,7 +22,7 @@ from neuprim.core.model.fields import ConditionSpec
 
 @dataclass(frozen=True)
 class Shutter:
-    """A shutter that is open from t - fraction interval/2 to t + fraction interval/2 in a frame of time t.
+    """A shutter that is open for ``fraction`` times ``interval``, centred on the time of each frame.
 
     Attributes:
         fraction: part of the interval between two frames, above 0 and at most 1.

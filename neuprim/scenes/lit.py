@@ -94,7 +94,7 @@ class LitView(NamedTuple):
 
 
 class LitImage(NamedTuple):
-    """Image of ``lit_solids``: premultiplied radiance and coverage, radiance without cast shadows, pixel classes."""
+    """Image of ``lit_solids``: premultiplied radiance with alpha, radiance without cast shadows, and pixel classes."""
 
     rgba: NDArray[np.float32]
     unshadowed: NDArray[np.float32]

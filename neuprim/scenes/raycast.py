@@ -84,7 +84,7 @@ class Scene:
         return Hits(hit, position, distance, normal, face, albedo, gloss, specular, owner, triangle, weight)
 
     def _first_hits(self, o: NDArray, d: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-        """Return per ray, (N,): triangle index or -1, barycentric u and v, and distance in lengths of ``d``."""
+        """Return four (N,) arrays of N rays: triangle or -1, barycentric u and v, and distance in lengths of ``d``."""
         return self._search.first(o, d)
 
     def occluded(self, points: ArrayLike, directions: ArrayLike, distance: ArrayLike = np.inf) -> NDArray[np.bool_]:
@@ -139,7 +139,7 @@ class _EmbreeEngine:
 
 
 class _BoxHierarchy:
-    """Bounding volume hierarchy of triangles (F, 3) of vertices (V, 3); same queries as :class:`_EmbreeEngine`."""
+    """Bounding volume hierarchy of F triangles with vertices (V, 3) and indices (F, 3); queries as _EmbreeEngine."""
 
     def __init__(self, vertices: NDArray, faces: NDArray) -> None:
         corners = vertices[faces].astype(np.float64)
@@ -159,7 +159,8 @@ class _BoxHierarchy:
 
 
 def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDArray, NDArray]:
-    """Build the tree; return triangle order, node boxes, and per node (first child, 0) or (first triangle, count)."""
+    """Build the tree of triangles with bounding boxes ``low``, ``high``; return the triangles' order, the nodes' boxes
+    and the nodes' links: (first child, 0) for an inner node, (first triangle, count) for a leaf."""
     order = np.arange(len(low))
     middle = (low + high) / 2
     boxes: list[tuple[NDArray, NDArray]] = [(low[:0], high[:0])]
@@ -186,7 +187,7 @@ def _build_box_tree(low: NDArray, high: NDArray) -> tuple[NDArray, NDArray, NDAr
 
 @numba.njit(nogil=True, error_model="numpy")
 def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-untyped-def]
-    """Return the distance at which a ray enters the box of ``node``; infinity if it misses the box."""
+    """Return the distance at which a ray from ``o`` enters the box of ``node``; infinity if not before ``limit``."""
     near, far = 0.0, limit
     for axis in range(3):
         a, b = (low[node, axis] - o[axis]) * inverse[axis], (high[node, axis] - o[axis]) * inverse[axis]
@@ -199,7 +200,7 @@ def _raycast_box_entry(low, high, node, o, inverse, limit):  # type: ignore[no-u
 
 @numba.njit(nogil=True, error_model="numpy")
 def _intersect_triangle(corner, o, d):  # type: ignore[no-untyped-def]
-    """Intersect a ray with a triangle (3, 3); return barycentric u, v and the distance. Without a hit, it is -1."""
+    """Intersect a ray with a triangle (3, 3); return barycentric u, v and the distance, -1 without a hit."""
     ex, ey, ez = corner[1, 0] - corner[0, 0], corner[1, 1] - corner[0, 1], corner[1, 2] - corner[0, 2]
     fx, fy, fz = corner[2, 0] - corner[0, 0], corner[2, 1] - corner[0, 1], corner[2, 2] - corner[0, 2]
     px, py, pz = d[1] * fz - d[2] * fy, d[2] * fx - d[0] * fz, d[0] * fy - d[1] * fx

@@ -245,7 +245,7 @@ def room_camera_poses(train: int, test: int) -> dict[str, list[NDArray[np.float6
 
 
 def _walk_pose(t: float, shake: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the (4, 4) pose at ``t``, 0..1, of a walk of two rounds; ``shake`` (7,), -1..1, varies eye, aim, roll."""
+    """Return the (4, 4) pose at ``t``, 0..1, of a walk of two rounds; ``shake`` (7,), -1..1, moves eye, aim, roll."""
     turn = 2 * math.pi
     distance = 3.55 + 0.8 * math.sin(turn * (5 * t + 0.15)) + 0.12 * shake[0]
     height = 1.1 - 0.6 * math.cos(turn * t) + 0.1 * math.sin(turn * 7 * t) + 0.06 * shake[1]

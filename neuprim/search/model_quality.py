@@ -28,7 +28,7 @@ MAX_PSNR = 200.0  # dB that stand for equal images, as JSON has no infinity
 
 @dataclass(frozen=True)
 class EvalView:
-    """A test view, its ground truth over the background, (H, W, C), and a mask of valid pixels (None: all valid)."""
+    """A test view, its (H, W, C) ground truth over the background, and a mask of valid pixels (None: all are valid)."""
 
     view: View
     image: Tensor

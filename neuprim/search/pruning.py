@@ -57,11 +57,12 @@ Progress = Callable[[str, float], None]
 
 @dataclass(frozen=True)
 class PruningStage:
-    """One round of pruning.
+    """One round of pruning, with all reductions of fields so far (``words``).
 
     Attributes:
-        words: reductions of fields so far. primitives, numbers: primitives and parameter values that remain.
-        cut, trained: quality after the cut and after fine-tuning, dB. kept: whether the loss is within the tolerance.
+        primitives, numbers: how many primitives, and how many parameter values, remain.
+        cut, trained: quality in dB after the round's cut, and after the fine-tuning that follows the cut.
+        kept: whether the loss is within the tolerance.
     """
 
     words: tuple[str, ...]
@@ -74,12 +75,13 @@ class PruningStage:
 
 @dataclass(frozen=True)
 class _PruningState:
-    """Intermediate model of pruning.
+    """Intermediate model of pruning, with all reductions of its fields so far (``words``).
 
     Attributes:
-        words: all reductions of the model's fields so far.
-        bite: intended loss by the last cut, before fine-tuning, dB; cut: quality after this cut, dB.
-        lost: loss relative to the full model, dB; rounds: rounds of fine-tuning since the last cut.
+        bite: loss in dB that the last cut was intended to cause, before fine-tuning.
+        cut: quality after the last cut, before fine-tuning, dB.
+        lost: loss relative to the full model, dB.
+        rounds: rounds of fine-tuning since the last cut.
         fields_only: whether the last cut only reduced fields.
     """
 
@@ -254,7 +256,7 @@ class PruneRequest:
         steps: number of fine-tuning steps, instead of ``seconds``; the result is then the same on every machine.
         out: the new run directory; None for the run's name with "-pruned".
         overwrite: whether existing files may be replaced.
-        hold_out: n > 1: use every n-th training view neither for fine-tuning nor for decisions; 0: use all.
+        hold_out: n > 1 keeps every n-th training view out of fine-tuning and of decisions; 0 uses all training views.
     """
 
     run_dir: Path  # the run directory

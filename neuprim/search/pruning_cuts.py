@@ -60,15 +60,15 @@ def list_pruning_reductions(model: Primitives) -> list[tuple[str, str, int]]:
 def price_cuts(
     model: Primitives, views: Sensitivity, inside: Sensitivity | None, quality: SearchQuality
 ) -> Sensitivity:
-    """Return the effect of removing each primitive and each unit: the mean squared change of images, plus the weighted
-    change of the extinction if ``inside`` has it.
+    """Return the effect of removing each primitive and each unit: the mean squared change of images, from ``views``,
+    plus the weighted change of the extinction, from ``inside``. Without ``inside``, only images count.
     """
     priced = replace(views, whole=views.whole * _measure_contrast(model, views, quality))
     return priced if inside is None else priced.combine(inside, quality.inside_weight(model))
 
 
 def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQuality) -> float:
-    """Measure the mean squared difference of primitives' colours to the colours behind them, by removing a few."""
+    """Measure the mean squared difference between primitives' colours and the colours behind, by removing a few."""
     count = max(int(_PROBE * model.count), 1)
     order = effects.whole.where(effects.seen > 0, torch.inf).argsort(stable=True)
     kept = order[count:].sort().values
@@ -82,8 +82,9 @@ def _measure_contrast(model: Primitives, effects: Sensitivity, quality: SearchQu
 
 
 class _Sizes(NamedTuple):
-    """Parameter values that can be removed: number of nonzero values of each primitive, (N,); unit -> which primitives
-    have the unit, (N,) bool; unit -> its number of values in one primitive.
+    """Parameter values that can be removed: ``whole`` (N,) has the number of nonzero values of each primitive.
+    ``present`` maps the name of a unit to an (N,) bool mask of the primitives that have the unit, and ``units`` maps it
+    to the unit's number of values in one primitive.
     """
 
     whole: Tensor

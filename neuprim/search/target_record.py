@@ -115,7 +115,8 @@ class TargetRecord:
         chosen: name of the folder of the full run that was chosen as the result.
         achieved: measurements of the result: quality of test and held-out views, bytes, frames per second.
         out_of_reach: message that the target cannot be reached; None unless trials show this.
-        why: reasons why the search ended; warning: message that the target was missed.
+        why: reasons why the search ended.
+        warning: message that the target was missed.
     """
 
     asked: dict[str, float]
@@ -199,8 +200,9 @@ class TrialRunner:
     """Run the trainings that a target search requests. A training whose outcome is in the record is not repeated.
 
     Attributes:
-        config: configuration from which the search starts; dataset: the whole scene.
-        clock: function that returns monotonic seconds; begun: its value at the start of the budget.
+        config: configuration from which the search starts.
+        dataset: data of the whole scene.
+        clock: function that returns monotonic seconds; it returned ``begun`` at the start of the budget.
     """
 
     config: RunConfig

@@ -80,7 +80,8 @@ def chain_pareto_steps(steps: Sequence[ParetoStep], min_gain: float = 0.01) -> l
     """Return combinations of overrides that are expected on the Pareto front: two or more settings, one override each.
 
     Gains and losses are assumed to add up; the combinations are measured later. Each combination extends the previous
-    one by the step with the least loss per gain. A step changes one more setting, or changes a setting further.
+    one by the step with the least loss per gain, among the steps that gain more than ``min_gain``. A step changes one
+    more setting, or changes a setting further.
     """
     state: dict[str, ParetoStep] = {}
     chain: list[tuple[str, ...]] = []
@@ -134,8 +135,9 @@ class TradeoffPoint:
         words: overrides that reproduce the point.
         quality: psnr, ssim, ssim_3dgs; lpips and lpips_3dgs if there are weights.
         bytes: size of the model file.
-        ms: mean milliseconds per frame in each round; ratios: frame time divided by the reference's in each round.
-        turned, length: for trained models: overrides on top of the centre's, and fraction of the full training length.
+        ms: mean milliseconds per frame in each round.
+        ratios: frame time divided by the reference's in each round.
+        turned, length: overrides on top of the centre's, and fraction of the full training length, of a trained model.
         centre_ms: median milliseconds per frame of the centre over all rounds.
         run_dir: run directory, relative to the record's folder; empty unless trained.
     """

@@ -42,7 +42,7 @@ class Trial:
     """Request for a trial: a short training in the ``output_dir`` of ``config``.
 
     Attributes:
-        hold_out: n > 1: hold out every n-th training view for evaluation; 0: evaluate on the test views.
+        hold_out: n > 1 holds out every n-th training view for the evaluation; 0 evaluates on the test views.
         views: limit on the number of views to evaluate; they are evenly spread.
     """
 
@@ -58,7 +58,8 @@ class Outcome:
     Attributes:
         psnr, ssim: means over the evaluation views, in the data set's colour space.
         bytes: size of ``model.safetensors``.
-        seconds: time of the training. pace: seconds per training step.
+        seconds: time of the training.
+        pace: seconds per training step.
         ms_per_frame: median render time over the evaluation views.
     """
 

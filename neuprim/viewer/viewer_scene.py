@@ -228,7 +228,8 @@ class FrameEllipsoids(NamedTuple):
 
     Attributes:
         rows: (M,) indices of the primitives in the model.
-        positions: (M, 3) centres; wxyz: (M, 4) unit quaternions; scales: (M, 3) semi-axes.
+        positions, scales: (M, 3) centres and (M, 3) semi-axes of the ellipsoids.
+        wxyz: (M, 4) unit quaternions of their orientations.
         colours: (M, 3) uint8 sRGB, colours at the centres, seen from the viewpoint's camera.
     """
 

@@ -296,8 +296,8 @@ def _make_webpage_camera(middle: Sequence[float], radius: float, up: Sequence[fl
 
 
 def webpage_camera_numbers(camera: Camera) -> dict[str, Any]:
-    """Return a camera in the form of the page's scripts: world-to-camera R (row by row) and t, OpenCV axes; intrinsics
-    in pixels.
+    """Return a camera in the form of the page's scripts: rotation R (row by row) and translation t from world to
+    camera, OpenCV axes, and intrinsics and image size in pixels.
     """
     view = camera.viewmat.detach().double().cpu()
     numbers = {name: float(getattr(camera, name)) for name in ("fx", "fy", "cx", "cy", "width", "height")}
@@ -336,7 +336,7 @@ def shader_constants(edge: int) -> dict[str, list[float]]:
     """Return constants of the page's shader: polynomials in z = v^2 and the positive half of a Gauss rule.
 
     The polynomials, highest power first, hold for |v| <= 1/2: ``cos`` is cos(2 pi v), ``sinc`` is
-    sin(2 pi v)/(2 pi v), and ``edge`` is B_p(2 pi v) of :mod:`neuprim.core.model.edge`.
+    sin(2 pi v)/(2 pi v), and "edge" is B_p(2 pi v) of :mod:`neuprim.core.model.edge` for p = ``edge``.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     turn = 2 * math.pi

@@ -92,7 +92,8 @@ class ProcessExecutor:
         folder: folder for the workers' logs.
 
     Attributes:
-        workers: number of parallel tasks. threads: threads per task.
+        workers: number of parallel tasks.
+        threads: number of threads per task.
     """
 
     def __init__(self, settings: LauncherSettings, jobs: int, folder: Path) -> None:

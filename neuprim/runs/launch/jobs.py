@@ -195,7 +195,8 @@ class WorkerTask:
 
     Attributes:
         threads: number of threads that the job may use.
-        status: file for the job's status. stop: the job stops when this file exists.
+        status: file for the job's status.
+        stop: file whose existence makes the job stop, like Ctrl-C.
         cwd: folder that relative paths refer to.
         variables: environment variables, set before large libraries are imported.
         attempt: how often the job's worker died before.

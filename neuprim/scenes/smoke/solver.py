@@ -170,7 +170,7 @@ class GasState:
     """State of the gas ``time`` seconds after the start.
 
     Attributes:
-        velocity: at the faces, divergence-free.
+        velocity: divergence-free velocity, stored on the faces of the cells.
         density, temperature, fuel: (X, Y, Z) float32. Fuel is the reaction coordinate: 1 as it leaves the source, 0
             when burnt.
         colour: (3, X, Y, Z) albedo times density, so that mixed smoke has a weighted mean albedo; or None.
@@ -301,8 +301,8 @@ def _gas_acceleration(
 ) -> Tensor:
     """Return the (3, X, Y, Z) acceleration of gas: buoyancy, weight and vorticity confinement e h (N x w).
 
-    w = curl u and N = grad |w| / |grad |w|| (Fedkiw, Stam and Jensen 2001). Confinement restores the small eddies that
-    interpolation damps.
+    e is ``settings.confinement``, h the edge of a cell, w = curl u the vorticity of the velocity u, and N = grad |w| /
+    |grad |w|| (Fedkiw, Stam and Jensen 2001). Confinement restores the small eddies that interpolation damps.
     """
     if settings.confinement:
         w = _vorticity(velocity, box.cell)
@@ -402,8 +402,8 @@ def advect_field(fields: Tensor, velocity: Tensor, time: float, cell: float, blu
     """Advect (C, X, Y, Z) fields for ``time`` seconds by a velocity (3, X, Y, Z) in world units per second.
 
     Points are traced back with the midpoint rule. The blur of the interpolation is then corrected (MacCormack; Selle,
-    Fedkiw, Kim, Liu and Rossignac 2008, "An unconditionally stable MacCormack method"): advect forward, advect back,
-    and add half of the difference from the original,
+    Fedkiw, Kim, Liu and Rossignac 2008, "An unconditionally stable MacCormack method"): advect the fields q forward
+    (A), then back (A^-1), and add half of the difference from q,
 
         q1 = A(q),   q2 = A^-1(q1),   q' = q1 + (q - q2) / 2,
 

@@ -154,7 +154,8 @@ def invisible_fraction_over_time(model: Primitives, times: Sequence[Tensor]) -> 
     """Return the fraction of primitives that are invisible: opacity below 1/255 along all three axes at all ``times``.
 
     Along axis j, with direction r_j and semi-axis s_j, the optical depth of the chord through the centre is I = (N_p
-    s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)), see :mod:`neuprim.core.model.edge`.
+    s_j/m) (b2 + sum_k w2_k cos(omega0 b1_k) B_p(omega0 W1_k . r_j s_j/m)). m is the largest semi-axis;
+    :mod:`neuprim.core.model.edge` defines N_p and B_p for the exponent p of the edge.
     """
     most_opaque = torch.zeros(model.count, dtype=torch.float64)
     density, params = model.density, {k: v.detach() for k, v in model.of(model.density).items()}

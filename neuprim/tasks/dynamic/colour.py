@@ -31,8 +31,9 @@ class TimeHarmonics(ColourField):
     """SH colour whose lowest band changes in time: c = max(0, C0 S(xi) + higher bands + 1/2).
 
     S(xi) = S0 + sum_{i=1..n} a_i xi^i + sum_{i=1..l} (b_i cos(w i xi) + c_i sin(w i xi)) has 1 + n + 2 l parameters
-    per channel; n is ``powers``, l is ``waves``, and ``frequencies`` chooses w, see :data:`FREQUENCIES`. The higher
-    bands do not change in time. With n = l = 4, three channels have 84 parameters at degree 3 and 39 at degree 0.
+    per channel: S0, a_i, b_i and c_i. xi is the time, C0 is the constant SH of degree 0, n is ``powers``, l is
+    ``waves``, and ``frequencies`` chooses w, see :data:`FREQUENCIES`. The higher bands do not change in time. With
+    n = l = 4, three channels have 84 parameters at degree 3 and 39 at degree 0.
     """
 
     def __init__(

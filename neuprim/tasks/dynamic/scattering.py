@@ -42,7 +42,7 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 
 
 class ScatteringHarmonics(TimeHarmonics):
-    """Emission plus single scattering of one light, c = TimeHarmonics(xi, d) + T max(0, a) E/typical.
+    """Emission, the colour of :class:`TimeHarmonics`, plus single scattering of one light: T max(0, a) E/typical.
 
     a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction times the isotropic
     phase function 1/4 pi. T is the model's transmittance from the primitive's centre to the light, without gradient

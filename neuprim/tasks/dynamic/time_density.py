@@ -93,14 +93,14 @@ def time_chunk_weights(chunk: Tensor, overlaps: ChunkOverlaps, xi: Tensor) -> Te
 
 
 class TimeDensity(DensityField):
-    """Density field f(x~, xi) of K cosine neurons that change in time; ``time`` names the parts (see the module).
+    """Density field of K cosine neurons; ``time`` names the parts that change in time (see the module).
 
     A primitive has 5K + 1 parameters plus the parameters of the parts. The setting ``model.init`` has the keys of
     :class:`~neuprim.core.model.cosine.CosineDensity`, and
 
     * ``window``: initial half width tau of windows, as a fraction of the sequence;
     * ``window_frames``: upper limit of the initial tau, in frames;
-    * ``rate``: W_t is initialised uniformly from -rate..rate.
+    * ``rate``: W_t of the part "phase" is initialised uniformly from -rate..rate.
 
     Args:
         seams: overlaps in time of the chunks from which a model was joined; empty for other models.
@@ -267,7 +267,7 @@ class TimeDensity(DensityField):
 
 
 def _advance_phase_in_time(b1: Tensor, W_t: Tensor, xi: Tensor, turn: float) -> Tensor:
-    """Return the phase b1 + xi W_t modulo 2 pi/omega0; exact to float32 even for times far outside 0..1."""
+    """Return b1 + xi W_t modulo ``turn``, 2 pi/omega0; exact to float32 even for times far outside 0..1."""
     phase = b1.double() + xi * W_t.double()
     return (phase - turn * torch.round(phase.detach() / turn)).to(b1)
 
@@ -303,9 +303,10 @@ _MIDDLE = 0.5  # reference time of motion without a window
 def drop_time_terms(params: Params, geometry: Geometry, part: str, omega0: float) -> dict[str, Tensor]:
     """Replace one time-dependent part of a :class:`TimeDensity` by its mean over time; return the new tensors.
 
-    Means are over xi in 0..1, weighted by the window if there is one. A phase cos(phi + xi a) is replaced by its mean
-    R cos(phi + psi), where R e^(i psi) is the mean of e^(i xi a). A window is replaced by its mean factor, a motion by
-    the mean position, which changes "means". The result still contains the tensors of the replaced part.
+    Means are over xi in 0..1, weighted by the window if there is one. A cosine cos(phi + xi a), whose phase changes at
+    the rate a, is replaced by its mean R cos(phi + psi), where R e^(i psi) is the mean of e^(i xi a). A window is
+    replaced by its mean factor, a motion by the mean position, which changes "means". The result still contains the
+    tensors of the replaced part.
     """
     if part == "phase":
         return {**params, **_mean_phase_over_time(params, omega0)}
@@ -319,7 +320,7 @@ def _sequence_mean_times(like: Tensor) -> Tensor:
 
 
 def _time_window_factor(params: Params, xi: Tensor) -> Tensor:
-    """Return (N, 1) window factors (1 - u^2)^2 of the primitives at time ``xi``."""
+    """Return the (N, 1) factors of the windows at time ``xi``: (1 - u^2)^2, u as in the module, and 0 for |u| > 1."""
     u = (xi - params["window_center"].double()) / params["log_window"].double().exp()
     return (1 - u * u).clamp_min(0.0).square()
 

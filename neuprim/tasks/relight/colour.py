@@ -59,7 +59,7 @@ class LightNetwork(ColourField):
         visibility: one of :data:`VISIBILITY`; equation 14 as printed has "none".
         boost: beta. With 1 the initial colour hardly depends on the light's direction; 30 overfits.
         falloff: divide the light's intensity by the squared distance, in scene units.
-        typical: E of a typical training light, in the data's units.
+        typical: strength of a typical training light in the data's units; E is relative to it.
     """
 
     init_settings = ("output",)
@@ -127,7 +127,8 @@ class LightNetwork(ColourField):
         return RayNet(self.boost * params["net_x"], self.boost * phase, out * factor[:, :, None], base * factor)
 
     def on_split(self, params: Params, old: Geometry, new: Geometry) -> dict[str, Tensor]:
-        """Adapt the parameters to a split, so that children have the parent's colour: x~' = x~ m/m' - (mu' - mu)/m'."""
+        """Adapt the parameters to a split, so that children have the parent's colour. The local point x~ of a parent
+        (centre mu, size m) is x~' = x~ m/m' - (mu' - mu)/m' in a child (centre mu', size m')."""
         r = (new.log_length_scale.double() - old.log_length_scale.double()).exp()
         shift = (new.means.double() - old.means.double()) / old.length_scale.double()[:, None]
         net_x = params["net_x"].double()
@@ -170,9 +171,10 @@ def prune_light_network_units(
 ) -> dict[str, Tensor]:
     """Prune a :class:`LightNetwork` to the ``keep`` hidden units per primitive that affect the colour most.
 
-    A removed unit is replaced by its mean over x~ in the ellipsoid and over all directions d and l. The mean of
-    cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) b(|beta W_x diag|) sinc(|beta W_d|) sinc(|beta W_l|), where b
-    is the mean over a ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean
+    A removed unit is replaced by its mean over x~ in the ellipsoid and over all directions d and l, with the symbols of
+    the module and phi = beta b. The mean of cos(phi + beta (W_x x~ + W_d d + W_l l)) is cos(phi) B(|beta W_x A|)
+    sinc(|beta W_d|) sinc(|beta W_l|), where the columns of A are the semi-axes in the units of x~, and B is the mean of
+    a cosine over the unit ball. The variance follows from cos^2 = (1 + cos 2(.))/2. In the multiplicative form the mean
     becomes part of the albedo.
     """
     net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
@@ -210,7 +212,7 @@ def prune_light_network_units(
 
 
 class LightHarmonics(ColourField):
-    """Baseline colour field c = E max(0, SH(direction mu -> light)), without view dependence and shadows."""
+    """Baseline colour field c = E max(0, SH(l)), without view dependence and shadows; E and l as in the module."""
 
     def __init__(self, degree: int = 5, channels: int = 3, falloff: bool = False, typical: float = 1.0) -> None:
         check_count(degree, 0, 8, "spherical-harmonics degree")
@@ -256,7 +258,8 @@ def real_light_harmonics(directions: Tensor, degree: int) -> Tensor:
 
     Bands are in order, m = -l..l. Recurrences give the associated Legendre functions, without Condon-Shortley phase:
     P_m^m = (2m - 1)!! sin^m, P_{m+1}^m = (2m + 1) z P_m^m, (l - m) P_l^m = (2l - 1) z P_{l-1}^m -
-    (l + m - 1) P_{l-2}^m; sin^m cos(m phi) and sin^m sin(m phi) are polynomials in x, y.
+    (l + m - 1) P_{l-2}^m. Here, sin is the sine of the angle from the z axis. With the azimuth phi, sin^m cos(m phi)
+    and sin^m sin(m phi) are polynomials in x and y.
     """
     x, y, z = directions.unbind(-1)
     cosine, sine = [torch.ones_like(x)], [torch.zeros_like(x)]

@@ -85,7 +85,7 @@ def _surface_colors_backward(  # type: ignore[no-untyped-def]
     start, stop, means, sizes, normal, albedo, highlight, log_gloss, indirect, light, eye, grad,
     g_light, g_eye, g_normal, g_albedo, g_highlight, g_log_gloss, g_indirect,
 ):  # fmt: skip
-    """Write the gradients of all inputs. g_light, g_eye: (N, 3) gradients of the vectors to light and camera."""
+    """Write all gradients ``g_...``; ``g_light`` and ``g_eye`` (N, 3) are of the vectors to light and camera."""
     lobes, numbers, channels = log_gloss.shape[1], indirect.shape[1], albedo.shape[1]
     g_l = np.empty(3)
     for i in range(start, stop):

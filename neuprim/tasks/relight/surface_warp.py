@@ -27,7 +27,7 @@ def _over(v: wp.vec3d, shortest: wp.float64):
 
 @wp.func
 def _pull_back(g: wp.vec3d, v: wp.vec3d, over: wp.float64, shortest: wp.float64):
-    """Return the gradient of v, given the gradient g of ``over`` v (see :func:`_over`)."""
+    """Return the gradient of ``v``; ``g`` is that of ``over`` times ``v``, where ``over`` is :func:`_over` of ``v``."""
     if not wp.length(v) >= shortest:
         return over * g
     unit = over * v

@@ -21,10 +21,10 @@ _SHARPNESS = 2.0  # initial sharpness of a lobe: half as bright 49 degrees off i
 
 
 class SphericalHarmonics(ColourField):
-    """SH colour c = max(0, SH(direction camera -> mu) + 0.5), degree 0..3; (degree + 1)^2 parameters per channel.
+    """SH colour c = max(0, SH(d) + 0.5) of degree 0..3, with (degree + 1)^2 parameters per channel.
 
-    During training, one more SH band becomes active after every fraction ``sh_every`` of the training budget. A loaded
-    model uses all bands.
+    d is the direction from the camera to the primitive's centre. During training, one more SH band becomes active after
+    every fraction ``sh_every`` of the training budget. A loaded model uses all bands.
     """
 
     def __init__(self, degree: int = 3, channels: int = 3, sh_every: float = 0.0) -> None:
@@ -78,9 +78,10 @@ class SphericalHarmonics(ColourField):
 class SphericalLobes(ColourField):
     """Colour of 0..8 spherical Gaussian lobes, c = max(0, C0 sh_dc + 1/2 + sum_l a_l exp(s_l (m_l . d - 1))).
 
-    d is the direction camera -> mu. L lobes and C channels have C + L (C + 4) parameters. A lobe has an amplitude a_l
-    per channel, an axis m_l (three parameters, normalised when used) and the logarithm of a sharpness s_l. Lobes start
-    with random axes and amplitude zero.
+    d is the direction from the camera to the primitive's centre, and C0 is the constant SH of degree 0. L lobes and C
+    channels have C + L (C + 4) parameters: ``sh_dc`` and, for each lobe l, an amplitude a_l per channel, an axis m_l
+    (three parameters, normalised when used) and the logarithm of a sharpness s_l. Lobes start with random axes and
+    amplitude zero.
     """
 
     stage = 0

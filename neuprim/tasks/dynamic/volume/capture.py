@@ -72,7 +72,7 @@ class Capture:
     Attributes:
         frames: the .vdb files, in order.
         cameras: training cameras, then ``held_out`` test cameras.
-        samples: n for n x n rays per pixel.
+        samples: rays per pixel along each axis of the image.
         lights: number of lights per frame. If several, training cameras take turns; test cameras have other lights.
         bounds: (2, 3) box around all matter, scene units.
         ends: numbers of the frames with time 0 and 1; None for the first and the last frame.
@@ -167,8 +167,9 @@ class Capture:
     def fetch_points(self, store: Store, frame: VdbFrame) -> Path:
         """Return the local path of a frame's ``points.npz``.
 
-        The file has the arrays means (M, 3), scene units; colors (M, 3), linear radiance; weight (), total extinction;
-        largest (), largest extinction; brightest (), largest radiance in the frame's images.
+        The file has the ``means`` (M, 3), scene units, and ``colors`` (M, 3), linear radiance, of M points. It also has
+        three numbers: the total extinction ``weight``, the largest extinction ``largest``, and the largest radiance in
+        the frame's images, ``brightest``.
         """
         return store.fetch_file(f"{self.frame_folder(frame)}/{LAST_FILE}", _POINTS_BYTES)
 
@@ -367,10 +368,10 @@ def hemisphere_capture_cameras(
 
 
 def choose_rays_per_pixel(camera: Camera, voxel: float) -> int:
-    """Return n for n x n rays per pixel: 1 if pixels at the centre of the box are narrower than a ``voxel``, else 2.
+    """Return the rays per pixel along each axis: 1 if pixels at the box's centre are narrower than a voxel, else 2.
 
-    ``voxel`` is in scene units. For such narrow pixels, images with one ray have a PSNR of 67 to 72 dB against many
-    rays (`smoke_fire` at 160×160), and take a third of the time of 2 x 2 rays.
+    ``voxel`` is the edge of a voxel in scene units. For such narrow pixels, images with one ray have a PSNR of 67 to
+    72 dB against many rays (`smoke_fire` at 160×160), and take a third of the time of 2 x 2 rays.
     """
     return 1 if _DISTANCE / camera.fx < voxel else 2
 

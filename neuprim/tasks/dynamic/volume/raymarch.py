@@ -125,7 +125,7 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 
     Args:
         camera: pinhole, scene units.
-        samples: n for n x n rays per pixel, on a regular grid.
+        samples: rays per pixel along each axis of the image, on a regular grid.
         subdivisions: sub-intervals per cell; more than 1 only to verify the error.
     """
     if medium.empty or medium.skips.min() > 0:
@@ -180,7 +180,7 @@ def _inverse_march_direction(d):  # type: ignore[no-untyped-def]
 
 @inline
 def _march_cell_exit(o, inverse, cell, reach):  # type: ignore[no-untyped-def]
-    """Return the t at which the ray leaves the cells ``cell - reach … cell + reach`` of one axis."""
+    """Return the t at which a ray o + t/``inverse`` leaves the cells ``cell - reach … cell + reach`` of one axis."""
     if inverse > 0.0:
         return (cell + reach + 1 - o) * inverse
     if inverse < 0.0:
@@ -306,10 +306,11 @@ def _march_image_rows(start, stop, values, skips, pose, lens, width, samples, pa
     """Render image rows start … stop.
 
     Args:
-        values, skips: of a :class:`Medium`.
+        values, skips: attributes of the :class:`Medium` to render.
         pose: (3, 4) float64, from camera space (scene units) to indices.
         lens: (4,) float64 fx fy cx cy.
-        samples: n for n x n rays per pixel. parts: sub-intervals per cell.
+        samples: rays per pixel along each axis of the image.
+        parts: sub-intervals per cell.
         image: (H, W, 4) float32, premultiplied RGBA, written.
     """
     nx, ny, nz = skips.shape
@@ -408,7 +409,8 @@ def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignor
     """Write the optical depth along one direction, from each voxel of slices start … stop to the grid's border.
 
     Args:
-        sigma: (X, Y, Z) float32. skips: of a :class:`Medium`.
+        sigma: (X, Y, Z) float32 extinction of a medium.
+        skips: :attr:`Medium.skips` of this medium.
         rx, ry, rz: the direction, indices per scene unit.
         result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
     """

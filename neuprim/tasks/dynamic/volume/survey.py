@@ -32,7 +32,7 @@ class GridReader:
     """Reader of the grids of .vdb files by meaning ("density", "temperature", "flames", "color").
 
     Attributes:
-        names: meaning -> name in the files.
+        names: meaning of a grid -> its name in the files.
         extinction: meaning of the grid that absorbs.
     """
 

@@ -125,7 +125,7 @@ def _run_command(args: argparse.Namespace) -> int:
         if viewer is not None and given:
             raise ConfigError(f"viewer=true: the viewer shows a single run and cannot be combined with {name}")
     if wanted is not None and args.multirun:
-        raise ConfigError(f"{wanted[0]}: a run with a target cannot be combined with -m; leave one of them out")
+        raise ConfigError(f"{wanted[0]}: a run with a target cannot be combined with -m; leave out -m or the target")
     if args.multirun and not drop_output_overrides(overrides):
         from neuprim.runs.sweep import read_sweep_overrides
 
@@ -161,7 +161,9 @@ def _run_command_with_target(
             record = run_target(config, target, budget, events, launcher=launcher)
     except KeyboardInterrupt:
         command = typed.resume_command(config.output_dir)
-        raise KeyboardInterrupt(f"; {config.output_dir} has the trials so far; to continue:\n  {command}") from None
+        raise KeyboardInterrupt(
+            f"; {config.output_dir} holds the trials trained so far; to continue:\n  {command}"
+        ) from None
     for line in _list_printed_target_lines(record):
         events.console.print(line)
     print_run_summary(Path(record.achieved["run_dir"]))

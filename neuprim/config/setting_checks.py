@@ -85,7 +85,7 @@ def task_and_loss_options(spec: TaskSpec, loss: LossExtension | None) -> Mapping
     for name in sorted(spec.options.keys() & loss.options.keys()):
         raise ConfigError(
             f"train.loss={loss.name}: the loss and task {spec.name!r} both have an option {name!r}; "
-            "they cannot be combined"
+            "choose another loss, or rename the option in its plugin"
         )
     return {**spec.options, **loss.options}
 

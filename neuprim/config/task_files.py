@@ -124,7 +124,9 @@ def _read_with_defaults(
 
     place = f"{folder}/{name}.yaml"
     if name in readers:
-        raise ConfigError(f"{who}{place}: defaults: the file includes itself; expected no cycle")
+        raise ConfigError(
+            f"{who}{place}: defaults: the file includes itself, perhaps through others; remove one of these defaults"
+        )
     own = read_task_yaml(root / folder / f"{name}.yaml", f"{who}{place}")
     names = own.pop("defaults", ["_self_"])
     if not isinstance(names, list) or not all(isinstance(entry, str) for entry in names):
@@ -191,7 +193,7 @@ def choose_config_effort_level(
     level = levels[int(chosen)]
     if preset not in (None, level.preset):
         found = f"this level of task {spec.name!r} uses preset={level.preset}, found preset={preset}"
-        raise ConfigError(f"{typed}: {found}; leave one of the two out")
+        raise ConfigError(f"{typed}: {found}; leave out {EFFORT} or preset")
     return level
 
 
@@ -216,7 +218,7 @@ def _parse_config_effort_levels(node: Mapping[str, Any], presets: Sequence[str])
         raise ConfigError(f"preset={format_setting_value(preset)}: no such preset{nearest(str(preset), presets)}")
     if not isinstance(levels, Mapping) or list(levels) != list(LEVELS):
         found = format_setting_value(list(levels) if isinstance(levels, Mapping) else levels)
-        raise ConfigError(f"levels: found {found}; expected {LEVELS[0]} to {LEVELS[-1]}, in this order")
+        raise ConfigError(f"levels: found {found}; expected the keys {LEVELS[0]} to {LEVELS[-1]}, in this order")
     made = {}
     for number, given in levels.items():
         if not isinstance(given, Mapping) or any(str(key).partition(".")[0] not in PRESET_GROUPS for key in given):

@@ -113,7 +113,8 @@ class Channels:
         if not isinstance(found, Tensor) or tuple(found.shape) != expected or not found.is_floating_point():
             what = f"{found.dtype} of shape {tuple(found.shape)}" if isinstance(found, Tensor) else type(found).__name__
             raise ConfigError(
-                f"task {self.task!r}: display returned {what} for {tuple(image.shape)}; expected floats {expected}"
+                f"task {self.task!r}: display returned {what} for an image {tuple(image.shape)}; "
+                f"expected floats {expected}"
             )
         bad = int((~torch.isfinite(found)).sum())
         if bad:

@@ -52,7 +52,7 @@ def write_tensors(path: Path, kind: str, tensors: Mapping[str, Tensor], header: 
         with atomic_path(path) as temporary:
             save_file(compact, str(temporary), metadata={_KEY: text})
     except (OSError, SafetensorError) as error:
-        left = "the previous one, if any, is untouched"
+        left = "a file that was there before is unchanged"
         raise CheckpointError(f"{path}: could not write the {kind}: {error}; {left}") from error
 
 

@@ -156,7 +156,9 @@ def count_condition_frames(texts: Mapping[str, str], found: Mapping[str, Sequenc
         each = " and ".join(
             f"{condition_flag(name)} {texts[name]} has {count} frames" for name, count in counts.items()
         )
-        raise ConfigError(f"{each}; expected equal numbers of frames, or only one condition with a number of frames")
+        raise ConfigError(
+            f"{each}; expected equal numbers of frames, or several frames in only one of these conditions"
+        )
     return max(counts.values(), default=1)
 
 

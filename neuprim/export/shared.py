@@ -107,7 +107,9 @@ def _export_colours_from_afar(run: TrainedModel, conditions: Conditions, directi
     lowered = run.model.lower(camera, conditions, run.settings)
     if not lowered.colour.per_primitive:
         form = type(lowered.colour).__name__
-        raise ConfigError(f"{run.directory}: colours of the form {form} have no value per primitive to export")
+        raise ConfigError(
+            f"{run.directory}: colours of the form {form} have no value per primitive; expected --format ply or npz"
+        )
     return lowered.center_colors(camera.position).double()
 
 

@@ -134,8 +134,8 @@ def _exported_component(job: ExportJob, placement: DensityGridPlacement | None) 
         return model
     if placement.component not in model.density.components(model.params):
         raise ConfigError(
-            f"{job.run.directory}: the model's extinction mixes flames with grid {placement.grid!r}, so the density of "
-            "this grid alone is unknown; train again with train.supervision=both and scene.optics.extinction above 0"
+            f"{job.run.directory}: the model's extinction is a sum of flames and grid {placement.grid!r}, so the "
+            "part of this grid is unknown; train again with train.supervision=both and scene.optics.extinction above 0"
         )
     return model.component(placement.component)
 

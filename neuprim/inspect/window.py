@@ -288,7 +288,7 @@ def prepare_headless() -> None:
     if failure:
         raise BackendUnavailable(
             f"VTK cannot draw pictures here ({failure}); on Debian or Ubuntu: apt install libegl1 libgl1-mesa-dri; "
-            "--out FILE.html and --out FILE.vdb work without them"
+            "--out FILE.html and --out FILE.vdb work without these packages"
         )
     from vtkmodules.vtkCommonCore import vtkLogger
 

@@ -158,7 +158,7 @@ def check_resumed_provenance(stored: object, now: Provenance, file: Path) -> Non
     if canonicalize_name(before.task.package) != canonicalize_name(now.task.package):
         raise CheckpointError(
             f"{file}: written for task {before.task.name!r} of {before.task.origin}; "
-            f"this run uses the task of {now.task.origin}"
+            f"this run uses the task {now.task.name!r} of {now.task.origin}; use the package that wrote the file"
         )
     warn_of_other_provenance(before, file)
     for kind, old in before.plugins.items():

@@ -89,8 +89,8 @@ def _check_run_export_files(report: Any, output: StagedOutput, exporter: str) ->
         final = output.final_path(path)
         if final is None:
             raise PluginError(
-                f"{exporter}: wrote {path} instead of {output.out}; expected only files below the given path, "
-                f"where existing files are protected"
+                f"{exporter}: wrote {path} instead of {output.out}; expected only this output path, or "
+                f"files in it (neuprim protects existing files there)"
             )
         if not path.exists():
             raise PluginError(f"{exporter}: reports {path}, which it did not write")

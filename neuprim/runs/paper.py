@@ -75,7 +75,7 @@ def plan_paper_runs(
     for flag, given, known in (("--scenes", scenes, every_scene), ("--rows", rows, every_row)):
         for name in given:
             if name not in known:
-                raise ConfigError(f"{flag} {name}: not in these tables{nearest(name, known)}")
+                raise ConfigError(f"{flag} {name}: not in the chosen tables{nearest(name, known)}")
     if not data.is_dir():
         raise ConfigError(f"--data {data}: no such folder")
     folders = {entry.name.casefold(): entry for entry in sorted(data.iterdir()) if entry.is_dir()}

@@ -202,7 +202,7 @@ class _RunRenderSession:
         illumination = self.task.environment(image, environment.samples, facts)
         clash = sorted(self.request.conditions.keys() & illumination.conditions[0].keys())
         if clash:
-            raise ConfigError(f"{condition_flag(clash[0])} and --environment: give one of them")
+            raise ConfigError(f"{condition_flag(clash[0])} and --environment: give only one of these flags")
         return illumination
 
     def _load_views(self) -> tuple[list[View], float | None]:
@@ -239,7 +239,7 @@ class _RunRenderSession:
         if known is None:
             raise ConfigError(f"--frame {text}: this model has no frame numbers; expected a model of .vdb files")
         if "time" in conditions:
-            raise ConfigError("--frame and --time: give one of them")
+            raise ConfigError("--frame and --time: give only one of these flags")
         first, last = known
         if min(numbers) < first or max(numbers) > last:
             raise ConfigError(f"--frame {text}: the sequence has frames {first} to {last}")
@@ -332,7 +332,7 @@ class _RunRenderSession:
             where = f"the model is within {start} to {end}, and {view.name} at {at} looks towards {towards}"
         raise DataError(
             f"--camera {self.request.camera}: all {len(self.views)} images are empty: {where}; expected cameras "
-            f"in the units of the run's data, or in those of the model with --space scene"
+            f"in the coordinates of the run's data; add --space scene if they are in scene coordinates"
         )
 
 

@@ -60,7 +60,9 @@ def choose_shutter(
     where = f"--shutter {fraction:g}"
     time = next((spec for spec in specs if spec.name == "time" and not spec.shape), None)
     if time is None:
-        raise ConfigError(f"{where}: the model does not vary in time; expected one of a moving scene. Omit --shutter.")
+        raise ConfigError(
+            f"{where}: the model does not vary in time; expected a model of a moving scene. Omit --shutter."
+        )
     if not 0 < fraction <= 1:
         raise ConfigError(f"{where}: expected a part of the frame interval, above 0 and at most 1")
     interval = frame_interval(header, (float(view.conditions["time"]) for view in views))

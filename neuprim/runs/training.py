@@ -228,7 +228,9 @@ def _warn_of_unwritable_run_file(fitted: Fitted, file: Path) -> Iterator[None]:
         yield
     except (CheckpointError, OSError) as error:
         reason = f"{file}: cannot be written ({error.strerror or error})" if isinstance(error, OSError) else error
-        warn_once(f"{reason}; training goes on from step {fitted.trainer.step} to the next checkpoint")
+        warn_once(
+            f"{reason}; training goes on from step {fitted.trainer.step}; neuprim tries again at the next checkpoint"
+        )
 
 
 def cut_run_curve(path: Path, step: int) -> None:

@@ -350,7 +350,7 @@ def _check_ablation_folder(models: _AblationSet, before: TradeoffRecord | None) 
     folder = models.folder
     if before is None:
         if folder.is_dir() and any(folder.iterdir()) and not (folder / TRIALS).is_dir():
-            raise ConfigError(f"--out {folder}: has other files; expected a new directory, or one of trainings")
+            raise ConfigError(f"--out {folder}: has other files; expected a new directory, or a directory of trainings")
     elif before.same.get("kind") != "models":
         raise DataError(f"{folder / TRADEOFF_FILE}: is about a finished run; expected another --out DIR for trainings")
     elif changed := before.changes(models.identity()):
@@ -381,4 +381,4 @@ def _parse_ablation_plan(file: Path, record: TradeoffRecord) -> AblationPlan | N
     try:
         return validate_settings(AblationPlan, record.facts["plan"], "plan") if "plan" in record.facts else None
     except ConfigError as error:
-        raise DataError(f"{file}: damaged ({error}); delete the folder to train again") from error
+        raise DataError(f"{file}: damaged ({error}); delete {file.parent} to train again") from error

@@ -103,7 +103,7 @@ def measure_tradeoff(
     """
     folder = request.out or run_dir / TRADEOFF_FOLDER
     if request.out and folder.is_dir() and any(folder.iterdir()) and not (folder / TRADEOFF_FILE).exists():
-        raise ConfigError(f"--out {folder}: has other files; expected a new folder, or one of `neuprim tradeoff`")
+        raise ConfigError(f"--out {folder}: has other files; expected a new folder, or a folder of `neuprim tradeoff`")
     setup = load_tradeoff_setup(run_dir, request.words, request.views, request.lpips)
     knobs = list_render_knobs(setup.reference, setup.model)
     check_knobs(request, knobs, "this run")

@@ -143,7 +143,7 @@ def _resume_target_search(config: RunConfig, asked: dict[str, float]) -> TargetR
     before = read_target_record(folder) if config.resume else None
     if before is None:
         if (folder / "config.yaml").exists():
-            expected = "expected a new directory, or that of a run with a target"
+            expected = "expected a new directory, or the directory of a run with a target"
             raise ConfigError(f"--out {folder}: contains a run without a target; {expected}")
         return TargetRecord(asked, same)
     if different := [key for key in same if before.same.get(key) != same[key]]:

@@ -123,7 +123,9 @@ def run_trial(trial: Trial, dataset: Dataset | None = None, events: Events = ign
     with lock_run_directory(folder, "trial"):
         asked, before = _trial_request(trial), read_trial(folder)
         if before is None and (folder / "config.yaml").exists():
-            raise DataError(f"{folder}: contains a run, but no {TRIAL_FILE}; expected a new folder, or that of a trial")
+            raise DataError(
+                f"{folder}: contains a run, but no {TRIAL_FILE}; expected a new folder, or the folder of a trial"
+            )
         if before is not None and before.asked != asked:
             a, b = flatten(before.asked), flatten(asked)
             changed = sorted(name for name in a.keys() | b.keys() if a.get(name) != b.get(name))

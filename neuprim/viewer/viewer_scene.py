@@ -104,7 +104,7 @@ class ViewerScene:
         camera, channels = viewpoint.camera, self.channels
         if camera.width * camera.height * settings.samples**2 > _MAX_RAYS:
             size = f"{camera.width} x {camera.height} pixels with renderer.samples={settings.samples}"
-            raise ConfigError(f"{size} need more than {_MAX_RAYS:,} rays; reduce one of them")
+            raise ConfigError(f"{size} need more than {_MAX_RAYS:,} rays; reduce the image size or renderer.samples")
         settings = replace(settings, depth=viewpoint.quantity == DEPTH)
         with torch.no_grad():
             output = render(self.model(), camera, viewpoint.conditions, settings, self.background)

@@ -173,7 +173,10 @@ def _field_script(kind: str, field: Field) -> str:
     """Return the script with which a browser evaluates the field, without its comment."""
     text = field.script()
     if text is None:
-        raise ConfigError(f"{kind} field {type(field).__name__} has no JavaScript version, so a page cannot show it")
+        raise ConfigError(
+            f"{kind} field {type(field).__name__} has no JavaScript version, so a page cannot show it; "
+            "expected a field with a method script()"
+        )
     if not isinstance(text, str) or "</script" in text.lower() or "<!--" in text:
         expected = "script() must return JavaScript text without </script or <!--"
         raise ConfigError(f"{kind} field {type(field).__name__}: {expected}")

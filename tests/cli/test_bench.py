@@ -79,8 +79,8 @@ def test_the_plan_is_the_protocol(data: Path, tmp_path: Path, monkeypatch: pytes
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["--scenes", "chiar"], "--scenes chiar: not in these tables; did you mean 'chair'?"),
-        (["--rows", "real", "--tables", "3"], "--rows real: not in these tables"),
+        (["--scenes", "chiar"], "--scenes chiar: not in the chosen tables; did you mean 'chair'?"),
+        (["--rows", "real", "--tables", "3"], "--rows real: not in the chosen tables"),
         (["--tables", "7"], "--data DATA: no folder named like a scene; expected one of train, truck, playroom"),
         (["budget=soon"], "budget=soon: expected"),
     ],

@@ -283,7 +283,7 @@ def test_a_target_prints_what_came_of_it(
     shutil.rmtree("out")
     assert main(words) == 130
     first, second = capsys.readouterr().err.splitlines()
-    assert first == "neuprim: interrupted; out has the trials so far; to continue:"
+    assert first == "neuprim: interrupted; out holds the trials trained so far; to continue:"
     assert second == f"  neuprim {' '.join(words)} resume=true"
 
 

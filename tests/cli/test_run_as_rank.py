@@ -131,4 +131,6 @@ def test_nobody_to_meet_is_one_line(monkeypatch: pytest.MonkeyPatch, capsys: pyt
         monkeypatch.setenv(name, value)
     assert main(["run", *WORDS]) == 2
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("neuprim")]
-    assert line.startswith("neuprim: error: rank 1 of 2 cannot meet the others at localhost:1 (")
+    assert line.startswith(
+        "neuprim: error: rank 1 of 2 cannot connect to the other ranks at MASTER_ADDR:MASTER_PORT=localhost:1 ("
+    )

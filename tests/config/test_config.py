@@ -66,7 +66,9 @@ def test_typed_seconds_are_all_of_the_budget(toy: Path) -> None:
     assert toys("train.max_seconds=5", "train.iterations=9").train.iterations == 9
     assert toys("train={max_seconds:5,iterations:9}").train.iterations == 9
     assert toys("train.max_seconds=5", "train.max_seconds=null").train.iterations == 7
-    with pytest.raises(ConfigError, match=r"train\.iterations and train\.max_seconds are both null; expected a budget"):
+    with pytest.raises(
+        ConfigError, match=r"train\.iterations and train\.max_seconds are both null; expected a number of steps"
+    ):
         toys("train.iterations=null")
 
 

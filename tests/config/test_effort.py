@@ -60,7 +60,10 @@ def test_no_such_level(levels: Path, word: str) -> None:
     [
         ("preset: [", r"cannot be read"),
         ("preset: quik\nlevels: {}", r"preset=quik: no such preset; did you mean 'quick'"),
-        ("preset: quick\nlevels: {1: {model.primitives: 3}}", r"levels: found \[1\]; expected 1 to 9, in this order"),
+        (
+            "preset: quick\nlevels: {1: {model.primitives: 3}}",
+            r"levels: found \[1\]; expected the keys 1 to 9, in this order",
+        ),
     ],
 )
 def test_a_damaged_file_is_named(toy: Path, text: str, expected: str) -> None:

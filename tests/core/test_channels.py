@@ -64,7 +64,7 @@ def test_the_tasks_own_display_is_what_is_shown() -> None:
 @pytest.mark.parametrize(
     ("own", "words"),
     [
-        (lambda x: x, ("torch.float32 of shape (4, 6, 5) for (4, 6, 5)", "expected floats (4, 6, 3)")),
+        (lambda x: x, ("torch.float32 of shape (4, 6, 5) for an image (4, 6, 5)", "expected floats (4, 6, 3)")),
         (lambda x: (255 * x[..., :3]).byte(), ("torch.uint8",)),
         (lambda x: x[..., :3].numpy(), ("display returned ndarray",)),
         (lambda x: x[..., :3] / 0, ("72 NaN or infinite values",)),

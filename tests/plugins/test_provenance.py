@@ -209,7 +209,10 @@ def test_a_run_does_not_go_on_with_another_packages_task(
 ) -> None:
     glow(site, "glow-too", "7", package="glow_too")
     before = (made / "checkpoint.safetensors").read_bytes()
-    text = "written for task 'glow' of neuprim-glow 0.1; this run uses the task of glow-too 7"
+    text = (
+        "written for task 'glow' of neuprim-glow 0.1; this run uses the task 'glow' of glow-too 7; "
+        "use the package that wrote the file"
+    )
     told = error(["run", "task=glow-too:glow", *SMALL, *QUICK, "--out", "r", "resume=true"], capsys)
     assert told.endswith(f"neuprim: error: r/checkpoint.safetensors: {text}")
     assert (made / "checkpoint.safetensors").read_bytes() == before

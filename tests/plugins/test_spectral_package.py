@@ -143,7 +143,7 @@ def test_its_exporter_and_inspector(package: Path, tmp_path: Path, capsys: pytes
 # the line
 
 CONSTANT = 'return Constant(spectrum(params["logit"], conditions["wavelength_shift"]))'
-SUM = "density field TwoScales: lower: sum of two Cosine forms: the first: "
+SUM = "density field TwoScales: lower: sum of two Cosine forms: the first form: "
 
 
 @pytest.mark.parametrize(

@@ -395,7 +395,8 @@ def test_a_full_disk_costs_a_checkpoint_and_not_the_training(
     said = ["train.checkpoint_every_seconds=0"]
     with pytest.warns(
         NeuprimWarning,
-        match=r"checkpoint\.safetensors: could not write .*No space left.*; training goes on from step 2 to the next",
+        match=r"checkpoint\.safetensors: could not write .*No space left.*; training goes on from step 2; "
+        "neuprim tries again",
     ):
         out = fit(words(scene, tmp_path / "run", 6, *said))
     assert read_metrics(out)["iterations"] == 6
@@ -468,7 +469,7 @@ def test_the_number_of_primitives_follows_the_budget() -> None:
     assert auto.with_count_for(both, 1e-5).count == 200 and auto.with_count_for(both, 8e-4).count == 100
     assert auto.with_count_for(seconds, 1e-30).count > 1e6 and auto.with_count_for(seconds, 1e9).count == 1
     assert ModelSettings(primitives=7).with_count_for(steps).count == 7
-    with pytest.raises(ConfigError, match="primitives=auto: only a training chooses it"):
+    with pytest.raises(ConfigError, match="primitives=auto: only a training can choose the number of primitives"):
         _ = auto.with_count_for(seconds).count
 
 

@@ -45,7 +45,9 @@ def read_colmap_model(folder: Path) -> Any:
         raise DataError(f"{folder}: no cameras.bin or cameras.txt; expected a COLMAP model (scene.model)")
     absent = [name + kind for name in _PARTS[1:3] if not (folder / (name + kind)).is_file()]
     if absent:
-        raise DataError(f"{folder}: {len(absent)} files not found: {', '.join(absent)}")
+        raise DataError(
+            f"{folder}: {len(absent)} files not found: {', '.join(absent)}; expected a complete COLMAP model"
+        )
     if kind == ".bin":
         check_binary_colmap_model(folder, _lens_parameter_count)
     try:

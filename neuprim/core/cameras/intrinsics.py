@@ -218,8 +218,8 @@ def _read_principal_point(
         return 0.5 * target.width, 0.5 * target.height
     record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
     if level is frame and sum(record.has(key) for key in PRINCIPAL_POINT) == 1 and file.has(PRINCIPAL_POINT):
-        found = "cx or cy is missing, and the values of the file are for another camera"
-        raise DataError(f"{record.where}: {found}; expected both in the frame")
+        found = "the frame has only one of cx, cy, and the cx, cy of the whole file are for another camera"
+        raise DataError(f"{record.where}: {found}; expected cx and cy in the frame")
     scale = level.scales(keys, target)
     plain = [record.number_or(key, 0.5 * side) for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)]
     stated = _read_camera_intrinsics(record)[:2] if array else plain
@@ -228,7 +228,7 @@ def _read_principal_point(
         differences = (abs(cx - plain[0] * scale[0]), abs(cy - plain[1] * scale[1]))
         if any(d > _TOLERANCE * side for d, side in zip(differences, target.size, strict=True)):
             found = f"cx, cy are {plain}, but camera_intrinsics begins with {stated}"
-            raise DataError(f"{record.where}: {found}; expected the same point")
+            raise DataError(f"{record.where}: {found}; expected the same cx, cy in both")
     if target.image or not (frame.has(SIZE) or file.has(SIZE)):  # an image to render may have it outside
         _check_principal_point(record.where, keys, (cx, cy), frame.has(SIZE) or file.has(SIZE), target)
     return cx, cy

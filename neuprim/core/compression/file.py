@@ -110,7 +110,7 @@ def write_compressed(
             file.writelines(stored)
     except OSError as error:
         raise CheckpointError(
-            f"{path}: could not write the model: {error}; the previous one, if any, is untouched"
+            f"{path}: could not write the model: {error}; a file that was there before is unchanged"
         ) from error
     return {s.name: len(data) for s, data in zip(sections, stored, strict=True)}
 
@@ -277,7 +277,9 @@ def _checked_codec_section(name: str, coding: int, shape: tuple[int, ...]) -> Co
     if shape != wanted:
         raise CorruptSection(f"section {name!r} of {CODINGS[coding]} has shape {shape}; expected {wanted}")
     if (coding == TEXT) != (name == CONFIG):
-        raise CorruptSection(f"section {name!r} has coding {CODINGS[coding]}; expected text for {CONFIG!r} alone")
+        raise CorruptSection(
+            f"section {name!r} has coding {CODINGS[coding]}; expected coding text in section {CONFIG!r} and in no other"
+        )
     if (coding == MASKS) != (name == MASKS_NAME) or (
         coding == MASKS and not (len(shape) == 1 and 0 < shape[0] <= _MAX_MASKS)
     ):

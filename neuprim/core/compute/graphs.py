@@ -66,7 +66,7 @@ class GraphRecorder:
             if "synchronizing" not in str(error):
                 raise
             self.failed = True
-            warn_once(f"{self._what} are not recorded as CUDA graphs, because one synchronises with the GPU: {error}")
+            warn_once(f"{self._what} are not recorded as CUDA graphs, because one of them waits for the GPU: {error}")
         finally:
             torch.cuda.set_sync_debug_mode(mode)
             current.wait_stream(stream)

@@ -280,7 +280,7 @@ def hold_out_views(dataset: Dataset, every: int) -> Dataset:
     count = len(dataset.train)
     if every < 2 or count < 2:
         found = f"cannot hold out one in {every} of {count} training views"
-        raise ConfigError(f"{dataset.name}: {found}; expected one in 2 or more, of at least 2 views")
+        raise ConfigError(f"{dataset.name}: {found}; expected at least 2 views, and at most every second one held out")
     test = [i for i in range(count) if i % every == i // every % every]
     train = [i for i in range(count) if i % every != i // every % every]
     return replace(dataset, train=ViewSubset(dataset.train, train), test=ViewSubset(dataset.train, test))
@@ -402,7 +402,7 @@ def choose_dataset_world(cameras: Sequence[Camera], where: str = "cameras") -> W
         row = int(far.nonzero()[0])
         place = ", ".join(f"{x + 0.0:.6g}" for x in centers[row].tolist())
         found = f"{int(far.sum())} of {len(views)} cameras lie far from all others, the first at {place}"
-        warn_once(f"{where}: {found}; they are ignored for the scene's size")
+        warn_once(f"{where}: {found}; the size of the scene is computed without these cameras")
     center = centers[~far].mean(0)
     there = World.at(center.tolist())
     extent = camera_extent([there.scene_camera(c) for c in cameras])

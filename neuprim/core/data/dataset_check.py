@@ -139,7 +139,7 @@ def _check_dataset_view(view: View, where: str, conditions: Sequence[ConditionSp
         what = f"{where}: condition {spec.name!r}"
         if spec.name not in view.conditions:
             there = ", ".join(sorted(view.conditions)) or "none"
-            raise DatasetError(f"{what} is missing, which the task needs; found {there}")
+            raise DatasetError(f"{what} is missing, but the task needs this condition; conditions found: {there}")
         value, shape = view.conditions[spec.name], tuple(spec.shape)
         if not isinstance(value, Tensor) or tuple(value.shape) != shape:
             _refuse_dataset_tensor(what, value, torch.float32, shape)

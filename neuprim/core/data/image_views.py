@@ -435,5 +435,5 @@ def _reduced_image_camera(frame: ImageFrame, factor: int) -> Camera:
     camera = frame.camera
     if min(camera.width, camera.height) < factor:
         found = f"{frame.path} has only {camera.width}x{camera.height} pixels"
-        raise ConfigError(f"scene.downsample is {factor}, but {found}")
+        raise ConfigError(f"scene.downsample is {factor}, but {found}; expected a smaller scene.downsample")
     return camera.reduced(factor)

@@ -107,7 +107,7 @@ def _starting_point_log_sizes(found: PlyVertices, path: Path) -> np.ndarray | No
     if there != list(_SCALES[: len(there)]) or (len(there) > 1 and not set(_ROTATION) <= set(found.names)):
         lacking = [name for name in (*_SCALES, *_ROTATION) if name not in found.names]
         what = f"has {', '.join(there)}, but no {', '.join(lacking)}"
-        warn_once(f"{path}: {what}; sizes in the file are ignored and estimated from distances between points")
+        warn_once(f"{path}: {what}; its sizes are ignored, and distances between points give the sizes instead")
         return None
     scales = found.columns(there)
     if len(there) == 1:

@@ -96,7 +96,7 @@ class BadImageViews:
         for fault in self._faults[:_LISTED]:
             warn_once(fault)
         if bad > _LISTED:
-            warn_once(f"{self._where}: {bad - _LISTED} more views are left out")
+            warn_once(f"{self._where}: {bad - _LISTED} further views are left out for such faults")
 
 
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".exr", ".PNG", ".JPG", ".JPEG", ".WEBP", ".EXR")
@@ -125,7 +125,7 @@ def _warn_of_images_outside_dataset(where: str, home: Path, paths: Iterable[Path
     outside = [path for path in paths if not path.resolve().is_relative_to(own)]
     if outside:
         found = f"{len(outside)} of its images lie outside of {own}, the first {outside[0].resolve()}"
-        warn_once(f"{where}: {found}; they are read from there")
+        warn_once(f"{where}: {found}; neuprim reads these images, too")
 
 
 def _find_image_in_other_case(folder: Path, path: Path) -> Path | None:
@@ -267,7 +267,7 @@ def _check_dataset_splits(
     for frame in (*train, *test):
         if frame.info.linear != first.info.linear:
             found = f"images mix OpenEXR (linear) and PNG/JPEG (sRGB), see {first.path}"
-            raise DataError(f"{frame.path}: {found}; expected one kind of file")
+            raise DataError(f"{frame.path}: {found}; expected only OpenEXR, or only PNG and JPEG")
         if frame.info.channels != first.info.channels:
             found = f"image has {frame.info.channels} channels, {first.path} has {first.info.channels}"
             raise DataError(f"{frame.path}: {found}; expected all RGB or all RGBA")

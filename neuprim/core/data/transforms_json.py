@@ -171,7 +171,7 @@ def read_image_splits(
     if hold_out:
         if len(frames) < 2:
             found = f"{folder} has only {len(frames)} training view"
-            raise ConfigError(f"scene.hold_out is {hold_out}, but {found}; expected at least 2")
+            raise ConfigError(f"scene.hold_out is {hold_out}, but {found}; expected at least 2 training views")
         return split_every_nth(frames, hold_out)
     path = folder / f"transforms_{test}.json"
     hint = "; scene.hold_out=8 holds out every 8th training view instead"

@@ -128,7 +128,7 @@ def _read_exr_header(path: Path) -> tuple[dict[str, Any], int, int]:
         raise DataError(f"{path}: {found}; expected 1 part of flat scan lines or tiles")
     if (low, high) != (full_low, full_high):
         found = f"OpenEXR data window {low}..{high} is not its display window {full_low}..{full_high}"
-        raise DataError(f"{path}: {found}; expected equal windows")
+        raise DataError(f"{path}: {found}; expected the same data and display window")
     width, height = high[0] - low[0] + 1, high[1] - low[1] + 1
     check_image_file_size(path, width, height)
     if width * height * len(channels) > _MAX_VALUES:

@@ -280,7 +280,7 @@ def _read_ascii(file: BinaryIO, path: Path, element: _ElementHeader, left: int) 
         raise DataError(f"{path}: {_describe_ply_rows(element)} are not numbers ({reason})") from error
     if table.shape != (count, len(scalars)):
         found = f"{table.shape[0]} {_describe_ply_rows(element)} of {table.shape[1]} numbers"
-        raise DataError(f"{path}: {found}; expected {count} of {len(scalars)}")
+        raise DataError(f"{path}: {found}; expected {count} rows of {len(scalars)} numbers")
     rows = np.zeros(count, [(name, "<" + kind) for name, kind in scalars])
     for i, (name, kind) in enumerate(scalars):
         rows[name] = _cast_ply_column(table[:, i], name, kind, path)

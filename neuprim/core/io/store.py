@@ -198,7 +198,9 @@ class Store:
         while self._is_gone():
             if time.monotonic() > deadline:
                 found = f"the folder disappeared and was missing for {MAX_WAIT:.0f} s"
-                raise DataError(f"{self.path}: {found}; expected it to be available again (its files are kept)")
+                raise DataError(
+                    f"{self.path}: {found}; make it available again, and repeat the command (finished files are kept)"
+                )
             time.sleep(POLL_INTERVAL)
 
     @contextmanager

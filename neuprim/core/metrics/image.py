@@ -41,7 +41,10 @@ def _check_images(rendered: Tensor, truth: Tensor) -> tuple[Tensor, Tensor]:
                 f"{name} image: expected shape (H, W, C) with at least one pixel, found {tuple(image.shape)}"
             )
     if rendered.shape != truth.shape:
-        raise DataError(f"rendered image has shape {tuple(rendered.shape)}, but ground truth {tuple(truth.shape)}")
+        raise DataError(
+            f"rendered image has shape {tuple(rendered.shape)}, but ground truth has {tuple(truth.shape)}; "
+            "expected equal shapes"
+        )
     for name, image in images.items():
         if math.isfinite(image.detach().sum().item()):
             continue

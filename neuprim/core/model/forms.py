@@ -69,14 +69,14 @@ class Cosine(PrimitiveTensors):
             sizes.pop("K", None)
             fault = form.fault(sizes)
             if fault is not None:
-                raise FormError(f"sum of two Cosine forms: the {word}: {fault}")
+                raise FormError(f"sum of two Cosine forms: the {word} form: {fault}")
         neurons = (self.W1.shape[1], other.W1.shape[1])
         if sum(neurons) > MOST_UNITS:
             raise FormError(
                 f"sum of two Cosine forms: {neurons[0]} + {neurons[1]} neurons; expected at most {MOST_UNITS}"
             )
         if self.edge != other.edge:
-            raise FormError(f"sum of two Cosine forms: edges {self.edge} and {other.edge}; expected the same of both")
+            raise FormError(f"sum of two Cosine forms: edges {self.edge} and {other.edge}; expected equal edges")
         omega0 = self.omega0 or other.omega0
         parts = [(f, f.omega0 / omega0 if f.omega0 != omega0 else 1.0) for f in (self, other)]
         W1 = torch.cat([f.W1 * scale for f, scale in parts], 1)

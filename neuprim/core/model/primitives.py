@@ -356,7 +356,9 @@ def validate_reduction(density: DensityField, colour: ColourField, kind: str, na
     offered = field.reductions()
     if name not in offered:
         what = nearest(f"{kind}.{name}", reduction_names(density, colour)) or "; this model has none"
-        raise ConfigError(f"{kind}.{name}: {type(field).__name__} has no such setting that can be reduced{what}")
+        raise ConfigError(
+            f"{kind}.{name}: {type(field).__name__} has no setting of this name that can be reduced{what}"
+        )
     if isinstance(value, bool) or value not in offered[name]:
         raise ConfigError(f"{kind}.{name}={value}: expected a reduced value: {' or '.join(map(str, offered[name]))}")
     return int(value)

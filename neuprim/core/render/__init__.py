@@ -134,7 +134,8 @@ def _render_checked_view(
         output = draw(lowered, camera, background, settings)
     elif isinstance(camera, RayCamera):
         raise ConfigError(
-            f"renderer.samples={settings.samples}: a RayCamera is not supersampled; expected 1. Give it more directions"
+            f"renderer.samples={settings.samples}: a RayCamera is not supersampled; expected 1. "
+            "For more rays, give the RayCamera more directions"
         )
     else:
         output = draw_pixel_samples(draw, lowered, camera, background, settings)

@@ -193,7 +193,8 @@ def check_backend_device(settings: RenderSettings) -> None:
     if settings.device not in backend.devices:
         own = " or ".join((*backend.devices, AUTO))
         raise ConfigError(
-            f"renderer.device={settings.device}: renderer.backend={backend.name} does not draw on it; expected {own}"
+            f"renderer.device={settings.device}: renderer.backend={backend.name} cannot use this device; "
+            f"expected renderer.device={own}"
         )
 
 
@@ -250,7 +251,9 @@ def choose_backend(lowered: LoweredPrimitives, settings: RenderSettings, camera:
         if reason is None:
             if device != backend.devices[0]:
                 own = next((f"; use renderer.backend={b.name}" for b in TABLE if b.devices[0] == device), "")
-                warn_once(f"renderer.backend={backend.name} is slow on the {device} and only for tests there{own}")
+                warn_once(
+                    f"renderer.backend={backend.name} is slow on the {device}, where it only serves for tests{own}"
+                )
             return backend
         reasons.append(f"renderer.backend={backend.name} {reason}")
     other = next((b for b in TABLE if b.cannot_draw(lowered, camera) is None), None)

@@ -72,7 +72,8 @@ class DistributedTrainer(Trainer):
         super().__init__(model, dataset, loss, settings, renderer, seed)
         if self.settings.supervision == "voxels":
             raise ConfigError(
-                f"train.supervision=voxels: {group.size} ranks have no views to share; expected one process"
+                "train.supervision=voxels: ranks share views, which training on voxels does not use; "
+                f"expected 1 process instead of {group.size}"
             )
         self.group, self.rank, self.ranks = group, group.rank, group.size
         self.recorder = None  # ranks exchange gradients in every step
@@ -149,8 +150,8 @@ class DistributedTrainer(Trainer):
         for rank, message in enumerate(messages):
             if message.checksum != messages[0].checksum:
                 raise RankError(
-                    f"rank {rank} does not compute as rank 0 does: its positions differ; "
-                    "expected processors or GPUs of one kind"
+                    f"rank {rank} computes other positions of primitives than rank 0; "
+                    "expected the same kind of processor or GPU for all ranks"
                 )
         self._agreed = messages[0].elapsed
         self._stopping = any(message.stop for message in messages)

@@ -51,7 +51,8 @@ def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunR
     missing = [name for name in _VARIABLES if name not in present]
     if missing:
         raise ConfigError(
-            f"environment: {', '.join(present)} without {', '.join(missing)}; expected all that torchrun sets, or none"
+            f"environment: {', '.join(present)} without {', '.join(missing)}; "
+            "expected all of these variables (torchrun sets them), or none"
         )
     values = {}
     for name in _NUMBERS:
@@ -66,8 +67,8 @@ def read_torchrun_rank(environment: Mapping[str, str] = os.environ) -> TorchrunR
             raise ConfigError(f"environment: {name}={value}; expected less than {whole}={most}")
     if local_size > size or local_rank > rank:
         raise ConfigError(
-            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected no more "
-            f"there than in all"
+            f"environment: rank {rank} of {size} is {local_rank} of {local_size} on this machine: expected at "
+            f"most as many ranks on this machine as on all machines together"
         )
     address = f"{environment['MASTER_ADDR']}:{environment['MASTER_PORT']}"
     return TorchrunRank(rank, size, local_rank, local_size, address) if size > 1 else None
@@ -107,7 +108,8 @@ class ProcessGroup:
         except (RuntimeError, ValueError, OSError) as error:
             reason = " ".join(str(error).split())[:200]
             raise ConfigError(
-                f"rank {place.rank} of {place.size} cannot meet the others at {place.address} ({reason})"
+                f"rank {place.rank} of {place.size} cannot connect to the other ranks at "
+                f"MASTER_ADDR:MASTER_PORT={place.address} ({reason})"
             ) from error
 
     @property
@@ -159,7 +161,7 @@ class ProcessGroup:
         for rank, other in enumerate(every):
             for name, value in every[0].items():
                 if other[name] != value:
-                    raise RankError(f"rank {rank} has other {name} than rank 0: {other[name]!r}, not {value!r}; {hint}")
+                    raise RankError(f"rank {rank} has {name} {other[name]!r}, but rank 0 has {value!r}; {hint}")
 
     @contextmanager
     def in_turn(self) -> Iterator[None]:

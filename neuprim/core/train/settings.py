@@ -69,7 +69,7 @@ class ModelSettings:
         """
         if self.primitives == "auto":
             raise ConfigError(
-                "model.primitives=auto: only a training chooses it for train.max_seconds; expected a number"
+                "model.primitives=auto: only a training can choose the number of primitives; expected a number"
             )
         return self.primitives
 
@@ -216,7 +216,7 @@ class TrainSettings:
         validate_fields(self, "train")
         if self.iterations is None and self.max_seconds is None:
             raise ConfigError(
-                "train.iterations and train.max_seconds are both null; expected a budget, in steps, in seconds or both"
+                "train.iterations and train.max_seconds are both null; expected a number of steps, of seconds, or both"
             )
 
     def rate_factor(self, step: int, progress: float) -> float:
@@ -253,7 +253,9 @@ class TrackedMapping(dict[str, Any]):
     def __missing__(self, key: str) -> Any:
         if self.member == "uses" and f"{self.group}.{key}" not in OPTIONAL:
             raise KeyError(key)
-        raise ConfigError(f"{self.owner} reads {self.group}.{key}, which its {self.member!r} does not declare")
+        raise ConfigError(
+            f"{self.owner} reads {self.group}.{key}, which its {self.member!r} does not declare; declare it there"
+        )
 
 
 def build_settings(task: TaskSpec, model: ModelSettings, options: Mapping[str, Any]) -> Mapping[str, Any]:

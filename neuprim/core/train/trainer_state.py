@@ -43,9 +43,14 @@ def check_state(
     if not isinstance(step, int) or not isinstance(elapsed, (int, float)) or step < 0 or not math.isfinite(elapsed):
         raise CheckpointError(f"{where}: step {step!r}, elapsed {elapsed!r}; expected numbers")
     if views != own_header["views"]:
-        raise CheckpointError(f"{where}: trained on {views} views, the data set now has {own_header['views']}")
+        raise CheckpointError(
+            f"{where}: trained on {views} views, but the data set now has {own_header['views']}; "
+            "continue with the original views"
+        )
     if header.get("names") != own_header["names"]:
-        raise CheckpointError(f"{where}: trained on {views} views with other names than those of the data set now")
+        raise CheckpointError(
+            f"{where}: trained on {views} views, whose names the data set has changed; continue with the original views"
+        )
     fault = _find_state_fault(tensors, own_tensors, step, own_header["views"])
     if fault is not None:
         raise CheckpointError(f"{where}: does not fit this run's settings ({fault})")

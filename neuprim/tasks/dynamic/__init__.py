@@ -70,7 +70,7 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
     if "light" in dataset.train.view(0).conditions:
         if dataset.channels != 3:
             found = f"{dataset.name}: {dataset.channels} colour channels"
-            raise ConfigError(f"{found}; task dynamic needs 3 if the views have a light (its intensity is RGB)")
+            raise ConfigError(f"{found}; task dynamic needs 3 channels if views have a light, because lights are RGB")
         return density, ScatteringHarmonics(*settings, **model["colour"], typical=typical_light(dataset, False))
     return density, TimeHarmonics(*settings, **model["colour"])
 

@@ -102,7 +102,7 @@ def measure_falloff(dataset: Dataset) -> Falloff:
     if error > FALLOFF_SPREAD:
         warn_once(
             f"{dataset.name}: training images do not show whether light weakens with distance; scene.falloff="
-            "inverse_square (point lights) is assumed. Set scene.falloff=none if it does not weaken"
+            "inverse_square (point lights) is assumed. Set scene.falloff=none if light does not weaken"
         )
         return "inverse_square"
     return "none" if slope > -1 else "inverse_square"

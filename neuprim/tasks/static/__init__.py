@@ -46,7 +46,10 @@ def _check_colour_settings(colour: Mapping[str, Any], degree: int) -> None:
     validate_choices(colour, "model.colour", {"form": ("sh", "lobes"), "lobes": int})
     if colour.get("form") != "lobes":
         if "lobes" in colour:
-            raise ConfigError(f"model.colour.lobes={colour['lobes']}: expected none without model.colour.form=lobes")
+            raise ConfigError(
+                f"model.colour.lobes={colour['lobes']}: used only with model.colour.form=lobes; "
+                "expected this form, or no model.colour.lobes"
+            )
         return
     try:
         SphericalLobes(colour.get("lobes", _USUAL_LOBES))

@@ -90,7 +90,7 @@ def test_the_frames_own_wins_whole_and_lengths_follow_the_size(
         ({}, {"fl_x": 50, "cx": 0.5, "cy": 0.5, "w": 64, "h": 48}, "expected pixels, not fractions of the image"),
         ({"fl_x": 90}, {"fl_x": 50, "cx": 20, "cy": 24}, "its own focal length, but cx of the file"),
         ({"fl_x": 90}, {"fl_x": 50, "k1": 0.1}, "k1 of the file"),
-        ({"cx": 30}, {"fl_x": 50, "cx": 20, "cy": 20}, "cx or cy is missing"),
+        ({"cx": 30}, {"fl_x": 50, "cx": 20, "cy": 20}, "the frame has only one of cx, cy"),
         ({"w": 64, "h": 48}, {"fl_x": 50, "w": 100, "h": 20}, "fl_x, fl_y are for images of 100x20 \\(w, h\\)"),
     ],
 )

@@ -118,7 +118,10 @@ def test_a_broken_promise_is_one_line(text: str) -> None:
 @pytest.mark.parametrize(
     ("value", "text"),
     [
-        (None, "train view 0 (v0): condition 'time' is missing, which the task needs; found none"),
+        (
+            None,
+            "train view 0 (v0): condition 'time' is missing, but the task needs this condition; conditions found: none",
+        ),
         (torch.zeros(1), "train view 0 (v0): condition 'time' is float32 (1,); expected float32 ()"),
         (0.5, "train view 0 (v0): condition 'time' is a float; expected float32 ()"),
         (
@@ -212,5 +215,5 @@ def test_what_cannot_be_held_out_is_refused() -> None:
     dataset = tiny.two_primitives()
     with pytest.raises(ConfigError, match=r"cannot hold out one in 1 of 6 training views"):
         hold_out_views(dataset, 1)
-    with pytest.raises(ConfigError, match="of 1 training views; expected one in 2"):
+    with pytest.raises(ConfigError, match="of 1 training views; expected at least 2 views, and at most every second"):
         hold_out_views(replace(dataset, train=tiny.Views(1, 0.0)), 2)

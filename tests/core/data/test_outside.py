@@ -28,7 +28,7 @@ def test_one_line_names_the_first_and_their_number(tmp_path: Path, named: str, m
     config = compose(["task=static", "scene=blender", f"scene.path={folder}"], check_output=False)
     with pytest.warns(
         NeuprimWarning,
-        match=rf"data: 1 of its images lie outside of {folder}, the first {secret}; they are read from there",
+        match=rf"data: 1 of its images lie outside of {folder}, the first {secret}; neuprim reads these images, too",
     ) as said:
         assert len(load_dataset(Job.of(config)).train) == 6
     assert len(said) == 1

@@ -158,7 +158,7 @@ def test_discs_are_flat_along_their_third_axis_and_balls_are_round(tmp_path: Pat
     assert found is not None and torch.allclose(found, torch.tensor(0.1))
     bare = rows[[n for n in rows.dtype.names or () if n != "rot_2"]]
     write_ply(tmp_path / "bare.ply", np.lib.recfunctions.repack_fields(bare))
-    with pytest.warns(match="has scale_0, scale_1, scale_2, but no rot_2; sizes in the file are ignored"):
+    with pytest.warns(match="has scale_0, scale_1, scale_2, but no rot_2; its sizes are ignored"):
         assert read_points(tmp_path / "bare.ply", 3, "srgb").deviations is None
 
 

@@ -61,9 +61,12 @@ def test_densities_and_line_integrals_add_up(name: str) -> None:
     [
         (
             replace(form(3, 30.0, 2), W1=torch.ones(11, 3, 3)),
-            r"the second: W1 has shape \(11, 3, 3\); expected .*N=12 ",
+            r"the second form: W1 has shape \(11, 3, 3\); expected .*N=12 ",
         ),
-        (replace(form(3, 30.0, 2), w2=torch.ones(COUNT, 1)), r"the second: w2 has shape \(12, 1\); expected \(12, 3\)"),
+        (
+            replace(form(3, 30.0, 2), w2=torch.ones(COUNT, 1)),
+            r"the second form: w2 has shape \(12, 1\); expected \(12, 3\)",
+        ),
         (form(MOST_UNITS, 30.0, 2), r"3 \+ 256 neurons; expected at most 256"),
     ],
 )

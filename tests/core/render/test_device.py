@@ -73,7 +73,10 @@ def test_without_a_gpu_everything_is_computed_on_the_cpu(monkeypatch: pytest.Mon
 
 
 def test_a_backend_and_a_device_that_do_not_go_together_are_refused(tmp_path: Path) -> None:
-    line = r"^renderer\.device=cuda: renderer\.backend=reference does not draw on it; expected cpu or auto$"
+    line = (
+        r"^renderer\.device=cuda: renderer\.backend=reference cannot use this device; expected renderer\.device=cpu or "
+    )
+    line += "auto$"
     with pytest.raises(ConfigError, match=line):
         compose(words(tmp_path, tmp_path / "run", 3, "renderer.device=cuda", "renderer.backend=reference"))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -175,7 +176,7 @@ def test_a_training_without_views_is_refused(tmp_path: Path) -> None:
     ]
     config = compose(overrides)
     first, _ = run_ranks(2, lambda group: prepare_training(config, group=group))
-    assert isinstance(first, ConfigError) and "2 ranks have no views to share" in str(first)
+    assert isinstance(first, ConfigError) and "expected 1 process instead of 2" in str(first)
 
 
 # ------------------------------------------------------------ failures
@@ -247,7 +248,9 @@ def test_a_rank_that_computes_differently_is_found_at_the_next_step(scene: Datas
                 trainer.model.params["means"].detach()[0, 0] += 1e-7
 
     for error in run_ranks(2, work):
-        assert isinstance(error, RankError) and "step 4: rank 1 does not compute as rank 0 does" in str(error)
+        assert isinstance(
+            error, RankError
+        ) and "step 4: rank 1 computes other positions of primitives than rank 0" in str(error)
 
 
 @pytest.mark.parametrize(
@@ -268,7 +271,7 @@ def test_ranks_that_start_differently_are_refused(change: dict[str, Any], what: 
         trainer.check_same_start()
 
     for error in run_ranks(2, work):
-        assert isinstance(error, RankError) and f"rank 1 has other {what} than rank 0" in str(error)
+        assert isinstance(error, RankError) and re.search(rf"rank 1 has {what} .+, but rank 0 has ", str(error))
 
 
 def test_ranks_go_in_turn() -> None:

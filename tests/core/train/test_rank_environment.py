@@ -30,13 +30,13 @@ def test_a_process_alone_has_none(environment: dict[str, str]) -> None:
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"RANK": None}, "MASTER_PORT without RANK; expected all that torchrun sets, or none"),
+        ({"RANK": None}, "MASTER_PORT without RANK; expected all of these variables .torchrun sets them., or none"),
         ({"MASTER_ADDR": ""}, "without MASTER_ADDR;"),
         ({"RANK": "x"}, "RANK=x: expected a whole number"),
         ({"LOCAL_RANK": "-1"}, "LOCAL_RANK=-1: expected a whole number"),
         ({"RANK": "4"}, "RANK=4; expected less than WORLD_SIZE=4"),
         ({"LOCAL_RANK": "2"}, "LOCAL_RANK=2; expected less than LOCAL_WORLD_SIZE=2"),
-        ({"WORLD_SIZE": "0"}, "RANK=3 with WORLD_SIZE=0"),
+        ({"WORLD_SIZE": "0"}, "RANK=3; expected less than WORLD_SIZE=0"),
         ({"LOCAL_WORLD_SIZE": "9"}, "rank 3 of 4 is 1 of 9 on this machine"),
     ],
 )

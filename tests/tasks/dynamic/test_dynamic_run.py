@@ -166,7 +166,7 @@ def test_frames_are_chosen_by_number_and_name_their_files(finished: Path, tmp_pa
         (["--frame", "1-4x0"], "expected numbers and ranges"),
         (["--frame", "a"], "expected numbers and ranges"),
         (["--frame", "0-999999999"], "expected numbers and ranges"),
-        (["--frame", "1", "--time", "0"], "--frame and --time: give one of them"),
+        (["--frame", "1", "--time", "0"], "--frame and --time: give only one of these flags"),
     ],
 )
 def test_impossible_frames(finished: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]) -> None:

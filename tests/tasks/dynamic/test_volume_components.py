@@ -185,5 +185,5 @@ def test_exported_density_is_the_files_own(files: Path, tmp_path: Path) -> None:
 def test_a_density_that_nothing_taught_is_refused(files: Path, tmp_path: Path) -> None:
     out = run(composed(files, tmp_path / "run", "train.iterations=3", "train.supervision=images"))
     assert open_run(out).model.density.components(open_run(out).model.params) == {}
-    with pytest.raises(ConfigError, match=r"extinction mixes flames with grid 'density'.*train\.supervision=both"):
+    with pytest.raises(ConfigError, match=r"extinction is a sum of flames and grid 'density'.*train\.supervision=both"):
         export_run(out, "vdb", tmp_path / "frames")

@@ -27,7 +27,7 @@ def test_forms() -> None:
 @pytest.mark.parametrize(
     ("words", "text"),
     [
-        (["preset=paper", "model.colour.lobes=2"], "model.colour.lobes=2: expected none without model.colour.form="),
+        (["preset=paper", "model.colour.lobes=2"], "model.colour.lobes=2: used only with model.colour.form="),
         (
             ["model.colour.form=lobes", "model.sh_degree=1"],
             "model.sh_degree=1: lobes have no spherical harmonics; expected",

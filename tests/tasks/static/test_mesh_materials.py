@@ -149,7 +149,7 @@ def test_light_and_opacity_of_an_objs_library(tmp_path: Path) -> None:
         (tmp_path / "a.mtl").write_text(f"newmtl lamp\nKd 0 0 0\n{lamp}\nnewmtl pane\nKd 0 0 1\n{pane}\n")
         return shown(tmp_path / "a.obj")
 
-    with pytest.warns(match="2 faces are translucent; drawn opaque where their opacity is at least 0.5"):
+    with pytest.warns(match="2 faces are translucent; they are opaque where their opacity is at least 0.5"):
         assert look("Ke 1 0.5 0", "d 0.3") == [255, 128, 0]
     assert look("Ke 0 0 0\nmap_Ke glow.png", "Tr 0.7") == list(RED)
     assert look("Ke 1 1 1", "d 0.7") == look("Ke 1 1 1", "Tr 0.3") == list(BLUE)

@@ -70,8 +70,8 @@ def _decode_grid(cursor: VdbCursor, file: FileHeader, header: GridHeader, max_by
     if header.parent:  # an instance: own transform and metadata, another grid's tree
         source = file.grid(header.parent)
         if source.parent or source.type != header.type:
-            found = f"is an instance of grid {header.parent!r}"
-            raise cursor.fail(f"{what} {found}, which is an instance itself or has another type")
+            found = f"is an instance of grid {header.parent!r}, but that grid"
+            raise cursor.fail(f"{what} {found} is an instance itself or has another type")
     tree = _TreeReader(cursor, source, what, max_bytes)
     arrays = (tree.background, tree.origins, tree.values, tree.masks, tree.tiles)
     return VdbGrid(header.name, header.transform, *arrays, header.kind, header.half, dict(header.metadata))
@@ -396,7 +396,9 @@ def list_vdb_files(path: Path) -> VdbSequence:
     gaps: list[tuple[int, int]] = []
     for before, after in itertools.pairwise(frames):
         if before.number == after.number:
-            raise DataError(f"{after.path}: frame {after.number} also exists as {before.path.name}; expected only one")
+            raise DataError(
+                f"{after.path}: frame {after.number} also exists as {before.path.name}; expected one file per frame"
+            )
         if after.number > before.number + 1:
             gaps.append((before.number + 1, after.number - 1))
     return VdbSequence(folder, tuple(frames), tuple(gaps))

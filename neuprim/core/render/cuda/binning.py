@@ -124,7 +124,8 @@ def count_tiles(counts: Tensor, bad: Tensor, capacity: FrameCapacity | None = No
     pairs, in_float64, first_bad = torch.cat((ends[:, -1], bad.long())).tolist()
     if pairs >= _MOST:
         raise BackendUnavailable(
-            f"primitives reach {pairs} tiles in all; the cuda backend counts to {_MOST - 1}: render a smaller image"
+            f"primitives reach {pairs} tiles in all; the cuda backend can count at most {_MOST - 1}: "
+            "render a smaller image"
         )
     return TileCounts(pairs, in_float64, first_bad if first_bad < counts.shape[1] else -1, ends)
 

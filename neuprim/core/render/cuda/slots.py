@@ -138,8 +138,8 @@ def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) ->
         total, few = ends[:, -1].tolist()
         if total >= _MAX_HITS:
             raise BackendUnavailable(
-                f"primitives cover {total} pixels in all; the cuda backend counts to {_MAX_HITS - 1}: render a smaller "
-                f"image"
+                f"primitives cover {total} pixels in all; the cuda backend can count at most {_MAX_HITS - 1}: "
+                "render a smaller image"
             )
     else:
         total, few = capacity.slots, capacity.float64_pairs

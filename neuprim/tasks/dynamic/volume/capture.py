@@ -205,7 +205,7 @@ class Capture:
                 raise DataError(
                     f"{frame.path}: "
                     f"a radiance of {float(rgba[..., :3].max()):.3g} does not fit the images' half floats; "
-                    "expected at most 65504 (scene.optics.emission, ambient and light set it)"
+                    "expected at most 65504; lower scene.optics.emission, scene.optics.ambient or scene.optics.light"
                 )
             brightest = max(brightest, peak)
             write_exr(folder / f"cam_{c:02d}.exr", rgba, half=True)

@@ -139,7 +139,10 @@ class GltfDocument:
         if length is not None and count != length:
             raise ValueError(f"{where} has {count} values, {length} vertices")
         if "sparse" in accessor or "bufferView" not in accessor:
-            raise DataError(f"{self.path}: {where} is sparse or compressed; expected an export with neither")
+            raise DataError(
+                f"{self.path}: {where} is sparse or compressed; "
+                "expected an export without sparse accessors and without compression"
+            )
         data, stride = self.view(accessor["bufferView"])
         dtype, width = np.dtype(_COMPONENT_TYPES[accessor["componentType"]]), _WIDTHS[kind]
         start, row = to_gltf_index(accessor.get("byteOffset", 0)), dtype.itemsize * width

@@ -173,7 +173,7 @@ class MeshFolder:
                 if size > self._budget:
                     more = "" if path == self.file else f" with the files that it uses, up to {path.name},"
                     found = f"the model{more} is larger than {MAX_BYTES >> 20} MiB"
-                    raise DataError(f"{self.file}: {found}; expected a smaller one")
+                    raise DataError(f"{self.file}: {found}; expected a smaller model")
                 data = file.read(size)
         except OSError as error:
             raise DataError(f"{path}: cannot be read ({error.strerror or error})") from None

@@ -399,7 +399,7 @@ def _warn_of_translucent_faces(model: Model, parts: Sequence[SurfacePart], pool:
             count += int(((part.alpha > 0) & (part.alpha < 1)).any(axis=1).sum())
     if count:
         found = f"{count} faces are translucent"
-        warn_once(f"{model.path}: {found}; drawn opaque where their opacity is at least 0.5, left out elsewhere")
+        warn_once(f"{model.path}: {found}; they are opaque where their opacity is at least 0.5, and left out elsewhere")
 
 
 def _separate_crowded_vertices(points: NDArray[np.float64], faces: NDArray[np.int64]) -> trimesh.Trimesh:

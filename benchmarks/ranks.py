@@ -172,9 +172,8 @@ def steps_table(found: Record) -> str:
     table = make_table(columns, found["psnr"].items())
     seeds = len(next(iter(found["psnr"].values())))
     return (
-        f"{table}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, rates as for one view "
-        f"a "
-        f"step, means of {seeds} seeds ± half the spread."
+        f"{table}\n\n`neuprim run {' '.join(found['words'])}`, {found['views']:,} views in all, with the learning "
+        f"rates of one view a step, means of {seeds} seeds ± half the spread."
     )
 
 

@@ -8,9 +8,13 @@ if "PYTEST_XDIST_WORKER" in os.environ:
     # Each worker has one core; more threads of torch wait for each other. Torch reads this when it is imported.
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+import hypothesis
 import pytest
 
 from neuprim.core.compute import device
+
+hypothesis.settings.register_profile("neuprim", deadline=None)  # a busy machine is no failure
+hypothesis.settings.load_profile("neuprim")
 
 SLOW = 3600.0
 """Seconds that a test marked slow may take; the others have ``timeout`` of pyproject.toml."""

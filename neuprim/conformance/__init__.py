@@ -178,7 +178,7 @@ def check_parameters_conformance(t: TaskUnderTest) -> None:
 
 
 def check_evaluation_conformance(t: TaskUnderTest) -> None:
-    """Check that the task's metrics, facts, clips and layers work on its example; orbit views have all conditions."""
+    """Check the task's metrics, facts, clips and layers on its example, and that orbit views set every condition."""
     task, data, model = t.task, t.dataset, t.perturbed_model(torch.float32)
     find_channels(task, data).display(data.test.pixels(0).over(data.background))
     before = {name: value.clone() for name, value in model.params.items()}

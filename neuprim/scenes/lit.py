@@ -85,7 +85,7 @@ class LitSettings:
 
 
 class LitView(NamedTuple):
-    """A view of ``lit_solids``: (3,) positions of camera, light and, in test views, the baseline's nearest light."""
+    """A view of ``lit_solids``: (3,) positions of camera, light and, in test views, the nearest training light."""
 
     name: str
     camera: NDArray[np.float64]

@@ -219,7 +219,7 @@ def _read_principal_point(
     record, keys = level.record, "camera_intrinsics" if array else "cx, cy"
     if level is frame and sum(record.has(key) for key in PRINCIPAL_POINT) == 1 and file.has(PRINCIPAL_POINT):
         found = "the frame has only one of cx, cy, and the cx, cy of the whole file are for another camera"
-        raise DataError(f"{record.where}: {found}; expected cx and cy in the frame")
+        raise DataError(f"{record.where}: {found}; expected both cx and cy in the frame")
     scale = level.scales(keys, target)
     plain = [record.number_or(key, 0.5 * side) for key, side in zip(PRINCIPAL_POINT, level.size, strict=True)]
     stated = _read_camera_intrinsics(record)[:2] if array else plain

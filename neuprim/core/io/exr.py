@@ -191,7 +191,7 @@ def write_exr_layers(
     Args:
         channels: channels by name, with the prefix of their layer; all of one size, values of half floats at most
             65504.
-        attributes: header attributes: text, numbers, float32 arrays of 2, 3 or 4 x 4 numbers, lists of floats.
+        attributes: header attributes: text, numbers, float32 arrays of shape (2,), (3,) or (4, 4), lists of floats.
     """
     shapes = sorted({tuple(channel.values.shape) for channel in channels.values()})
     if len(shapes) != 1 or len(shapes[0]) != 2 or 0 in shapes[0]:

@@ -199,9 +199,9 @@ class GradientSum:
         return self.shapes == {name: value.shape for name, value in params.items()}
 
     def add(self, params: Mapping[str, Tensor], contributions: Contributions) -> list[bool]:
-        """Add one view of every rank, in the order of the ranks, and clear the gradients of ``params``.
+        """Add the gradients of one view of every rank, in the order of the ranks, and clear those of ``params``.
 
-        Returns, for each parameter, whether it had a gradient.
+        Returns, for each parameter, whether it had a gradient on this rank.
         """
         present = []
         for value, part in zip(params.values(), self._gradients, strict=True):

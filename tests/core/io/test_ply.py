@@ -103,7 +103,7 @@ ONE = HEAD.format("ascii", 1)
         (HEAD.format("ascii", "٣"), "as the count of vertex; expected a number"),
         (ONE + "nothing\n", "not numbers"),
         (HEAD.format("ascii", 2) + "1\n \n\n\n\n", "1 vertices"),
-        (ONE + "1 2\n", "expected 1 of 1"),
+        (ONE + "1 2\n", "expected 1 rows of 1 numbers"),
         (HEAD.format("msdos", 1), "expected format"),
         ("ply\nelement vertex 1\nproperty float x\nend_header\n", "no format"),
         ("ply\nformat ascii 1.0\nend_header\n", "no element vertex"),

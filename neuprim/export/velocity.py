@@ -15,7 +15,6 @@ from neuprim.core.errors import ConfigError
 from neuprim.core.extensions import ExportJob
 from neuprim.core.io.vdb import VdbGrid, VdbTiles
 from neuprim.core.model.fields import Conditions
-from neuprim.core.model.geometry import Geometry
 from neuprim.core.model.primitives import ActivePrimitives, Primitives
 from neuprim.core.volumes.points import weighted_extinctions_at
 
@@ -100,7 +99,7 @@ def choose_velocity(
 def primitive_velocities(active: ActivePrimitives) -> Tensor:
     """Return the (N, 3) float32 velocities of a frame's primitives, in scene units per unit of the condition "time"."""
     own = {name: value.double() for name, value in active.own.items()}
-    stored = Geometry(active.stored.means.double(), active.stored.log_scales.double(), active.stored.quats.double())
+    stored = active.stored.double()
 
     def means(step: float) -> Tensor:
         time = active.conditions["time"].double() + step

@@ -323,7 +323,7 @@ def prune_cosine_neurons(params: Params, geometry: Geometry, keep: int, omega0: 
     """Keep the ``keep`` neurons of each primitive whose terms vary most; add the means of the other terms to b2."""
     W1, phase, w2 = params["W1"].double(), omega0 * params["b1"].double(), params["w2"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
-    rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations
+    rotations = geometry.double().rotations
     rate = omega0 * ((W1 @ rotations) * semi_axes[:, None, :]).norm(dim=-1)
     advance = omega0 * params["W_t"].double() if "W_t" in params else torch.zeros_like(phase)
     phase = phase + advance / 2

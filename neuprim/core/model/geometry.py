@@ -66,6 +66,10 @@ class Geometry(PrimitiveTensors):
         """Rotation matrices, (N, 3, 3); their columns are the axes of the ellipsoids in scene coordinates."""
         return quaternion_to_matrix(self.quats)
 
+    def double(self) -> Geometry:
+        """Return the ellipsoids in float64."""
+        return Geometry(self.means.double(), self.log_scales.double(), self.quats.double())
+
     def __getitem__(self, rows: Tensor | slice) -> Geometry:
         return Geometry(self.means[rows], self.log_scales[rows], self.quats[rows])
 

@@ -50,7 +50,8 @@ _NUMBERS = 64
 """At most so many numbers go to the device and back for a view, besides channels, and for the points."""
 
 _MOST_PROGRAMS = 16
-"""Most recordings kept; a recording is for one size of image and one set of intrinsics."""
+"""Most recordings; each is for one size of image and one set of intrinsics. Other steps are taken without a recording,
+as a recording that soon makes room for another one would cost more than it saves."""
 
 
 class RecordableTrainer(Protocol):
@@ -165,7 +166,7 @@ class StepRecorder:
         self.capacity: FrameCapacity | None = None
         self._on_gpu = trainer.device.type == device.CUDA
         self._refused = torch.zeros(1, dtype=torch.int32, device=trainer.device)
-        self._counts = (0, 0, 0, 0)
+        self._stages: tuple[Any, ...] = ()
         self._programs: dict[Any, _Program] = {}
         self._seen: Counter[Any] = Counter()
         self._sums: tuple[Tensor | None, ...] = ()
@@ -189,8 +190,7 @@ class StepRecorder:
         counts = frame_counts(stats)
         if self.capacity is not None and self.capacity.fits(counts):
             return
-        self._counts = tuple(max(pair) for pair in zip(counts, self._counts, strict=True))  # type: ignore[assignment]
-        self.capacity = FrameCapacity.around(self._counts, self._refused, zeros=False)
+        self.capacity = FrameCapacity.around(counts, self._refused, zeros=False, least=self.capacity)
         self.reset()
 
     def take(self, tasks: list[ViewTask], samples: PointSamples | None, progress: float) -> StepReport | None:
@@ -200,10 +200,12 @@ class StepRecorder:
             return None
         if not tasks or any(x is None for x in sums):
             return None
-        if any(x is not y for x, y in zip_longest(sums, self._sums)):
+        model = trainer.current_model
+        stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss)  # earlier ones do not return
+        if stages != self._stages or any(x is not y for x, y in zip_longest(sums, self._sums)):
             trainer.settle()
             self.reset()
-            self._sums = sums
+            self._sums, self._stages = sums, stages
         trainer.settle(_IN_FLIGHT - 1)
         inputs = _Inputs([trainer.load_view(task) for task in tasks], samples)
         program = self._find_program(inputs)
@@ -265,16 +267,12 @@ class StepRecorder:
     # ------------------------------------------------------------ recording
 
     def _find_program(self, inputs: _Inputs) -> _Program | None:
-        model, trainer = self.trainer.current_model, self.trainer
-        stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size)
-        key = (stages, inputs.shapes())
+        key = (self.trainer.limits_size, inputs.shapes())
         program = self._programs.get(key)
-        if program is None:
+        if program is None and len(self._programs) < _MOST_PROGRAMS:
             self._seen[key] += 1
             if self._seen[key] < 2:  # a recording takes as long as a step
                 return None
-            if len(self._programs) >= _MOST_PROGRAMS:
-                self._programs.pop(next(iter(self._programs)))
             program = self._programs[key] = self._make_program(inputs)
         return program
 

@@ -157,7 +157,7 @@ def _torch_density_point_values(
     x = device.copy_to_device(torch.from_numpy(cells.points), g.means.device)[row]
     if isinstance(form, Cosine):
         W1, b1, w2, b2 = (v.double() for v in (form.W1, form.b1, form.w2, form.b2))
-        place = Geometry(*(v.double() for v in (g.means, g.log_scales, g.quats)))
+        place = g.double()
         sigma = cosine_density(Cosine(W1, b1, w2, b2, form.omega0, form.edge), place, prim, x).clamp_min(0)
     else:
         sigma = active.sigma(prim, x.to(g.means)).double().clamp_min(0)

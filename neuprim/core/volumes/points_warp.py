@@ -31,7 +31,7 @@ def cosine_point_values(geometry: Geometry, form: Cosine, points: Tensor, weight
     Args:
         weights: (N, C) factors of the extinction of each primitive.
     """
-    g = Geometry(*(x.double() for x in (geometry.means, geometry.log_scales, geometry.quats)))
+    g = geometry.double()
     means, scales, axes, m = g.means, g.scales, g.rotations, g.length_scale
     A = axes.transpose(1, 2) / scales[:, :, None]  # y = A (x - mu)
     rate = form.omega0 * form.W1.double() / m[:, None, None]

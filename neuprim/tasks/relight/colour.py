@@ -180,7 +180,7 @@ def prune_light_network_units(
     net_x, view, light = (params[name].double() * boost for name in ("net_x", "net_view", "net_light"))
     phase, out = boost * params["net_phase"].double(), params["net_out"].double()
     semi_axes = (geometry.log_scales.double() - geometry.log_length_scale.double()[:, None]).exp()
-    rotations = Geometry(geometry.means.double(), geometry.log_scales.double(), geometry.quats.double()).rotations
+    rotations = geometry.double().rotations
     x_rate = ((net_x @ rotations) * semi_axes[:, None, :]).norm(dim=-1)
     view_rate, light_rate = view.norm(dim=-1), light.norm(dim=-1)
 

@@ -14,11 +14,13 @@ pytest.importorskip("warp", reason="the cuda backend is written in Warp: pip ins
 
 from neuprim.config import compose
 from neuprim.core.compute import device
+from neuprim.core.data import View
 from neuprim.core.errors import NonFiniteError
 from neuprim.core.io.vdb import write_vdb
 from neuprim.core.model.cosine import CosineDensity
 from neuprim.core.render import RenderSettings
 from neuprim.core.render.cuda.binning import FrameCapacity
+from neuprim.core.train import recorded_steps
 from neuprim.core.train.initial_model import initial_model_to_train
 from neuprim.core.train.losses import photometric
 from neuprim.core.train.recorded_steps import StepRecorder
@@ -124,6 +126,32 @@ def test_steps_of_volumes_are_recorded_between_looks_at_voxels(tmp_path: Path) -
     assert fast.dataset.largest is not None and fast.recorder.replayed >= 8
     assert found == expected and any("voxel_sigma" in report.parts for report in found)
     assert_same(plain.trainer, fast)
+
+
+def test_recordings_stay_when_there_are_more_kinds_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Steps of the other kinds are taken without a recording, instead of one that replaces another in every step."""
+    monkeypatch.setattr(recorded_steps, "_MOST_PROGRAMS", 1)
+    plain, fast = trainer(False), trainer(True)
+    assert fast.recorder is not None
+    for views in (plain.dataset.train, fast.dataset.train):
+
+        def view(index: int, of: Any = views.view) -> View:
+            found = of(index)
+            return replace(found, camera=replace(found.camera, fx=found.camera.fx * (1 + 0.1 * (index % 2))))
+
+        monkeypatch.setattr(views, "view", view)
+    calls: list[str] = []
+    for name in ("reset", "_make_program"):
+        function = getattr(fast.recorder, name)
+
+        def call(*inputs: Any, name: str = name, function: Any = function) -> Any:
+            calls.append(name)
+            return function(*inputs)
+
+        monkeypatch.setattr(fast.recorder, name, call)
+    assert reports(plain) == reports(fast)
+    assert_same(plain, fast)
+    assert 0 < calls.count("_make_program") <= calls.count("reset") and fast.recorder.replayed > 0
 
 
 @pytest.mark.parametrize("small", range(4), ids=["pairs", "in_float64", "slots", "float64_pairs"])

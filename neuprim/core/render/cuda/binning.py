@@ -62,16 +62,27 @@ class FrameCapacity:
     refused: Tensor  # (1,) int32 on the device
 
     @classmethod
-    def around(cls, counts: Sequence[int], refused: Tensor, zeros: bool) -> "FrameCapacity":
-        """Return sizes with room beyond ``counts``, in the order of fields; with ``zeros``, a count of 0 gets none."""
+    def around(
+        cls, counts: Sequence[int], refused: Tensor, zeros: bool, least: "FrameCapacity | None" = None
+    ) -> "FrameCapacity":
+        """Return sizes with room beyond ``counts``, in the order of fields, and no smaller than those of ``least``.
+
+        With ``zeros``, a count of 0 gets no room.
+        """
         sizes = [0 if zeros and not count else int(_MARGIN * count) + _SPARE for count in counts]
+        if least is not None:
+            sizes = [max(pair) for pair in zip(sizes, least.sizes, strict=True)]
         pairs, in_float64, slots, float64_pairs = sizes
         return cls(pairs, in_float64, slots, float64_pairs, refused)
 
+    @property
+    def sizes(self) -> tuple[int, int, int, int]:
+        """The four sizes, in the order of the fields."""
+        return (self.pairs, self.in_float64, self.slots, self.float64_pairs)
+
     def fits(self, counts: Sequence[int]) -> bool:
         """Return whether a frame with these counts, in the order of the fields, fits."""
-        held = (self.pairs, self.in_float64, self.slots, self.float64_pairs)
-        return all(count <= size for count, size in zip(counts, held, strict=True))
+        return all(count <= size for count, size in zip(counts, self.sizes, strict=True))
 
 
 @dataclass(frozen=True)

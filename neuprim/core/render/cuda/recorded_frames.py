@@ -46,7 +46,7 @@ class FrameRecorder:
     """
 
     def __init__(self, where: torch.device) -> None:
-        self.replayed, self._counts = 0, (0, 0, 0, 0)
+        self.replayed = 0
         self._refused = torch.zeros(1, dtype=torch.int32, device=where)
         self._capacity: FrameCapacity | None = None
         self._graphs = GraphRecorder(where, "frames")
@@ -99,8 +99,7 @@ class FrameRecorder:
             counts = frame_counts(output.stats)
             if self._capacity is not None and self._capacity.fits(counts):
                 return
-            self._counts = tuple(max(pair) for pair in zip(counts, self._counts, strict=True))  # type: ignore[assignment]
-            self._capacity = FrameCapacity.around(self._counts, self._refused, zeros=True)
+            self._capacity = FrameCapacity.around(counts, self._refused, zeros=True, least=self._capacity)
             self._programs.clear()
 
     def _make_program(

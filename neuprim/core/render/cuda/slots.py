@@ -155,7 +155,7 @@ def count_slots(frame: Frame, counts: Tensor, capacity: FrameCapacity | None) ->
 def refuse_misfit(frame: Frame, slot_ends: Tensor, capacity: FrameCapacity) -> None:
     """Empty the tiles of a frame that does not fit. ``slot_ends`` are running sums of slots and of float64 pairs."""
     starts = frame.lists.starts
-    sizes = wp.vec4i(capacity.pairs, capacity.in_float64, capacity.slots, capacity.float64_pairs)
+    sizes = wp.vec4i(*capacity.sizes)
     sums = (array(frame.ends, wp.int64), array(slot_ends, wp.int64), array(frame.bad, wp.int32))
     inputs = (*sums, sizes, array(starts, wp.int32), array(capacity.refused, wp.int32))
     launch_kernel(refuse_frame, len(starts), inputs, frame.device)

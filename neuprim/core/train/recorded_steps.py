@@ -50,8 +50,11 @@ _NUMBERS = 64
 """At most so many numbers go to the device and back for a view, besides channels, and for the points."""
 
 _MOST_PROGRAMS = 16
-"""Most recordings; each is for one size of image and one set of intrinsics. Other steps are taken without a recording,
-as a recording that soon makes room for another one would cost more than it saves."""
+"""Most recordings kept; a recording is for one size of image and one set of intrinsics."""
+
+_IDLE_STEPS = 128
+"""A recording is replaced after so many steps without use. If it were sooner, data with many kinds of images would
+record a step each time and replay none."""
 
 
 class RecordableTrainer(Protocol):
@@ -135,6 +138,7 @@ class _Program:
     inputs: _Inputs
     given: Tensor  # float64: for each view its matrix and background; learning rates; scales of the points
     run: Callable[[], None] = lambda: None
+    used: int = 0  # last step that used it
     found: Tensor | None = None  # float64: refused, then RenderedView.numbers of each view
     parts: tuple[tuple[str, ...], ...] = ()  # of the loss of each view
 
@@ -166,7 +170,6 @@ class StepRecorder:
         self.capacity: FrameCapacity | None = None
         self._on_gpu = trainer.device.type == device.CUDA
         self._refused = torch.zeros(1, dtype=torch.int32, device=trainer.device)
-        self._stages: tuple[Any, ...] = ()
         self._programs: dict[Any, _Program] = {}
         self._seen: Counter[Any] = Counter()
         self._sums: tuple[Tensor | None, ...] = ()
@@ -200,12 +203,10 @@ class StepRecorder:
             return None
         if not tasks or any(x is None for x in sums):
             return None
-        model = trainer.current_model
-        stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss)  # earlier ones do not return
-        if stages != self._stages or any(x is not y for x, y in zip_longest(sums, self._sums)):
+        if any(x is not y for x, y in zip_longest(sums, self._sums)):
             trainer.settle()
             self.reset()
-            self._sums, self._stages = sums, stages
+            self._sums = sums
         trainer.settle(_IN_FLIGHT - 1)
         inputs = _Inputs([trainer.load_view(task) for task in tasks], samples)
         program = self._find_program(inputs)
@@ -267,13 +268,21 @@ class StepRecorder:
     # ------------------------------------------------------------ recording
 
     def _find_program(self, inputs: _Inputs) -> _Program | None:
-        key = (self.trainer.limits_size, inputs.shapes())
-        program = self._programs.get(key)
-        if program is None and len(self._programs) < _MOST_PROGRAMS:
+        model, trainer, programs = self.trainer.current_model, self.trainer, self._programs
+        stages = (model.density.stage, model.colour.stage, trainer.has_anisotropy_loss, trainer.limits_size)
+        key = (stages, inputs.shapes())
+        program = programs.get(key)
+        if program is None:
             self._seen[key] += 1
             if self._seen[key] < 2:  # a recording takes as long as a step
                 return None
-            program = self._programs[key] = self._make_program(inputs)
+            if len(programs) >= _MOST_PROGRAMS:
+                oldest = min(programs, key=lambda key: programs[key].used)
+                if trainer.step - programs[oldest].used < _IDLE_STEPS:
+                    return None
+                del programs[oldest]
+            program = programs[key] = self._make_program(inputs)
+        program.used = trainer.step
         return program
 
     def _make_program(self, inputs: _Inputs) -> _Program:

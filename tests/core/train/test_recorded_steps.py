@@ -128,9 +128,11 @@ def test_steps_of_volumes_are_recorded_between_looks_at_voxels(tmp_path: Path) -
     assert_same(plain.trainer, fast)
 
 
-def test_recordings_stay_when_there_are_more_kinds_of_images(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("idle", [0, 128])
+def test_recordings_in_use_stay_when_there_are_more_kinds_of_images(monkeypatch: pytest.MonkeyPatch, idle: int) -> None:
     """Steps of the other kinds are taken without a recording, instead of one that replaces another in every step."""
     monkeypatch.setattr(recorded_steps, "_MOST_PROGRAMS", 1)
+    monkeypatch.setattr(recorded_steps, "_IDLE_STEPS", idle)
     plain, fast = trainer(False), trainer(True)
     assert fast.recorder is not None
     for views in (plain.dataset.train, fast.dataset.train):
@@ -151,7 +153,8 @@ def test_recordings_stay_when_there_are_more_kinds_of_images(monkeypatch: pytest
         monkeypatch.setattr(fast.recorder, name, call)
     assert reports(plain) == reports(fast)
     assert_same(plain, fast)
-    assert 0 < calls.count("_make_program") <= calls.count("reset") and fast.recorder.replayed > 0
+    made = calls.count("_make_program")
+    assert made > 0 and (made <= calls.count("reset")) == (idle > 0) and fast.recorder.replayed > 0
 
 
 @pytest.mark.parametrize("small", range(4), ids=["pairs", "in_float64", "slots", "float64_pairs"])

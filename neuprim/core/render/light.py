@@ -52,7 +52,7 @@ def light_factor(geometry: Geometry, conditions: Conditions, typical: float, fal
     if not falloff:
         return strength.reshape(1, -1).expand(len(means), -1)
     squared = (device.to_device_like(conditions["light"], means) - means).square().sum(-1, keepdim=True)
-    return strength / squared.clamp_min((_MIN_LIGHT_DISTANCE * geometry.length_scale.detach()[:, None]).square())
+    return strength / squared.clamp_min((_MIN_LIGHT_DISTANCE * geometry.detached_length_scale[:, None]).square())
 
 
 # ---------------------------------------------------------------- visibility
@@ -102,8 +102,11 @@ def extents_towards(geometry: Geometry, point: Tensor) -> Tensor:
     The extent is the distance between the two tangent planes perpendicular to this direction.
     """
     towards = device.to_device_like(point, geometry.means) - geometry.means
-    units = normalize_direction(towards, geometry.length_scale[:, None])
-    return 2 * ((geometry.rotations * units[:, :, None]).sum(1) * geometry.scales).norm(dim=-1)
+    units = normalize_direction(towards, geometry.detached_length_scale[:, None])
+    quats = geometry.quats / geometry.quats.norm(dim=-1, keepdim=True)
+    turn = 2 * torch.linalg.cross(units, quats[:, 1:])  # turned into the ellipsoid's axes without the 3x3 matrices
+    own = units + quats[:, :1] * turn + torch.linalg.cross(turn, quats[:, 1:])
+    return 2 * (own * geometry.scales).norm(dim=-1)
 
 
 class Visibility(Protocol):

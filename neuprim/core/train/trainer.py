@@ -106,7 +106,8 @@ class Trainer:
         self.max_screen_size = None if size is None else MaxScreenSize(train, size)
         self.exposures = Exposures(len(train), dataset.channels, rate, self.device) if rate > 0 else None
         refine = dataset.refine
-        self.corrections = ViewCorrections(len(train), refine, dataset.extent, self.device) if refine else None
+        poses = torch.stack([camera.viewmat for camera in cameras])
+        self.corrections = ViewCorrections(poses, refine, dataset.extent, self.device) if refine else None
         self.covered_pixels = count_covered_pixels(train) if settings.stride == "auto" else 0.0
         self.generator = torch.Generator().manual_seed(seed + 1)
         self.order, self.step, self.elapsed = torch.empty(0, dtype=torch.int64), 0, 0.0

@@ -36,7 +36,7 @@ _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
-_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [3e-4] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
+_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [3e-3] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
 """Initial learning rate of each number by kind, per step that uses the view; poses are in radians and units."""
 
 
@@ -202,16 +202,36 @@ class Exposures(_NumbersOfViews):
 class ViewCorrections(_NumbersOfViews):
     """Learned corrections of cameras and conditions whose given values are inexact (``Dataset.refine``).
 
+    A pose is a rotation around the point that the cameras look at, and a shift. A rotation around the camera would
+    shift the image like a shift does, and Adam learns either slowly. All cameras together are not moved, rotated or
+    scaled: images do not determine that, and the model would move away from the held-out cameras.
+
     Args:
+        cameras: (V, 4, 4) given view matrices of the training views.
         kinds: "camera" or a condition -> "pose", "offset" or "factor". A pose is a rotation vector and a shift in
             camera axes. An offset is added to a position. For a factor, the logarithm is learned.
         unit: unit of shifts and offsets, in scene units.
     """
 
-    def __init__(self, views: int, kinds: Mapping[str, Correction], unit: float, device: torch.device) -> None:
+    def __init__(self, cameras: Tensor, kinds: Mapping[str, Correction], unit: float, device: torch.device) -> None:
         rates = [rate for kind in kinds.values() for rate in _CORRECTION_RATES[kind]]
-        super().__init__(views, rates, device)
+        super().__init__(len(cameras), rates, device)
         self.kinds, self.unit = kinds, unit
+        rotations, shifts = cameras[:, :3, :3].double().cpu(), cameras[:, :3, 3].double().cpu()
+        self._pivots = rotations @ _looked_at(rotations, shifts) + shifts
+        none = torch.zeros_like(rotations)
+        turned, moved = torch.cat([rotations, none], 1), torch.cat([none, rotations], 1)
+        nearer = torch.cat([torch.zeros_like(shifts), self._pivots / unit], 1)[..., None]
+        self._alike = torch.cat([turned, moved, nearer], 2).flatten(0, 1)  # (6 V, 7): poses that move all cameras alike
+        self._alike_inverse = torch.linalg.pinv(self._alike)
+
+    def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
+        super().step(gradients, factor)
+        if "pose" in self.kinds.values():
+            first = sum(self._sizes()[: list(self.kinds.values()).index("pose")])
+            poses = self.numbers[:, first : first + 6]
+            alike = self._alike @ (self._alike_inverse @ poses.flatten().double().cpu())
+            poses -= alike.view(poses.shape).to(poses)
 
     def apply(self, index: int, view: View) -> View:
         """Return view ``index`` with its corrections applied."""
@@ -222,18 +242,20 @@ class ViewCorrections(_NumbersOfViews):
                 part = part.to(value)
                 conditions[name] = value * part.exp() if self.kinds[name] == "factor" else value + self.unit * part
             else:
-                camera = replace(camera, viewmat=self._motion(part.cpu()) @ camera.viewmat.double())
+                motion = self._motion(part.cpu(), self._pivots[index])
+                camera = replace(camera, viewmat=motion @ camera.viewmat.double())
         return replace(view, camera=camera, conditions=conditions)
 
     def _sizes(self) -> list[int]:
         return [len(_CORRECTION_RATES[kind]) for kind in self.kinds.values()]
 
-    def _motion(self, part: Tensor) -> Tensor:
-        """Return the (4, 4) rigid transform of a rotation vector and a shift."""
+    def _motion(self, part: Tensor, pivot: Tensor) -> Tensor:
+        """Return the (4, 4) rigid transform of a rotation vector, around ``pivot``, and a shift."""
         (x, y, z), shift = part[:3], self.unit * part[3:]
         zero = torch.zeros_like(x)
         cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).reshape(3, 3)
-        top = torch.cat([torch.linalg.matrix_exp(cross), shift[:, None]], 1)
+        rotation = torch.linalg.matrix_exp(cross)
+        top = torch.cat([rotation, (shift + pivot - rotation @ pivot)[:, None]], 1)
         return torch.cat([top, top.new_tensor([[0.0, 0.0, 0.0, 1.0]])])
 
     def summary(self) -> str:
@@ -247,3 +269,14 @@ class ViewCorrections(_NumbersOfViews):
             else:
                 found.append(f"{name} {first:.1%}" if kind == "factor" else f"{name} {self.unit * first:.2g}")
         return f"corrections of training views, root mean squares, scene units: {', '.join(found)}"
+
+
+def _looked_at(rotations: Tensor, shifts: Tensor) -> Tensor:
+    """Return the (3,) point nearest to the optical axes of cameras with rotations (V, 3, 3) and shifts (V, 3).
+
+    It minimises the sum of squared distances; where the axes are parallel, it is the one nearest to the cameras.
+    """
+    sideways = rotations[:, :2].flatten(0, 1)  # (2 V, 3): a point on an axis has the camera coordinates (0, 0, z)
+    middle = -(rotations.transpose(1, 2) @ shifts[..., None]).mean(0)[:, 0]
+    off = -(shifts[:, :2].flatten() + sideways @ middle)
+    return middle + torch.linalg.pinv(sideways, rtol=1e-6) @ off

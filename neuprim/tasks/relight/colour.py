@@ -110,7 +110,7 @@ class LightNetwork(ColourField):
 
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> RayNet:
         means = geometry.means
-        size = geometry.length_scale.detach()[:, None]
+        size = geometry.detached_length_scale[:, None]
         view = normalize_direction(means - device.to_device_like(camera.position, means), size)
         to_light = device.to_device_like(conditions["light"], means) - means
         factor = light_factor(geometry, conditions, self.typical, self.falloff)
@@ -247,7 +247,7 @@ class LightHarmonics(ColourField):
         color = params["c_dc"]
         if self.degree:
             to_light = device.to_device_like(conditions["light"], color) - geometry.means
-            size = geometry.length_scale.detach()[:, None]
+            size = geometry.detached_length_scale[:, None]
             bands = real_light_harmonics(normalize_direction(to_light, size), self.degree)
             color = color + (bands[:, 1:, None] * params["light_sh"]).sum(1)
         return Constant(color.clamp_min(0.0) * light_factor(geometry, conditions, self.typical, self.falloff))

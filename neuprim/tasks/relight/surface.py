@@ -191,7 +191,7 @@ class SurfaceColour(ColourField):
         means, albedo = geometry.means, params["c_dc"]
         none = albedo.new_zeros(len(albedo), 0, self.channels)
         parts = surface_colors(
-            means, geometry.length_scale.detach(), params["normal"], albedo,
+            means, geometry.detached_length_scale, params["normal"], albedo,
             params.get("highlight", none), params.get("log_gloss", none[..., 0]), params.get("indirect", none),
             conditions["light"], camera.position,
         )  # fmt: skip

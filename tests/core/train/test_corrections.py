@@ -9,7 +9,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from neuprim.core.cameras import Camera
+from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data import Dataset, Pixels, View, ViewSet
 from neuprim.core.errors import CheckpointError
 from neuprim.core.render import RenderSettings, render
@@ -20,6 +20,8 @@ from neuprim.plugins.losses import photometric
 from neuprim.tasks.relight.colour import LightNetwork
 from tests import lit_models, scenes
 from tests.core import tiny
+
+UP = torch.tensor([0.0, 0.0, 1.0])
 
 
 class ListedViews(ViewSet):
@@ -38,19 +40,16 @@ class ListedViews(ViewSet):
         return self.images[index]
 
 
-def moved(camera: Camera, generator: torch.Generator, amount: float) -> Camera:
-    """Turned and shifted on its own axes."""
-    numbers = amount * torch.randn(6, generator=generator, dtype=torch.float64)
-    corrections = ViewCorrections(1, {"camera": "pose"}, 1.0, torch.device("cpu"))
-    corrections.numbers[0] = numbers.float()
-    with torch.no_grad():
-        return corrections.apply(0, View("v", camera)).camera
-
-
 def with_moved_cameras(dataset: Dataset) -> Dataset:
-    g, train = torch.Generator().manual_seed(3), dataset.train
-    views = [replace(v, camera=moved(v.camera, g, 0.02)) for v in map(train.view, range(len(train)))]
-    images = [train.pixels(i) for i in range(len(train))]
+    """Cameras rotated and shifted on their own axes, but not all alike."""
+    given = [dataset.train.view(i) for i in range(len(dataset.train))]
+    poses = torch.stack([view.camera.viewmat for view in given])
+    corrections = ViewCorrections(poses, {"camera": "pose"}, dataset.extent, torch.device("cpu"))
+    corrections.numbers = 0.02 * torch.randn(len(given), 6, generator=torch.Generator().manual_seed(3))
+    corrections.step({})
+    with torch.no_grad():
+        views = [corrections.apply(i, view) for i, view in enumerate(given)]
+    images = [dataset.train.pixels(i) for i in range(len(given))]
     return replace(dataset, train=ListedViews(views, images), refine={"camera": "pose"})
 
 
@@ -85,6 +84,41 @@ def test_cameras_are_found() -> None:
         after = error([corrected(second, i).camera for i in range(count)])
     assert after < 0.4 * before, (before, after)
     assert second.corrections is not None and "camera" in second.corrections.summary()
+
+
+def test_moving_all_cameras_alike_is_undone() -> None:
+    """No image shows a rotation, a shift or a scale of the whole scene; what else the cameras do stays."""
+    g, small = torch.Generator().manual_seed(5), 1e-5
+    eyes = 3 + torch.randn(5, 3, generator=g, dtype=torch.float64)
+    cameras = [replace(scenes.camera(), viewmat=look_at(eye, torch.zeros(3), UP)) for eye in eyes]
+    given = [View(str(i), camera, {"light": torch.zeros(3)}) for i, camera in enumerate(cameras)]
+    poses = torch.stack([view.camera.viewmat for view in given])
+    corrections = ViewCorrections(poses, {"light": "offset", "camera": "pose"}, 2.0, torch.device("cpu"))
+
+    def motions() -> Tensor:
+        """(V, 6): how each camera is rotated and shifted, on its own axes."""
+        with torch.no_grad():
+            now = [corrections.apply(i, view).camera.viewmat for i, view in enumerate(given)]
+        change = torch.stack(now) @ poses.inverse()
+        rotations = change[:, [2, 0, 1], [1, 2, 0]]
+        return torch.cat([rotations, change[:, :3, 3]], 1)
+
+    w, d, scale = small * torch.randn(3, generator=g), small * torch.randn(3, generator=g), small
+    turn = torch.linalg.matrix_exp(torch.linalg.cross(torch.eye(3), w.expand(3, 3)).T.double())
+    for alike in (True, False):
+        for i, view in enumerate(given):
+            center = turn @ view.camera.position * (1 + scale) + d
+            rotation = view.camera.viewmat[:3, :3] @ turn.T
+            moved = torch.cat([rotation, -(rotation @ center)[:, None]], 1)
+            wanted = moved @ poses[i].inverse()
+            corrections.numbers[i] = 0.0
+            corrections.numbers[i, 3:6] = wanted[[2, 0, 1], [1, 2, 0]].float()
+            corrections.numbers[i, 6:] = ((wanted[:, 3] - motions()[i, 3:]) / 2.0).float()
+        before = motions().norm()
+        if not alike:
+            corrections.numbers[2, 7] += small
+        corrections.step({})
+        assert (motions().norm() < 1e-3 * before) == alike, alike
 
 
 def test_lights_are_found() -> None:

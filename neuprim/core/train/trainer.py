@@ -242,8 +242,7 @@ class Trainer:
         if self.exposures is not None:
             self.exposures.step({result.view: result.gain for result in results})
         if self.corrections is not None:
-            factor = self.settings.final_rate**progress
-            self.corrections.step({result.view: result.correction for result in results}, factor)
+            self.corrections.step_at(progress, {result.view: result.correction for result in results})
         report.__dict__["view"] = name
         report.resolve(cost, parts, psnr)
 

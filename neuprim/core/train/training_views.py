@@ -36,8 +36,12 @@ _STRIDE_STAGES = ((0.7, 1), (0.9, 2))
 
 _BETA1, _BETA2, _EPS = 0.9, 0.99, 1e-8
 
-_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [3e-3] * 6, "offset": [3e-3] * 3, "factor": [3e-3]}
+_CORRECTION_RATES: dict[Correction, list[float]] = {"pose": [4e-3] * 6, "offset": [5e-3] * 3, "factor": [5e-3]}
 """Initial learning rate of each number by kind, per step that uses the view; poses are in radians and units."""
+
+_CORRECTION_START, _CORRECTION_FINAL = 0.1, 0.02
+"""Used fraction of the budget when corrections begin, as an early model is too blurred to correct anything by, and
+their last rate as a fraction of the first."""
 
 
 class PixelLoader:
@@ -225,8 +229,11 @@ class ViewCorrections(_NumbersOfViews):
         self._alike = torch.cat([turned, moved, nearer], 2).flatten(0, 1)  # (6 V, 7): poses that move all cameras alike
         self._alike_inverse = torch.linalg.pinv(self._alike)
 
-    def step(self, gradients: Mapping[int, list[float] | None], factor: float = 1.0) -> None:
-        super().step(gradients, factor)
+    def step_at(self, progress: float, gradients: Mapping[int, list[float] | None]) -> None:
+        """Update the corrections of views by ``gradients``, keyed by view, when ``progress`` of the budget is used."""
+        if progress < _CORRECTION_START:
+            return
+        self.step(gradients, _CORRECTION_FINAL ** ((progress - _CORRECTION_START) / (1 - _CORRECTION_START)))
         if "pose" in self.kinds.values():
             first = sum(self._sizes()[: list(self.kinds.values()).index("pose")])
             poses = self.numbers[:, first : first + 6]

@@ -46,7 +46,7 @@ def with_moved_cameras(dataset: Dataset) -> Dataset:
     poses = torch.stack([view.camera.viewmat for view in given])
     corrections = ViewCorrections(poses, {"camera": "pose"}, dataset.extent, torch.device("cpu"))
     corrections.numbers = 0.02 * torch.randn(len(given), 6, generator=torch.Generator().manual_seed(3))
-    corrections.step({})
+    corrections.step_at(1.0, {})
     with torch.no_grad():
         views = [corrections.apply(i, view) for i, view in enumerate(given)]
     images = [dataset.train.pixels(i) for i in range(len(given))]
@@ -117,7 +117,7 @@ def test_moving_all_cameras_alike_is_undone() -> None:
         before = motions().norm()
         if not alike:
             corrections.numbers[2, 7] += small
-        corrections.step({})
+        corrections.step_at(1.0, {})
         assert (motions().norm() < 1e-3 * before) == alike, alike
 
 

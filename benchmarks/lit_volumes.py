@@ -56,7 +56,7 @@ def measure(fitted: Fitted, metrics: dict[str, Any]) -> dict[str, Any]:
             shown: dict[str, Light | None] = {"new": lights[c - lit.held_out], "own": lights[0], "trained": lights[1]}
             for name, light in shown.items():
                 known = light_conditions(lit, light) if "light" in view.conditions else {}
-                truth = render_medium(light_medium(medium, light), view.camera, lit.samples)[..., :3]
+                truth = render_medium(light_medium(medium, light, lit.optics), view.camera, lit.samples)[..., :3]
                 took = []
                 for _ in range(ROUNDS):
                     start = time.thread_time()

@@ -71,7 +71,12 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
         if dataset.channels != 3:
             found = f"{dataset.name}: {dataset.channels} colour channels"
             raise ConfigError(f"{found}; task dynamic needs 3 channels if views have a light, because lights are RGB")
-        return density, ScatteringHarmonics(*settings, **model["colour"], typical=typical_light(dataset, False))
+        more: dict[str, Any] = {**model["colour"], "typical": typical_light(dataset, False)}
+        recording = vdb_recording_of(dataset)
+        if recording is not None:
+            optics = recording.capture.optics
+            more |= {"octaves": optics.octaves, "share": optics.octave_share}
+        return density, ScatteringHarmonics(*settings, **more)
     return density, TimeHarmonics(*settings, **model["colour"])
 
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypeVar
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -25,6 +26,24 @@ from neuprim.tasks.dynamic.colour import TimeHarmonics
 SHINES = "shines"
 """Condition, 0 or 1: whether an image includes emission. Of several images to be summed, only one does."""
 
+MOST_OCTAVES = 8
+
+_Transmittance = TypeVar("_Transmittance", np.ndarray, Tensor)
+
+
+def scattered_light(transmittance: _Transmittance, octaves: int, share: float) -> _Transmittance:
+    """Return the light that a point scatters, divided by the unoccluded light: sum_{o < octaves} share^o T^(1/2^o).
+
+    T is the transmittance to the light. The first octave is single scattering. Each further octave approximates light
+    that is scattered more often: it is weaker, and extinction weakens it half as much (Wrenninge et al. 2013, Oz: The
+    Great and Volumetric).
+    """
+    found, arriving = transmittance, transmittance
+    for octave in range(1, octaves):
+        arriving = arriving**0.5
+        found = found + share**octave * arriving
+    return found
+
 
 def light_smoke_by_environment(environment: Environment, count: int, facts: Mapping[str, Any]) -> Illumination:
     """Convert an environment to ``count`` lights for smoke and fire; only the first light's image includes emission.
@@ -42,21 +61,30 @@ def light_smoke_by_environment(environment: Environment, count: int, facts: Mapp
 
 
 class ScatteringHarmonics(TimeHarmonics):
-    """Emission, the colour of :class:`TimeHarmonics`, plus single scattering of one light: T max(0, a) E/typical.
+    """Emission, the colour of :class:`TimeHarmonics`, plus scattering of one light: S max(0, a) E/typical.
 
     a (C,) is a parameter of each primitive: albedo times the scattering fraction of the extinction times the isotropic
-    phase function 1/4 pi. T is the model's transmittance from the primitive's centre to the light, without gradient
-    (:func:`~neuprim.core.render.light.shade_volume_by_light`). E is the condition ``light_intensity``: the irradiance
-    of the unoccluded light. ``typical`` is the irradiance of a typical training light.
+    phase function 1/4 pi. S is the :func:`scattered_light` for the model's transmittance from the primitive's centre to
+    the light, without gradient (:func:`~neuprim.core.render.light.shade_volume_by_light`). E is the condition
+    ``light_intensity``: the irradiance of the unoccluded light.
+
+    Args:
+        typical: irradiance of a typical training light.
+        octaves, share: arguments of :func:`scattered_light`.
     """
 
-    def __init__(self, *settings: Any, typical: float = 1.0, **more: Any) -> None:
+    def __init__(self, *settings: Any, typical: float = 1.0, octaves: int = 1, share: float = 0.5, **more: Any) -> None:
         super().__init__(*settings, **more)
         check_typical_light(typical)
-        self.typical = float(typical)
+        if isinstance(octaves, bool) or not isinstance(octaves, int) or not 1 <= octaves <= MOST_OCTAVES:
+            raise ValueError(f"octaves {octaves!r}; expected 1..{MOST_OCTAVES}")
+        if not 0 <= share <= 1:
+            raise ValueError(f"share {share!r}; expected 0..1")
+        self.typical, self.octaves, self.share = float(typical), octaves, float(share)
+        self._brightest = float(scattered_light(np.ones(()), octaves, self.share))
 
     def settings(self) -> dict[str, Any]:
-        return {**super().settings(), "typical": self.typical}
+        return {**super().settings(), "typical": self.typical, "octaves": self.octaves, "share": self.share}
 
     def parameters(self) -> list[ParameterSpec]:
         C = self.channels
@@ -74,13 +102,16 @@ class ScatteringHarmonics(TimeHarmonics):
         own = super().lower(params, geometry, camera, conditions).rgb
         if SHINES in conditions:
             own = own * device.to_device_like(conditions[SHINES], own)
-        strength = light_factor(geometry, conditions, self.typical, falloff=False)
+        strength = self._brightest * light_factor(geometry, conditions, self.typical, falloff=False)
         return Constant(params["scattered"].clamp_min(0.0) * strength, own)
 
     def shade(
         self, geometry: Geometry, density: LoweredDensity, conditions: Conditions, settings: RenderSettings
     ) -> Shading:
-        return shade_volume_by_light(geometry, density, conditions, settings)
+        shading = shade_volume_by_light(geometry, density, conditions, settings)
+        if self.octaves == 1 or shading.primitives is None:
+            return shading
+        return Shading(scattered_light(shading.primitives, self.octaves, self.share) / self._brightest)
 
     def script(self) -> str:
         return read_script(__package__, "scattering.js").replace("TIME_HARMONICS", super().script().strip())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -17,6 +18,7 @@ from neuprim.core.environment import Environment
 from neuprim.core.errors import ConfigError
 from neuprim.core.io.exr import write_exr
 from neuprim.core.model.cosine import cosine_density
+from neuprim.core.model.fields import Constant
 from neuprim.core.model.geometry import GEOMETRY_SPECS, Geometry
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.render import RenderSettings, render
@@ -25,7 +27,7 @@ from neuprim.core.task import SceneContext
 from neuprim.runs.measure import render_light_sum
 from neuprim.runs.open import load_run, open_run
 from neuprim.runs.run import run
-from neuprim.tasks.dynamic.scattering import ScatteringHarmonics, light_smoke_by_environment
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics, light_smoke_by_environment, scattered_light
 from neuprim.tasks.dynamic.time_density import TimeDensity
 from neuprim.tasks.dynamic.volume.optics import draw_lights
 from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
@@ -109,6 +111,32 @@ def test_lights_at_the_extremes(light: tuple[float, float, float]) -> None:
         assert bool(((found >= 0) & (found <= 1)).all())
     frame = {"time": torch.tensor(0.5), "light": place, "light_intensity": torch.ones(3)}
     assert bool(torch.isfinite(render(model, camera_at((2.0, 2.0, 1.0)), frame, SETTINGS).rgb).all())
+
+
+def test_octaves_of_scattering() -> None:
+    """Each is weaker than the one before, and reaches deeper; the shading is relative to the unoccluded light."""
+    transmittance = torch.tensor([1.0, 0.25, 0.0])
+    assert scattered_light(transmittance, 1, 0.5).tolist() == [1.0, 0.25, 0.0]
+    assert scattered_light(transmittance, 3, 0.5).tolist() == pytest.approx([1.75, 0.25 + 0.25 + 0.5**2.5, 0.0])
+    model, light = cloud(80), torch.tensor([2.0, -1.0, 3.0])
+    frame = {"time": torch.tensor(0.5), "light": light, "light_intensity": torch.ones(3)}
+    single = shaded(model, light)
+    model.colour = ScatteringHarmonics(0, powers=0, waves=0, octaves=3, share=0.4)
+    geometry, density = model.lower_density(frame)
+    shading = model.colour.shade(geometry, density, frame, SETTINGS)
+    assert shading is not None and shading.primitives is not None and float(shading.primitives.max()) <= 1.0
+    colour = model.colour.lower(model.of(model.colour), geometry, camera_at((2.0, 2.0, 1.0)), frame)
+    assert isinstance(colour, Constant)
+    arriving = shading.primitives[:, None] * colour.rgb
+    expected = scattered_light(single, 3, 0.4)[:, None] * model.params["scattered"]
+    assert torch.allclose(arriving, expected, rtol=1e-5, atol=1e-7)
+
+
+@pytest.mark.parametrize("wrong", [{"octaves": 0}, {"octaves": 9}, {"octaves": True}, {"share": 1.5}, {"share": -0.1}])
+def test_impossible_octaves_are_refused(wrong: dict[str, Any]) -> None:
+    (name,) = wrong
+    with pytest.raises(ValueError, match=rf"^{name} .*; expected"):
+        ScatteringHarmonics(0, **wrong)
 
 
 def test_an_empty_frame_is_dark() -> None:

@@ -80,7 +80,7 @@ def test_the_equation_of_a_look() -> None:
 
     def value(**settings: object) -> list[float]:
         optics = Optics(extinction=4.0, **settings)  # type: ignore[arg-type]
-        found = light_medium(build_medium(grids, optics, SAME), optics.light)
+        found = light_medium(build_medium(grids, optics, SAME), optics.light, optics)
         assert found.values.shape == (3, 3, 3, 4)
         return found.values[1, 1, 1].tolist()
 
@@ -90,6 +90,8 @@ def test_the_equation_of_a_look() -> None:
     through = math.exp(-1.0)  # half a ramp of σ = 2
     light = Light((0.0, 0.0, 5.0), (4 * math.pi, 0.0, 0.0))
     assert value(light=light) == pytest.approx([2.0, 2.0 * through, 0.0, 0.0], rel=1e-5)
+    twice = value(light=light, albedo=(0.9, 0.9, 0.9), octaves=2)[1]
+    assert twice == pytest.approx(1.8 * (through + 0.45 * math.sqrt(through)), rel=1e-5)
     glow = value(emission=3.0, kelvin=(1000.0, 2000.0), flame_range=(0.0, 0.25))
     assert glow == pytest.approx([2.0, *(2.0 * 3.0 * black_body_rgb(np.array(2000.0), 2000.0))], rel=1e-5)
     middle = value(emission=3.0, kelvin=(1000.0, 2000.0), flame_range=(0.0, 0.5))

@@ -69,7 +69,7 @@ def test_points_are_voxel_centres_with_the_files_own_values(files: Path, tmp_pat
     capture = recorded(data).capture
     assert sorted(drawn) == [f"frame_{n:04d}" for n in range(1, 6)]
     for frame in capture.frames[:4]:
-        medium = light_medium(capture.medium(frame), capture.optics.light)
+        medium = light_medium(capture.medium(frame), capture.optics.light, capture.optics)
         for samples in drawn[f"frame_{frame.number:04d}"]:
             assert float(samples.conditions["time"]) == pytest.approx((frame.number - 1) / 4)
             index = samples.points.double().numpy() @ medium.index_from_scene[:3, :3].T + medium.index_from_scene[:3, 3]

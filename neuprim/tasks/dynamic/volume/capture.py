@@ -196,7 +196,7 @@ class Capture:
         """
         medium = self.medium(frame)
         lights = self.frame_lights(frame)
-        media = {light: light_medium(medium, light) for light in dict.fromkeys(lights)}
+        media = {light: light_medium(medium, light, self.optics) for light in dict.fromkeys(lights)}
         brightest = 0.0
         for c, (camera, light) in enumerate(zip(self.cameras, lights, strict=True)):
             rgba = render_medium(media[light], camera, self.samples)

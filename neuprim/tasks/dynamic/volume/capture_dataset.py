@@ -438,8 +438,8 @@ class FrameVoxels(PointSupervision):
 
     def _supervised_medium(self, frame: VdbFrame) -> Medium:
         """Return a frame's medium. It includes the light, unless there are several: then the model adds their light."""
-        medium = self.capture.medium(frame)
-        return light_medium(medium, self.capture.frame_lights(frame)[0]) if self.capture.lights == 1 else medium
+        capture, medium = self.capture, self.capture.medium(frame)
+        return medium if capture.lights > 1 else light_medium(medium, capture.frame_lights(frame)[0], capture.optics)
 
     def _read_or_make_voxels(self, frame: VdbFrame) -> MediumVoxels:
         name = f"{self.capture.frame_folder(frame)}/voxels.npz"

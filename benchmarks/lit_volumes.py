@@ -31,7 +31,8 @@ from neuprim.core.render import render
 from neuprim.runs.fit import Fitted
 from neuprim.tasks.dynamic import vdb_recording_of
 from neuprim.tasks.dynamic.volume.capture_dataset import light_conditions
-from neuprim.tasks.dynamic.volume.optics import Light, light_medium
+from neuprim.tasks.dynamic.volume.lit_medium import light_medium
+from neuprim.tasks.dynamic.volume.optics import Light
 from neuprim.tasks.dynamic.volume.raymarch import render_medium
 
 RECORD = RESULTS / "lit_volumes.json"

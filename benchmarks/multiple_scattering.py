@@ -6,10 +6,11 @@
 
 Mitsuba 3 (`volpath`) traces the middle frame for every held-out camera, under a light that no training view had. The
 smoke scatters nine tenths of what it absorbs, and does not glow. Compared with these images are those of the ray caster
-with 1 to 4 octaves (`scene.optics.octaves`), and of models that were trained by it with 1 and 3 octaves and four lights
+with 1 to 4 octaves (`scene.optics.octaves`), and of models that were trained by it with 1 to 3 octaves and four lights
 a frame. Values are PSNR of the pixels that show matter, in linear light over the brightest path-traced pixel; *again*
 is path tracing with another seed, so it is what the noise allows. `fire` is a folder of EmberGen's files, of which
-frames 20 to 40 are used. Results go to benchmarks/results/multiple_scattering.json after every run, and only what is
+frames 20 to 40 are used. A second table has the ray caster's images of smoke that only its flames light, with few lights
+for the flames (`scene.optics.fire_lights`), against 256. Results go to benchmarks/results/multiple_scattering.json after every run, and only what is
 missing is run; --docs puts the table between the markers of docs/results/dynamic.md, --print runs nothing.
 """
 
@@ -30,15 +31,19 @@ from shared.trials import Trial, run_all
 from torch import Tensor
 
 from neuprim.core.cameras import Camera
+from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.render import render
 from neuprim.runs.fit import Fitted
 from neuprim.tasks.dynamic import vdb_recording_of
+from neuprim.tasks.dynamic.volume.capture import Capture
 from neuprim.tasks.dynamic.volume.capture_dataset import light_conditions
-from neuprim.tasks.dynamic.volume.optics import Light, light_medium
+from neuprim.tasks.dynamic.volume.lit_medium import light_medium
+from neuprim.tasks.dynamic.volume.optics import Light
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 
 RECORD = RESULTS / "multiple_scattering.json"
-LIGHTS, OCTAVES, TRAINED = 4, (1, 2, 3, 4), (1, 3)
+LIGHTS, OCTAVES, TRAINED = 4, (1, 2, 3, 4), (1, 2, 3)
+FIRE_LIGHTS, ALL_FIRE_LIGHTS, _GLOW = (0, 1, 4, 16, 64), 256, 1.5
 _DEPTH = 128  # most scatterings of a path
 _LOOK = (
     "scene.look=smoke_fire",
@@ -104,7 +109,7 @@ def trace_medium(medium: Medium, light: Light, camera: Camera, samples: int, see
 
 
 def measure(samples: int, fitted: Fitted, metrics: dict[str, Any]) -> dict[str, Any]:
-    """Mean squared errors of radiance against path tracing, and the brightest traced radiance."""
+    """Mean squared errors of radiance against path tracing, the brightest traced radiance, and those of the flames."""
     dataset, model, settings = fitted.dataset, fitted.model, fitted.config.renderer
     recording = vdb_recording_of(dataset)
     assert recording is not None
@@ -128,7 +133,25 @@ def measure(samples: int, fitted: Fitted, metrics: dict[str, Any]) -> dict[str, 
         for name, image in images.items():
             errors.setdefault(f"mse_{name}", []).append((image - truth).square()[mask])
     found = {name: float(torch.cat(parts).double().mean()) for name, parts in errors.items()}
-    return {"model_bytes": metrics["model_bytes"], "brightest": brightest, **found}
+    fire = light_by_flames(capture, capture.frames[t]) if capture.optics.octaves == 1 else {}
+    return {"model_bytes": metrics["model_bytes"], "brightest": brightest, **found, **fire}
+
+
+def light_by_flames(capture: Capture, frame: VdbFrame) -> dict[str, float]:
+    """Mean squared errors of radiance with few fire lights, by their number, and the brightest light of the flames."""
+
+    def images(lights: int) -> list[Tensor]:
+        optics = replace(capture.optics, emission=_GLOW, fire_lights=lights)
+        medium = replace(capture, optics=optics).medium(frame)
+        return [render_medium(medium, camera, 2) for camera in capture.cameras[-capture.held_out :]]
+
+    truth = torch.stack(images(ALL_FIRE_LIGHTS))
+    seen, dark = truth[..., 3] > 0.01, torch.stack(images(0))
+    found = {"brightest_fire": float((truth - dark)[..., :3].max())}
+    for lights in FIRE_LIGHTS:
+        wrong = torch.stack(images(lights))[seen][..., :3] - truth[seen][..., :3]
+        found[f"mse_fire_{lights}"] = float(wrong.double().square().mean())
+    return found
 
 
 def plan(scenes: Sequence[str], steps: int, fire: Path | None) -> list[Trial]:
@@ -156,7 +179,12 @@ def table(record: Record) -> str:
 
         made.row(scene, "ray caster", *(cell(first, f"cast_{n}") for n in OCTAVES), cell(first, "again"))
         made.row(scene, "model", *(cell(trained[n], "model") if n in trained else "–" for n in OCTAVES), "–")
-    return str(made)
+    fire = Table("scene", *(f"{n} light{'s' * (n != 1)}" for n in FIRE_LIGHTS))
+    for run in record["trials"]:
+        if "brightest_fire" in run:
+            errors = (run[f"mse_fire_{n}"] / run["brightest_fire"] ** 2 for n in FIRE_LIGHTS)
+            fire.row(run["scene"], *(f"{-10 * math.log10(error):.1f} dB" for error in errors))
+    return f"{made}\n\n{fire}"
 
 
 def main() -> None:

@@ -29,7 +29,7 @@ from neuprim.runs.open import load_run, open_run
 from neuprim.runs.run import run
 from neuprim.tasks.dynamic.scattering import ScatteringHarmonics, light_smoke_by_environment, scattered_light
 from neuprim.tasks.dynamic.time_density import TimeDensity
-from neuprim.tasks.dynamic.volume.optics import draw_lights
+from neuprim.tasks.dynamic.volume.lit_medium import draw_lights
 from neuprim.tasks.dynamic.volume.volume_scene import load_volume_scene
 from tests.page_models import camera_at
 from tests.tasks.dynamic import sequences

@@ -9,22 +9,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from scipy import ndimage
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.errors import DataError
 from neuprim.core.io.vdb import list_vdb_files, read_grid, vdb_scale_transform, write_vdb
 from neuprim.tasks.dynamic.volume.capture import hemisphere_capture_cameras
-from neuprim.tasks.dynamic.volume.optics import (
-    OPTICS_PRESETS,
-    Axis,
-    Light,
-    Optics,
-    black_body_rgb,
-    black_body_xyz,
-    build_medium,
-    light_medium,
-)
-from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, render_medium
+from neuprim.tasks.dynamic.volume.lit_medium import build_medium, light_medium
+from neuprim.tasks.dynamic.volume.optics import OPTICS_PRESETS, Axis, Light, Optics, black_body_rgb, black_body_xyz
+from neuprim.tasks.dynamic.volume.raymarch import Medium, light_transmittance, point_transmittance, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
 from tests.tasks.dynamic.volumes import grid_of, march_slowly, ragged, rotation
 
@@ -97,6 +90,59 @@ def test_the_equation_of_a_look() -> None:
     middle = value(emission=3.0, kelvin=(1000.0, 2000.0), flame_range=(0.0, 0.5))
     assert middle[1:] == pytest.approx((6.0 * black_body_rgb(np.array(1500.0), 2000.0)).tolist(), rel=1e-3)
     assert value(flame_extinction=8.0)[0] == 4.0
+
+
+def test_flames_light_the_smoke() -> None:
+    """One flame and one voxel of smoke in a vacuum."""
+    flames, smoke = np.zeros((9, 3, 3), np.float32), np.zeros((9, 3, 3), np.float32)
+    flames[1, 1, 1], smoke[7, 1, 1] = 1.0, 1e-3
+    grids = {"flames": grid_of("flames", flames), "density": grid_of("density", smoke)}
+    look = Optics(extinction=1.0, albedo=(0.5, 0.5, 0.5), emission=2.0, flame_extinction=1e-3, kelvin=(1000.0, 2000.0))
+    plain, lit = (build_medium(grids, dataclasses.replace(look, fire_lights=n), SAME).values[..., 1:] for n in (0, 4))
+    light, change = 1e-3 * 2.0 * black_body_rgb(np.array(2000.0), 2000.0), lit - plain
+    assert change[7, 1, 1] == pytest.approx(0.5 * 1e-3 * light / (4 * math.pi * (36 + 0.25)), rel=3e-3)
+    change[7, 1, 1] = 0
+    assert not change.any()
+
+
+def test_few_fire_lights_come_close_to_one_for_each_flame() -> None:
+    g = np.random.default_rng(1)
+    x, y, z = np.meshgrid(*(np.linspace(-1, 1, 20),) * 3, indexing="ij")
+    flames = np.maximum(1 - 9 * (x**2 + (y + 0.4) ** 2 + z**2), 0).astype(np.float32) * g.random((20, 20, 20))
+    smoke = np.maximum(1 - x**2 - y**2 - z**2, 0).astype(np.float32)
+    grids = {"flames": grid_of("flames", flames), "density": grid_of("density", smoke)}
+    optics = Optics(extinction=0.3, emission=1.0, kelvin=(1000.0, 2000.0))
+
+    def lit(lights: int) -> np.ndarray:
+        return build_medium(grids, dataclasses.replace(optics, fire_lights=lights), SAME).values[..., 1:] - dark
+
+    dark = build_medium(grids, optics, SAME).values[..., 1:]
+    exact = lit(4096)  # more lights than flames
+    errors = [float(np.abs(lit(n) - exact).sum() / exact.sum()) for n in (1, 4, 16)]
+    assert errors[2] < 0.15 and errors[0] > errors[1] > errors[2], errors
+
+
+def test_transmittance_to_a_point() -> None:
+    """From every voxel of a uniform block, to points inside, outside, and so far away that the rays are parallel."""
+    sigma = np.zeros((8, 9, 10), np.float32)
+    sigma[1:-1, 1:-1, 1:-1] = 0.2 + np.random.default_rng(0).random((6, 7, 8))
+    turned = 0.25 * rotation(3)[:3, :3]
+    scene_from_index = np.eye(4)
+    scene_from_index[:3, :3], scene_from_index[:3, 3] = turned, (1.0, -2.0, 0.5)
+    medium = Medium(np.concatenate([sigma[..., None], np.zeros((*sigma.shape, 3), np.float32)], -1), scene_from_index)
+    some = np.argwhere(sigma > 0)[::29]
+    for index in ((4.3, 3.7, 5.1), (4.0, 4.0, 4.0), (-30.0, 12.0, 5.0)):
+        place = (scene_from_index @ [*index, 1.0])[:3]
+        found = point_transmittance(medium, place)[tuple(some.T)]
+        steps = (np.arange(4000) + 0.5) / 4000
+        for voxel, transmittance in zip(some, found, strict=True):
+            way = np.array(index) - voxel
+            samples = ndimage.map_coordinates(sigma.astype(np.float64), voxel[:, None] + way[:, None] * steps, order=1)
+            exact = math.exp(-samples.mean() * float(np.linalg.norm(turned @ way)))
+            assert transmittance == pytest.approx(exact, abs=2e-4), (index, voxel)
+    direction = np.array([0.3, -0.5, 0.8])
+    far, parallel = point_transmittance(medium, 1e7 * direction), light_transmittance(medium, direction)
+    assert np.abs(far - parallel).max() < 1e-4
 
 
 def test_which_grid_gives_extinction() -> None:

@@ -19,7 +19,8 @@ from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
 from neuprim.tasks.dynamic.volume.capture import sample_extinction
 from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels, VdbFrameViews
-from neuprim.tasks.dynamic.volume.optics import build_medium, optics_preset, override_optics
+from neuprim.tasks.dynamic.volume.lit_medium import build_medium
+from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation
 from neuprim.tasks.dynamic.volume.volume_scene import choose_volume_frames
 from tests.tasks.dynamic.sequences import (

@@ -16,7 +16,7 @@ from neuprim.core.io.vdb import write_vdb
 from neuprim.core.train.trainer import Trainer
 from neuprim.runs.fit import fit, prepare_training
 from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels
-from neuprim.tasks.dynamic.volume.optics import light_medium
+from neuprim.tasks.dynamic.volume.lit_medium import light_medium
 from tests.tasks.dynamic.sequences import VOXEL, dataset, empty_frame, recorded, write_blobs
 
 SMALL = (

@@ -40,15 +40,8 @@ from neuprim.core.volumes.density_truth import (
     TruthFrame,
     measure_density_errors,
 )
-from neuprim.tasks.dynamic.volume.optics import (
-    DATA_DEPENDENT,
-    UP_AXES,
-    Light,
-    Optics,
-    build_medium,
-    draw_lights,
-    light_medium,
-)
+from neuprim.tasks.dynamic.volume.lit_medium import build_medium, draw_lights, light_medium
+from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
 from neuprim.tasks.dynamic.volume.raymarch import Medium, render_medium
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation, GridReader
 

@@ -24,7 +24,8 @@ from neuprim.core.io.json_reader import read_npz_arrays
 from neuprim.core.io.store import Store
 from neuprim.core.io.vdb import VdbFrame
 from neuprim.tasks.dynamic.volume.capture import Capture
-from neuprim.tasks.dynamic.volume.optics import Light, light_medium
+from neuprim.tasks.dynamic.volume.lit_medium import light_medium
+from neuprim.tasks.dynamic.volume.optics import Light
 from neuprim.tasks.dynamic.volume.raymarch import Medium
 
 TRAINING_MEMORY, _TEST_MEMORY, _VOXEL_MEMORY = 6 / 11, 1 / 11, 4 / 11

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import Annotated, Any, Literal, get_args
 
 import numpy as np
-from scipy import ndimage
 
-from neuprim.core.errors import ConfigError, DataError, nearest
-from neuprim.core.io.vdb import DENSE_LIMIT, Bounds, VdbGrid
+from neuprim.core.errors import ConfigError, nearest
 from neuprim.core.validation import Accepts, Range, Unbounded, field_types, validate_fields, validate_setting_names
-from neuprim.tasks.dynamic.scattering import MOST_OCTAVES, scattered_light
-from neuprim.tasks.dynamic.volume.raymarch import NOT_FINITE, Medium, light_transmittance
+from neuprim.tasks.dynamic.scattering import MOST_OCTAVES
 
 Axis = Literal["y", "z"]
 """The upward axis of a sequence's files."""
@@ -88,7 +84,7 @@ class Optics:
     isotropic phase function 1/4π, with shadows. With ``octaves`` above 1,
     :func:`~neuprim.tasks.dynamic.scattering.scattered_light` replaces T_light. Extinctions are per scene unit, and a
     scene unit is the longest side of the sequence's box; radiances are linear sRGB in one arbitrary unit. Negative, NaN
-    and infinite voxels count as 0.
+    and infinite voxels count as 0. With ``fire_lights`` above 0, flames light the smoke, too.
 
     Attributes:
         extinction_grids: names of the grid d in order of preference; the first that a file has is used.
@@ -102,6 +98,8 @@ class Optics:
         kelvin: temperatures of the coldest and the hottest flame.
         emission: radiance of the hottest flame; 0 for no glow.
         flame_extinction: extinction per unit of f.
+        fire_lights: number of point lights that stand for the flames of a frame and light its smoke, e.g. 16; 0: flames
+            do not light the smoke.
         color_grid: name of a vec3s grid that multiplies the albedo, clamped to 0..1; null for none.
         gradient: RGB from the bottom to the top of the unit box, where a file has no ``color_grid``; null for none.
         up: upward axis of the gradient, y or z.
@@ -118,6 +116,7 @@ class Optics:
     kelvin: KelvinRange = (1000.0, 2000.0)
     emission: NotNegative = 0.0
     flame_extinction: NotNegative = 0.0
+    fire_lights: Annotated[int, Range(0, 4096)] = 0
     color_grid: GridMeaning | None = None
     gradient: Gradient | None = None
     up: Axis = "z"
@@ -225,169 +224,6 @@ def override_optics(optics: Optics, changes: Mapping[str, Any]) -> Optics:
     if optics.light is not None and isinstance(light, Mapping):
         changes = {**changes, "light": {**vars(optics.light), **light}}
     return replace(optics, **changes)
-
-
-# ---------------------------------------------------------------- further lights
-
-_LOWEST = math.radians(10.0)  # lowest elevation of random lights
-
-
-def draw_lights(optics: Optics, count: int, *key: int) -> list[Light | None]:
-    """Draw ``count`` random lights, as strong as the optics' light, uniform over the sky; ``key`` is the seed."""
-    own = optics.light
-    if own is None:
-        return [None] * count
-    lights: list[Light | None] = []
-    for across, up in np.random.default_rng([20261126, *key]).random((count, 2)).tolist():
-        height = math.sin(_LOWEST) + (1 - math.sin(_LOWEST)) * up
-        around = math.sqrt(1 - height * height)
-        x, y = around * math.cos(2 * math.pi * across), around * math.sin(2 * math.pi * across)
-        lights.append(Light((x, y, height) if optics.up == "z" else (y, height, x), own.irradiance))
-    return lights
-
-
-# ---------------------------------------------------------------- the medium of a frame
-
-
-def light_medium(medium: Medium, light: Light | None, optics: Optics) -> Medium:
-    """Add isotropic scattering of a light, with shadows, to a medium's source; return the new medium."""
-    if light is None or medium.empty or medium.scattered is None:
-        return medium
-    values = medium.values.copy()
-    arriving = np.array(light.irradiance, np.float32) / np.float32(4.0 * math.pi)
-    scattered = scattered_light(light_transmittance(medium, light.direction), optics.octaves, optics.octave_share)
-    values[..., 1:] += medium.scattered * (scattered[..., None] * arriving)
-    if not np.isfinite(values).all():
-        raise DataError(NOT_FINITE)
-    return replace(medium, values=values)
-
-
-_BLACK_BODY_STEPS = 1024  # entries of the table of black bodies; linear between them
-
-
-def build_medium(grids: Mapping[str, VdbGrid], optics: Optics, scene_from_world: np.ndarray) -> Medium:
-    """Build the medium of one frame on the voxels of its extinction grid, without the optics' light.
-
-    Other grids are sampled at the centres of these voxels, trilinearly unless they have the same transform. If flames
-    absorb, the voxels are extended to contain all flames. An empty frame gives an empty medium.
-
-    Args:
-        grids: meaning -> grid; grids that the optics do not use are ignored.
-        scene_from_world: (4, 4) float64.
-
-    Raises:
-        DataError: no extinction grid exists, a grid has a wrong number of channels, the box is too large, or an
-            extinction overflows.
-    """
-    flames = grids.get(optics.flame_grid) if optics.emission > 0.0 or optics.flame_extinction > 0.0 else None
-    base = next((grids[name] for name in optics.extinction_grids if name in grids), None)
-    if base is None and flames is not None and optics.flame_extinction > 0.0:  # flames absorb by themselves
-        base = VdbGrid.from_dense(
-            optics.extinction_grids[0], np.zeros((0, 0, 0), np.float32), transform=flames.transform
-        )
-    if base is None:
-        wanted = " or ".join(repr(n) for n in optics.extinction_grids)
-        raise DataError(f"no grid {wanted} to take the extinction from{nearest(optics.extinction_grids[0], grids)}")
-    box = base.bounds
-    if flames is not None and optics.flame_extinction > 0.0:
-        box = _unite_medium_boxes(box, _transform_medium_bounds(flames, base.transform))
-    if box is None:
-        return Medium.without_voxels()
-    sigma_s = _sample_medium_grid(base, base.transform, box) * np.float32(optics.extinction)
-    flame = None if flames is None else _sample_medium_grid(flames, base.transform, box)
-    sigma = sigma_s if flame is None else sigma_s + flame * np.float32(optics.flame_extinction)
-    values = np.zeros((*sigma.shape, 4), np.float32)
-    values[..., 0] = sigma
-    scene_from_index = scene_from_world @ base.transform
-    scene_from_index[:3, 3] += scene_from_index[:3, :3] @ np.array(box[0], np.float64)
-    scattered = sigma_s[..., None] * _scattering_albedo(grids, optics, base.transform, box, scene_from_index)
-    values[..., 1:] = scattered * np.array(optics.ambient, np.float32)
-    if flame is not None and optics.emission > 0.0:
-        values[..., 1:] += sigma[..., None] * _flame_radiance(flame, optics)
-    mixed = sigma_s if optics.mixes(grids) else None
-    return Medium.padded(values, scene_from_index, mixed, None if optics.light is None else scattered)
-
-
-def _transform_medium_bounds(grid: VdbGrid, transform: np.ndarray) -> Bounds | None:
-    """Return the bounds of the voxels of ``transform`` whose centres lie in a grid's active box."""
-    if grid.bounds is None or _same_voxels(grid.transform, transform):
-        return grid.bounds
-    ends = np.array(grid.bounds, np.float64) - 0.5  # faces of the outermost voxels, not centres
-    corners = np.stack(np.meshgrid(*ends.T, indexing="ij"), -1).reshape(-1, 3)
-    chain = np.linalg.inv(transform) @ grid.transform
-    index = corners @ chain[:3, :3].T + chain[:3, 3]
-    return _make_medium_bounds(np.ceil(index.min(0) - 1e-6), np.floor(index.max(0) + 1e-6) + 1)
-
-
-def _unite_medium_boxes(a: Bounds | None, b: Bounds | None) -> Bounds | None:
-    if a is None or b is None:
-        return b if a is None else a
-    return _make_medium_bounds(np.minimum(a[0], b[0]), np.maximum(a[1], b[1]))
-
-
-def _make_medium_bounds(low: np.ndarray, high: np.ndarray) -> Bounds:
-    (a, b, c), (d, e, f) = low.astype(int).tolist(), high.astype(int).tolist()
-    return (a, b, c), (d, e, f)
-
-
-def _same_voxels(a: np.ndarray, b: np.ndarray) -> bool:
-    """Return whether two index-to-world matrices define the same voxels, to a millionth of a voxel."""
-    scale = float(np.abs(b[:3, :3]).max())
-    shift = np.linalg.inv(b) @ a[:, 3]  # not a difference, as the world's origin may be far away
-    same_axes = np.allclose(a[:3, :3], b[:3, :3], rtol=0, atol=1e-9 * scale)
-    return same_axes and np.allclose(shift, [0, 0, 0, 1], rtol=0, atol=1e-6)
-
-
-def _sample_medium_grid(grid: VdbGrid, transform: np.ndarray, box: Bounds, channels: int = 1) -> np.ndarray:
-    """Sample a grid at the voxel centres of ``box`` under ``transform``.
-
-    Values that are not finite and negative scalars become 0.
-    """
-    if grid.channels != channels:
-        raise DataError(f"grid {grid.name!r} has {grid.channels} channels; expected {channels}")
-    limit = DENSE_LIMIT // 4 * channels  # the medium has four numbers per voxel
-    shape = tuple(h - l for l, h in zip(*box, strict=True))
-    if _same_voxels(grid.transform, transform):
-        values = grid.to_dense(box, limit, 0.0)
-    elif grid.bounds is None:
-        values = np.zeros((*shape, 3)[: 2 + min(channels, 2)], np.float32)
-    else:
-        around = _make_medium_bounds(np.array(grid.bounds[0]) - 1, np.array(grid.bounds[1]) + 1)
-        own = grid.to_dense(around, limit, 0.0)
-        matrix = np.linalg.inv(grid.transform) @ transform
-        offset = matrix[:3, :3] @ np.array(box[0], np.float64) + matrix[:3, 3] - np.array(around[0])
-        planes = [own] if channels == 1 else list(np.moveaxis(own, -1, 0))
-        settings = (matrix[:3, :3], offset, shape)
-        sampled = [ndimage.affine_transform(p, *settings, order=1, mode="grid-constant") for p in planes]
-        values = sampled[0] if channels == 1 else np.stack(sampled, -1)
-    return np.maximum(values, 0.0) if channels == 1 else values
-
-
-def _scattering_albedo(
-    grids: Mapping[str, VdbGrid], optics: Optics, transform: np.ndarray, box: Bounds, scene_from_index: np.ndarray
-) -> np.ndarray:
-    """Return the albedo times colour grid or gradient, broadcastable to (X, Y, Z, 3)."""
-    albedo = np.array(optics.albedo, np.float32)
-    if optics.color_grid is not None and optics.color_grid in grids:
-        return albedo * np.clip(_sample_medium_grid(grids[optics.color_grid], transform, box, 3), 0.0, 1.0)
-    if optics.gradient is None:
-        return albedo
-    axis = "xyz".index(optics.up)
-    sizes = [h - l for l, h in zip(*box, strict=True)]
-    indices = np.meshgrid(*(np.arange(n) for n in sizes), indexing="ij", sparse=True)
-    height = sum(scene_from_index[axis, a] * indices[a] for a in range(3)) + scene_from_index[axis, 3] + 0.5
-    stops = np.linspace(0.0, 1.0, len(optics.gradient))
-    colours = [np.interp(height, stops, [stop[c] for stop in optics.gradient]) for c in range(3)]
-    return albedo * np.stack(colours, -1).astype(np.float32)
-
-
-def _flame_radiance(flame: np.ndarray, optics: Optics) -> np.ndarray:
-    """Return the radiance of flames, emission · B(K(flame)) of :class:`Optics`, (X, Y, Z, 3) float32."""
-    low, high = optics.flame_range
-    table = black_body_rgb(np.linspace(*optics.kelvin, _BLACK_BODY_STEPS), optics.kelvin[1]) * optics.emission
-    where = np.clip((flame - low) / (high - low), 0.0, 1.0) * (_BLACK_BODY_STEPS - 1)
-    entries = np.arange(_BLACK_BODY_STEPS)
-    return np.stack([np.interp(where, entries, table[:, c]) for c in range(3)], -1).astype(np.float32)
 
 
 # ---------------------------------------------------------------- black bodies

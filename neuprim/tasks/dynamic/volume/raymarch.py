@@ -141,16 +141,30 @@ def render_medium(medium: Medium, camera: Camera, samples: int = 2, subdivisions
 def light_transmittance(medium: Medium, direction: Sequence[float]) -> np.ndarray:
     """Return (X, Y, Z) float32 transmittance exp(-∫ σ ds) from voxel centres to a directional light.
 
-    The transmittance is exact up to rounding. ``direction`` points to the light, on the scene's axes, any length > 0.
-    Voxels without extinction get 1; no ray is traced from them.
+    ``direction`` points to the light, on the scene's axes, any length > 0; otherwise as :func:`point_transmittance`.
     """
+    towards = np.array(direction, np.float64)
+    return _transmittance_to(medium, np.append(towards / float(np.linalg.norm(towards)), 0.0))
+
+
+def point_transmittance(medium: Medium, position: Sequence[float]) -> np.ndarray:
+    """Return (X, Y, Z) float32 transmittance from voxel centres to a point, given in scene units.
+
+    The transmittance is exact up to rounding. Voxels without extinction get 1; no ray is traced from them.
+    """
+    return _transmittance_to(medium, np.append(np.array(position, np.float64), 1.0))
+
+
+def _transmittance_to(medium: Medium, place: np.ndarray) -> np.ndarray:
+    """Return the transmittance to a homogeneous point (4,), scene axes; the last number is 0 for a direction."""
     result = np.zeros(medium.values.shape[:3], np.float32)
     if not medium.empty:
-        towards = np.array(direction, np.float64)
-        way = medium.index_from_scene[:3, :3] @ (towards / float(np.linalg.norm(towards)))
-        sigma = np.ascontiguousarray(medium.values[..., 0])
-        rx, ry, rz = way.tolist()
-        parallel_for(_march_depths, len(sigma), _SLICES_PER_JOB, 0, sigma, medium.skips, rx, ry, rz, result)
+        sigma, units = (
+            np.ascontiguousarray(medium.values[..., 0]),
+            np.ascontiguousarray(medium.scene_from_index[:3, :3]),
+        )
+        target = medium.index_from_scene @ place
+        parallel_for(_march_depths, len(sigma), _SLICES_PER_JOB, 0, sigma, medium.skips, target, units, result)
     return np.exp(-result)
 
 
@@ -405,32 +419,42 @@ def _trilinear_march_sample(v, i, j, k, x, y, z):  # type: ignore[no-untyped-def
 
 
 @kernel
-def _march_depths(start, stop, sigma, skips, rx, ry, rz, result):  # type: ignore[no-untyped-def]
-    """Write the optical depth along one direction, from each voxel of slices start … stop to the grid's border.
+def _march_depths(start, stop, sigma, skips, target, units, result):  # type: ignore[no-untyped-def]
+    """Write the optical depth from each voxel of slices start … stop to a point, or along a direction to the border.
 
     Args:
         sigma: (X, Y, Z) float32 extinction of a medium.
         skips: :attr:`Medium.skips` of this medium.
-        rx, ry, rz: the direction, indices per scene unit.
+        target: (4,) float64, homogeneous: a position in indices and 1, or a direction in indices per scene unit and 0.
+        units: (3, 3) float64, scene units per index.
         result: (X, Y, Z) float32, written where sigma > 0; a ray stops at a depth of 16.
     """
     nx, ny, nz = skips.shape
-    ix, iy, iz = _inverse_march_direction(rx), _inverse_march_direction(ry), _inverse_march_direction(rz)
     for a in range(start, stop):
         for b in range(ny + 1):
             for c in range(nz + 1):
                 if sigma[a, b, c] <= 0.0:
                     continue
                 ox, oy, oz = float(a), float(b), float(c)
+                rx, ry, rz = target[0] - target[3] * ox, target[1] - target[3] * oy, target[2] - target[3] * oz
+                end = _FAR
+                if target[3] > 0.0:
+                    x = units[0, 0] * rx + units[0, 1] * ry + units[0, 2] * rz
+                    y = units[1, 0] * rx + units[1, 1] * ry + units[1, 2] * rz
+                    z = units[2, 0] * rx + units[2, 1] * ry + units[2, 2] * rz
+                    end = math.sqrt(x * x + y * y + z * z)
+                    length = max(end, 1.0 / _FAR)
+                    rx, ry, rz = rx / length, ry / length, rz / length
+                ix, iy, iz = _inverse_march_direction(rx), _inverse_march_direction(ry), _inverse_march_direction(rz)
                 i, j, k = min(a, nx - 1), min(b, ny - 1), min(c, nz - 1)
                 t, depth = 0.0, 0.0
-                while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and depth < _DARK:
+                while 0 <= i < nx and 0 <= j < ny and 0 <= k < nz and t < end and depth < _DARK:
                     skip = int(skips[i, j, k])
                     reach = max(skip - 1, 0)
                     tx = _march_cell_exit(ox, ix, i, reach)
                     ty = _march_cell_exit(oy, iy, j, reach)
                     tz = _march_cell_exit(oz, iz, k, reach)
-                    out = min(tx, min(ty, tz))
+                    out = min(tx, min(ty, min(tz, end)))
                     if skip == 0 and out > t:
                         for point in range(2):
                             s = t + (out - t) * (_GAUSS if point == 0 else 1.0 - _GAUSS)

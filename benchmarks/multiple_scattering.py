@@ -9,9 +9,10 @@ smoke scatters nine tenths of what it absorbs, and does not glow. Compared with 
 with 1 to 4 octaves (`scene.optics.octaves`), and of models that were trained by it with 1 to 3 octaves and four lights
 a frame. Values are PSNR of the pixels that show matter, in linear light over the brightest path-traced pixel; *again*
 is path tracing with another seed, so it is what the noise allows. `fire` is a folder of EmberGen's files, of which
-frames 20 to 40 are used. A second table has the ray caster's images of smoke that only its flames light, with few lights
-for the flames (`scene.optics.fire_lights`), against 256. Results go to benchmarks/results/multiple_scattering.json after every run, and only what is
-missing is run; --docs puts the table between the markers of docs/results/dynamic.md, --print runs nothing.
+frames 20 to 40 are used. A second table has the ray caster's images of smoke that its flames light, with few lights for
+the flames (`scene.optics.fire_lights`), against 256, over the brightest light that flames add. Results go to
+benchmarks/results/multiple_scattering.json after every run, and only what is missing is run; --docs puts the tables
+between the markers of docs/results/dynamic.md, --print runs nothing.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from typing import Any
 import numpy as np
 import torch
 from shared.arguments import make_parser, require_folders
-from shared.tables import RESULT_PAGES, RESULTS, Record, Table, between_markers, group_runs, read_record
+from shared.tables import RESULT_PAGES, RESULTS, Record, Run, Table, between_markers, group_runs, read_record
 from shared.trials import Trial, run_all
 from torch import Tensor
 
@@ -174,7 +175,7 @@ def table(record: Record) -> str:
         trained = {run["octaves"]: run for run in runs}
         first = runs[0]
 
-        def cell(run: Record, name: str, peak: float = peak) -> str:
+        def cell(run: Run, name: str, peak: float = peak) -> str:
             return f"{-10 * math.log10(run[f'mse_{name}'] / peak**2):.2f} dB"
 
         made.row(scene, "ray caster", *(cell(first, f"cast_{n}") for n in OCTAVES), cell(first, "again"))

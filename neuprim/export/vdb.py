@@ -14,7 +14,7 @@ Units (metadata ``neuprim_units``):
 * ``world``: extinction per world unit, which a volume shader multiplies by a length
 * ``scene``: extinction per scene unit, i.e. sigma
 
-``velocity=true`` adds the grid ``vel`` (:mod:`neuprim.export.velocity`).
+``velocity=true``, ``emission=true`` and ``albedo=true`` add vector grids (:mod:`neuprim.export.vector_grids`).
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ from neuprim.core.volumes.density_truth import (
     measure_density_errors,
 )
 from neuprim.export.shared import find_export_box
-from neuprim.export.velocity import choose_velocity
+from neuprim.export.vector_grids import choose_look, choose_velocity
 
 OPTIONS = {
     "grid": (None, "voxels along the longest side, 8 to 2048 (default: the source's own voxels, else 128)"),
@@ -53,6 +53,8 @@ OPTIONS = {
     "half": (False, "16-bit floats"),
     "name": ("density", "name of the grid"),
     "velocity": (False, "also write the grid vel: velocities of the primitives, in world units per frame"),
+    "emission": (False, "also write the grid emission: extinction times emitted colour, linear RGB"),
+    "albedo": (False, "also write the grid albedo, of models trained with scene.lights=4"),
     "fps": (None, "frames per second; with it, vel is in world units per second"),
 }
 _SLAB_BYTES = 64 * 2**20
@@ -89,6 +91,8 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
     fallback = _export_voxel_transform(job, box, scene_from_world, origin)
     sampler = _VdbExportSampler(job, _exported_component(job, placement), scene_from_world, name, factor, threshold)
     moving = choose_velocity(job, sampler.model, [f.conditions for f in frames], scene_from_world)
+    look = choose_look(job, frames[0].conditions, per_world, scene_from_world)
+    whole = _VdbExportSampler(job, job.run.model, scene_from_world, name, factor, threshold)
     metadata = {"neuprim_units": units, "neuprim_sigma_per_unit": 1 / factor, "neuprim_threshold": threshold}
     errors: dict[str, float] = {}
     for i, (frame, path) in enumerate(zip(frames, paths, strict=True)):
@@ -96,17 +100,27 @@ def _write_vdb_frames(job: ExportJob) -> ExportReport:
         transform = None
         if own and source is not None and frame.source is not None:
             transform = source.grid_transform(frame.source)
-        grid = sampler.sample_grid(frame.conditions, fallback if transform is None else transform)
+        transform = fallback if transform is None else transform
+        grid = sampler.sample_grid(frame.conditions, transform)
+        vectors = []
+        if look is not None:  # flames glow where the exported extinction may be 0
+            lit = whole.sample_grid(frame.conditions, transform)
+            vectors += look.sample_grids(job.run.model, frame.conditions, replace(lit, half=job.flag("half")))
         if placement is not None and placement.extents:
             extents = placement.extents  # for a time between frames, the extent of all
             extent = GridExtent.around(extents) if frame.source is None else extents[frame.source]
             grid = _clamp_exported_grid(grid, extent, placement.sigma_per_unit * factor)
         more = {f"neuprim_{key}": float(v) for key, v in frame.conditions.items() if v.numel() == 1}
         grid = replace(grid, half=job.flag("half"), metadata={**metadata, **more})
-        velocity = [] if moving is None else [moving.sample_grid(sampler.model, frame.conditions, grid)]
-        write_vdb(path, [grid, *velocity])
+        if moving is not None:
+            vectors.append(moving.sample_grid(sampler.model, frame.conditions, grid))
+        write_vdb(path, [grid, *vectors])
         if source is not None and frame.source is not None:
             errors |= _measure_vdb_errors(job, source, frame.source, frame.conditions)
+            truth = None if look is None else source.look(frame.source)
+            if look is not None and truth is not None:
+                found = look.measure_errors(job.run.model, frame.conditions, truth)
+                errors |= {f"frame_{frame.number:04d}.{key}": value for key, value in found.items()}
     notes.append(f"grid {name!r} in {units} units: extinction per scene unit = value x {1 / factor:g}")
     if moving is not None:
         notes.append(f"grid 'vel' in {moving.unit}, mean of the primitives weighted by extinction")

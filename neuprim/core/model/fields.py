@@ -239,6 +239,10 @@ class ColourField(Field):
         found = self.harmonics(params, conditions)
         return None if found is None else lowest_band_colors(found[0])
 
+    def scattering(self, params: Params) -> Tensor | None:
+        """Return the (N, C) radiance that primitives scatter per irradiance of a light; None if it is not separate."""
+        return None
+
     @abstractmethod
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> LoweredColour:
         """Return the closed form of the colour for one camera, under the conditions of one frame."""

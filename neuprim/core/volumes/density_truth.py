@@ -160,6 +160,14 @@ class DensityTruth(ABC):
         """
 
 
+class VoxelLook(NamedTuple):
+    """What M voxels of a frame emit and scatter, linear light, per scene unit."""
+
+    points: np.ndarray  # (M, 3) float64 centres, scene units
+    emission: np.ndarray  # (M, 3) extinction times emitted radiance
+    scattered: np.ndarray | None  # (M, 3) extinction times scattering albedo; None if the light is part of the emission
+
+
 class DensityGridSource(DensityTruth):
     """Base class of ground truth in voxel files, read one frame at a time."""
 
@@ -168,6 +176,10 @@ class DensityGridSource(DensityTruth):
     @abstractmethod
     def grid_transform(self, frame: int) -> np.ndarray | None:
         """Return the (4, 4) float64 world_from_index of a frame's absorbing grid; None if the frame has none."""
+
+    def look(self, frame: int) -> VoxelLook | None:
+        """Return what the voxels of a frame emit and scatter; None if it is unknown or the frame is empty."""
+        return None
 
     @abstractmethod
     def open_files(self, path: Path) -> DensityTruth:

@@ -82,7 +82,9 @@ def _build_time_fields(model: Mapping[str, Any], dataset: Dataset) -> tuple[Dens
 
 def _dataset_facts(dataset: Dataset) -> Mapping[str, Any]:
     recording = vdb_recording_of(dataset)
-    frames = {} if recording is None else {"frames": list(recording.capture.clock)}
+    frames: dict[str, Any] = {"exposure": dataset.exposure}
+    if recording is not None:
+        frames["frames"] = list(recording.capture.clock)
     lights = [dataset.train.view(i).conditions.get("light") for i in range(len(dataset.train))]
     known = [light for light in lights if light is not None]
     if not known:

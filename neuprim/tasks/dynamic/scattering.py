@@ -98,6 +98,9 @@ class ScatteringHarmonics(TimeHarmonics):
     def isotropic(self, params: Params, conditions: Conditions) -> Tensor | None:
         return lowest_band_colors(self.lowest_band(params, conditions))
 
+    def scattering(self, params: Params) -> Tensor:
+        return params["scattered"].clamp_min(0.0) / self.typical
+
     def lower(self, params: Params, geometry: Geometry, camera: AnyCamera, conditions: Conditions) -> Constant:
         own = super().lower(params, geometry, camera, conditions).rgb
         if SHINES in conditions:

@@ -38,6 +38,7 @@ from neuprim.core.volumes.density_truth import (
     DensityGridSource,
     GridExtent,
     TruthFrame,
+    VoxelLook,
     measure_density_errors,
 )
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium, draw_lights, light_medium
@@ -443,6 +444,18 @@ class CaptureDensity(DensityGridSource):
     def grid_transform(self, frame: int) -> np.ndarray | None:
         extinction = self.capture.reader.read(self._files[frame].path).get(self.capture.reader.extinction)
         return None if extinction is None else extinction.transform
+
+    def look(self, frame: int) -> VoxelLook | None:
+        capture, medium = self.capture, self.medium(frame)
+        if medium.empty:
+            return None
+        if capture.lights == 1:
+            medium = light_medium(medium, capture.frame_lights(self._files[frame])[0], capture.optics)
+        index = np.argwhere(medium.values[..., 0] > 0)
+        where = tuple(index.T)
+        points = index @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
+        scattered = None if capture.lights == 1 or medium.scattered is None else medium.scattered[where]
+        return VoxelLook(points, medium.values[where][:, 1:], scattered)
 
     def open_files(self, path: Path) -> CaptureDensity:
         return CaptureDensity(self.capture, path)

@@ -1,18 +1,20 @@
-"""The grid ``vel`` of ``neuprim export --format vdb velocity=true``: the motion of the primitives, in the world."""
+"""Vector grids of ``neuprim export --format vdb``: motion, emission and albedo of the primitives, in the world."""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from neuprim.core.errors import ConfigError
+from neuprim.core.errors import ConfigError, NeuprimError
 from neuprim.core.io.vdb import VdbGrid, read_grid, read_header
 from neuprim.core.model.primitives import Primitives
 from neuprim.core.volumes.density_grid import density_at
 from neuprim.runs.export import export_run
+from neuprim.tasks.dynamic.scattering import ScatteringHarmonics
 from tests.plugins import marked
 from tests.timed_models import model as timed
 
@@ -38,33 +40,97 @@ def exported(run: Path, out: Path, *words: str) -> tuple[VdbGrid, VdbGrid]:
     return read_grid(report.files[0], "density"), read_grid(report.files[0], "vel")
 
 
+def extinctions(model: Primitives, points: torch.Tensor) -> torch.Tensor:
+    """(M, N) of every primitive at every point, with one model per primitive."""
+    params = {name: value.detach() for name, value in model.params.items()}
+    alone = ({name: value[i : i + 1] for name, value in params.items()} for i in range(model.count))
+    time = {"time": torch.tensor(TIME)}
+    return torch.stack([density_at(Primitives(model.density, model.colour, one), time, points) for one in alone], -1)
+
+
 def expected(model: Primitives, points: torch.Tensor) -> torch.Tensor:
-    """The weighted mean of the closed-form velocities, with one model per primitive for its extinction."""
+    """The weighted mean of the closed-form velocities."""
     params = {name: value.detach() for name, value in model.params.items()}
     since = TIME - params["window_center"]
     velocities = params["velocity"] + 2 * params["acceleration"] * since
-    sigma = torch.stack(
-        [
-            density_at(Primitives(model.density, model.colour, one), {"time": torch.tensor(TIME)}, points)
-            for one in ({name: value[i : i + 1] for name, value in params.items()} for i in range(model.count))
-        ],
-        -1,
-    )
+    sigma = extinctions(model, points)
     return sigma @ velocities.double() / sigma.sum(-1, keepdim=True)
+
+
+def scene_points(grid: VdbGrid) -> torch.Tensor:
+    """Centres of the active voxels."""
+    leaf, *inside = np.nonzero(grid.masks)
+    world = (grid.origins[leaf] + np.stack(inside, -1)) @ grid.transform[:3, :3].T + grid.transform[:3, 3]
+    matrix = np.array(placed()["scene_from_world"])
+    return torch.from_numpy(world @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+def lit(channels: int = 3) -> Primitives:
+    """Primitives that emit and scatter."""
+    model = timed("window+motion", count=16, dtype=torch.float32)
+    colour = ScatteringHarmonics(1, channels, typical=2.0)
+    params = {name: value.detach() for name, value in model.params.items()}
+    params["scattered"] = 0.1 * torch.rand(16, channels, generator=torch.Generator().manual_seed(2))
+    for spec in colour.parameters():
+        params[spec.name] = params[spec.name][..., :channels]
+    return Primitives(model.density, colour, params)
 
 
 def test_velocities_are_weighted_means_in_world_units_per_frame(tmp_path: Path) -> None:
     density, vel = exported(run_directory(tmp_path / "run"), tmp_path / "a.vdb")
     assert np.array_equal(vel.masks, density.masks) and np.array_equal(vel.origins, density.origins)
     assert np.array_equal(vel.transform, density.transform) and vel.active_voxels > 1000
-    leaf, *inside = np.nonzero(vel.masks)
-    world = (vel.origins[leaf] + np.stack(inside, -1)) @ vel.transform[:3, :3].T + vel.transform[:3, 3]
-    matrix = np.array(placed()["scene_from_world"])
-    scene = torch.from_numpy(world @ matrix[:3, :3].T + matrix[:3, 3])
+    scene = scene_points(vel)
     found = vel.values[vel.masks]
     wanted = expected(timed("window+motion", count=16, dtype=torch.float32), scene).numpy() @ TURN / SCALE / 10
     assert np.abs(wanted).max() > 0.02
     assert np.abs(found - wanted).max() < 1e-4 * np.abs(wanted).max()
+
+
+def test_emission_and_albedo(tmp_path: Path) -> None:
+    """Emission per world unit, times the exposure; impossible albedos are limited to 1."""
+    model = lit()
+    run = marked.write_run(
+        tmp_path / "run", model, WORDS, color_space="linear", data={"frames": [11, 21], "exposure": 3.0}, world=placed()
+    )
+    words = [f"--time={TIME}", "grid=40", "emission=true", "albedo=true", "velocity=true"]
+    (path,) = export_run(run, "vdb", tmp_path / "a.vdb", words).files
+    density, emission, albedo = (read_grid(path, name) for name in ("density", "emission", "albedo"))
+    assert [grid.name for grid in read_header(path).grids] == ["density", "emission", "albedo", "vel"]
+    sigma = extinctions(model, scene_points(emission))
+    emitted = model.colour.isotropic(model.of(model.colour), {"time": torch.tensor(TIME)})
+    assert emitted is not None
+    wanted = (SCALE * 3.0 * sigma @ emitted.double()).numpy()
+    found = emission.values[emission.masks]
+    assert np.abs(found - wanted).max() < 1e-4 * np.abs(wanted).max() and wanted.max() > 0.01
+    share = (model.params["scattered"] / 2.0 * 4 * math.pi * 3.0).clamp_max(1.0)
+    assert float(share.max()) == 1.0 and float(share.min()) < 0.2
+    mean = (sigma @ share.double() / sigma.sum(-1, keepdim=True)).numpy()
+    assert np.abs(albedo.values[albedo.masks] - mean).max() < 1e-4
+    assert np.array_equal(emission.masks, density.masks) and np.array_equal(albedo.transform, density.transform)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (
+            ["albedo=true"],
+            "albedo=true: the colours of this model contain the light; expected a run with scene.lights=4",
+        ),
+        (["emission=yes"], "emission=yes: expected true or false"),
+    ],
+)
+def test_grids_that_a_model_lacks_are_refused(tmp_path: Path, words: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        export_run(run_directory(tmp_path / "run"), "vdb", tmp_path / "a.vdb", [f"--time={TIME}", *words])
+
+
+@pytest.mark.parametrize("exposure", [0, -1.0, "bright", True])
+def test_an_impossible_exposure_is_refused(tmp_path: Path, exposure: object) -> None:
+    data = {"frames": [11, 21], "exposure": exposure}
+    run = marked.write_run(tmp_path / "run", lit(), WORDS, color_space="linear", data=data, world=placed())
+    with pytest.raises(NeuprimError, match="exposure"):
+        export_run(run, "vdb", tmp_path / "a.vdb", [f"--time={TIME}", "emission=true"])
 
 
 def test_a_frame_rate_makes_them_velocities_per_second(tmp_path: Path) -> None:

@@ -88,7 +88,7 @@ def test_a_sequence_lies_on_the_voxels_of_its_files_and_in_their_units(moving: P
 
 
 def test_errors_are_those_of_the_runs_own_comparison(moving: Path, tmp_path: Path) -> None:
-    from neuprim.tasks.dynamic.volume.capture import compare_capture_extinction
+    from neuprim.tasks.dynamic.volume.capture_density import compare_capture_extinction
 
     report = export_run(moving, "vdb", tmp_path / "frames")
     run = open_run(moving)

@@ -145,7 +145,7 @@ def compare_with_vdb_recording(dataset: Dataset, model: Primitives) -> dict[str,
     recording = vdb_recording_of(dataset)
     if recording is None:
         return {}
-    from neuprim.tasks.dynamic.volume.capture import compare_capture_extinction
+    from neuprim.tasks.dynamic.volume.capture_density import compare_capture_extinction
 
     capture, times = recording.capture, recording.test.times
     return {

@@ -17,8 +17,8 @@ from neuprim.core.io.vdb import VdbGrid, vdb_scale_transform, write_vdb
 from neuprim.core.volumes.density_grid import box_lattice
 from neuprim.tasks.dynamic import TASK
 from neuprim.tasks.dynamic.volume import capture as capturing
-from neuprim.tasks.dynamic.volume.capture import sample_extinction
 from neuprim.tasks.dynamic.volume.capture_dataset import FrameVoxels, MediumVoxels, VdbFrameViews
+from neuprim.tasks.dynamic.volume.capture_density import sample_extinction
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium
 from neuprim.tasks.dynamic.volume.optics import optics_preset, override_optics
 from neuprim.tasks.dynamic.volume.survey import CaptureNormalisation

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
@@ -20,8 +19,6 @@ from typing import Any
 
 import numpy as np
 import torch
-from scipy import ndimage
-from torch import Tensor
 
 from neuprim.core.cameras import Camera, look_at
 from neuprim.core.data.dataset import DatasetImages
@@ -29,17 +26,10 @@ from neuprim.core.errors import DataError, warn_once
 from neuprim.core.io.exr import write_exr
 from neuprim.core.io.files import write_json
 from neuprim.core.io.store import Store
-from neuprim.core.io.vdb import VdbFrame, list_vdb_files
-from neuprim.core.model.primitives import Primitives
-from neuprim.core.volumes.density_grid import voxels_in_box
+from neuprim.core.io.vdb import VdbFrame
 from neuprim.core.volumes.density_truth import (
-    DENSITY_ERRORS,
     DensityGridPlacement,
-    DensityGridSource,
     GridExtent,
-    TruthFrame,
-    VoxelLook,
-    measure_density_errors,
 )
 from neuprim.tasks.dynamic.volume.lit_medium import build_medium, draw_lights, light_medium
 from neuprim.tasks.dynamic.volume.optics import DATA_DEPENDENT, UP_AXES, Light, Optics
@@ -368,120 +358,3 @@ def choose_rays_per_pixel(camera: Camera, voxel: float) -> int:
     72 dB against many rays (`smoke_fire` at 160×160), and take a third of the time of 2 x 2 rays.
     """
     return 1 if _DISTANCE / camera.fx < voxel else 2
-
-
-THIRDS = ("early", "middle", "late")
-_COMPARED_PER_THIRD = 3  # frames
-
-
-def sample_extinction(
-    medium: Medium, scene_from_index: Tensor, shape: tuple[int, int, int], part: bool = False
-) -> np.ndarray:
-    """Sample a medium's extinction at the points of a grid, trilinearly: (X, Y, Z) float32.
-
-    With ``part``, the result is only the contribution of the extinction grid, without flames.
-    """
-    if medium.values.size == 0:
-        return np.zeros(shape, np.float32)
-    chain = np.linalg.inv(medium.scene_from_index) @ scene_from_index.numpy()
-    sigma = medium.scattering if part and medium.scattering is not None else medium.values[..., 0]
-    points = chain[:3, :3] @ np.indices(shape, dtype=np.float64).reshape(3, -1) + chain[:3, 3:]
-    values: np.ndarray = ndimage.map_coordinates(sigma, points, order=1, mode="constant", cval=0.0)
-    return values.reshape(shape).astype(np.float32)
-
-
-class CaptureDensity(DensityGridSource):
-    """Ground-truth density of the .vdb files of ``path``, or of the scene if ``path`` is None.
-
-    Grids, optics, placement and times are those of the scene. If ``path`` is a folder, frames outside the scene's
-    times are left out. If ``path`` is a single file outside these times, its frame has no time. Models are compared
-    on the voxels of the frame, in a box that also contains the sequence's box.
-
-    Raises:
-        DataError: there is no file, or no frame within the scene's times.
-    """
-
-    def __init__(self, capture: Capture, path: Path | None = None) -> None:
-        self.capture, self.bounds = capture, torch.from_numpy(capture.bounds).double()
-        self.placement = capture.placement()
-        first, last = capture.clock
-        if path is None:
-            files = list(capture.frames)
-        elif path.is_dir():
-            files = [frame for frame in list_vdb_files(path).frames if first <= frame.number <= last]
-            if not files:
-                raise DataError(f"{path}: no frame from {first} to {last}, the range of the scene's frames")
-        else:
-            numbers = re.findall(r"[0-9]{1,18}", path.stem)  # the last one counts, as in a folder
-            files = [VdbFrame(int(numbers[-1]) if numbers else -1, path)]
-        self._files = files
-        self._cached: tuple[int, Medium] | None = None
-        timed = [{"time": torch.tensor(capture.time(f))} if first <= f.number <= last else {} for f in files]
-        self.frames = [TruthFrame(file.path.name, times) for file, times in zip(files, timed, strict=True)]
-
-    def medium(self, frame: int) -> Medium:
-        """Return the medium of a frame. The last medium is cached, since grids are requested in parts."""
-        if self._cached is None or self._cached[0] != frame:
-            self._cached = (frame, self.capture.medium(self._files[frame]))
-        return self._cached[1]
-
-    def points(self, frame: int) -> tuple[Tensor, tuple[int, int, int]] | None:
-        medium = self.medium(frame)
-        if medium.empty:
-            return None
-        inside = np.array(medium.values.shape[:3]) - 2.0  # without the empty layer around it
-        ends = np.stack(np.meshgrid(*np.stack([np.ones(3), inside], -1), indexing="ij"), -1).reshape(-1, 3)
-        corners = ends @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
-        low, high = self.bounds.numpy()
-        box = np.stack([np.minimum(corners.min(0), low), np.maximum(corners.max(0), high)])
-        return voxels_in_box(box, medium.scene_from_index)
-
-    def grid(
-        self, frame: int, scene_from_index: Tensor, shape: tuple[int, int, int], component: str | None = None
-    ) -> Tensor:
-        return torch.from_numpy(sample_extinction(self.medium(frame), scene_from_index, shape, component is not None))
-
-    def grid_transform(self, frame: int) -> np.ndarray | None:
-        extinction = self.capture.reader.read(self._files[frame].path).get(self.capture.reader.extinction)
-        return None if extinction is None else extinction.transform
-
-    def look(self, frame: int) -> VoxelLook | None:
-        capture, medium = self.capture, self.medium(frame)
-        if medium.empty:
-            return None
-        if capture.lights == 1:
-            medium = light_medium(medium, capture.frame_lights(self._files[frame])[0], capture.optics)
-        index = np.argwhere(medium.values[..., 0] > 0)
-        where = tuple(index.T)
-        points = index @ medium.scene_from_index[:3, :3].T + medium.scene_from_index[:3, 3]
-        scattered = None if capture.lights == 1 or medium.scattered is None else medium.scattered[where]
-        return VoxelLook(points, medium.values[where][:, 1:], scattered)
-
-    def open_files(self, path: Path) -> CaptureDensity:
-        return CaptureDensity(self.capture, path)
-
-
-def compare_capture_extinction(model: Primitives, capture: Capture, times: list[float]) -> dict[str, Any]:
-    """Measure a model's errors of sigma on all voxels of the sequence's box, for the early, middle and late third.
-
-    "sigma_frames" has the errors of each compared frame, see
-    :func:`~neuprim.core.volumes.density_truth.measure_density_errors`. The errors of a third are means over three
-    evenly spaced frames. Frames without extinction are left out. If flames add to the extinction of a grid, the errors
-    of that grid's part are also measured: "density_frames", ...
-    """
-    result: dict[str, Any] = {}
-    count, truth, compared = len(capture.frames), CaptureDensity(capture), 3 * _COMPARED_PER_THIRD
-    for component in (None, *model.density.components(model.params)):
-        entries: list[dict[str, Any]] = []
-        for t in sorted({int((i + 0.5) * count / compared) for i in range(compared)}):
-            conditions = {"time": torch.tensor(times[t])}
-            errors = measure_density_errors(model, conditions, truth, t, component=component)
-            if errors is not None:
-                entries.append({"frame": capture.frames[t].number, "third": THIRDS[min(3 * t // count, 2)], **errors})
-        name = component or "sigma"
-        result[f"{name}_frames"] = entries
-        for key in DENSITY_ERRORS:
-            for third in THIRDS:
-                values = [e[key] for e in entries if e["third"] == third]
-                result[f"{name}_{key}_{third}"] = float(np.mean(values)) if values else None
-    return result

@@ -31,7 +31,6 @@ from neuprim.scenes.smoke.smoke_scenes import MAX_TIMESTEPS, Resolution, simulat
 from neuprim.tasks.dynamic.time_density import ChunkOverlaps, TimeDensity
 from neuprim.tasks.dynamic.volume.capture import (
     Capture,
-    CaptureDensity,
     CapturedVdbFrames,
     choose_rays_per_pixel,
     hemisphere_capture_cameras,
@@ -42,6 +41,7 @@ from neuprim.tasks.dynamic.volume.capture_dataset import (
     total_extinction_of_vdb_frame,
     volume_dataset,
 )
+from neuprim.tasks.dynamic.volume.capture_density import CaptureDensity
 from neuprim.tasks.dynamic.volume.optics import (
     DATA_DEPENDENT,
     UP_AXES,

@@ -121,6 +121,20 @@ def test_moving_all_cameras_alike_is_undone() -> None:
         assert (motions().norm() < 1e-3 * before) == alike, alike
 
 
+@pytest.mark.parametrize(("converging", "furthest"), [(0.0, 1.0), (1e-3, 1.0), (0.5, 3.0)])
+def test_rotations_do_not_move_cameras_far(converging: float, furthest: float) -> None:
+    """Cameras in a row, up to 2 units apart, whose axes are parallel, almost parallel, or meet 2 units before them."""
+    places = [torch.tensor([x, 0.1 * x * x, 0.0], dtype=torch.float64) for x in (-1.0, -0.5, 0.5, 1.0)]
+    target = [place + torch.tensor([-converging * float(place[0]), 1.0, 0.0]) for place in places]
+    cameras = [replace(scenes.camera(), viewmat=look_at(*both, UP)) for both in zip(places, target, strict=True)]
+    poses = torch.stack([camera.viewmat for camera in cameras])
+    corrections = ViewCorrections(poses, {"camera": "pose"}, 1.0, torch.device("cpu"))
+    corrections.numbers[:, :3] = 0.1
+    with torch.no_grad():
+        moved = [corrections.apply(i, View("v", camera)).camera.position for i, camera in enumerate(cameras)]
+    assert max(float((a - b).norm()) for a, b in zip(moved, places, strict=True)) < 0.18 * furthest
+
+
 def test_lights_are_found() -> None:
     """Positions and intensities, of a model that is known."""
     model = lit_models.model(LightNetwork(3, visibility="none"), torch.float32)
